@@ -27,11 +27,11 @@ from torch import Tensor
 
 from lumigraph.commands.cli import main as command
 from lumigraph.derive.canonical import PRESETS, Instance, Solution, canonicalise, found_in, sampled, solve
-from lumigraph.derive.canonical.learning import found_rotations
-from lumigraph.derive.canonical.mean_shape import best_alignment, best_rotations, described
+from lumigraph.derive.canonical.canonicalise import best_alignment, best_rotations, described
+from lumigraph.derive.canonical.network import found_rotations
 from lumigraph.files import write_json
-from lumigraph.geometry.choice import evenly
-from lumigraph.run.canonicalised import Canonicalised
+from lumigraph.geometry import evenly
+from lumigraph.run.composition import Canonicalised
 from lumigraph.synthetic import signed_distance
 from lumigraph.synthetic.members import member_stage
 

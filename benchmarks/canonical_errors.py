@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lumigraph.datasets.alignment import angles
-from lumigraph.derive.canonical.rotations import nearest_rotation
+from lumigraph.derive.canonical.harmonics import nearest_rotation
 
 ROUNDS = 10
 

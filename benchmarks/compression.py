@@ -16,8 +16,7 @@ import tyro
 from rich.table import Table
 
 from lumigraph.derive.compression import LADDER, CompressionTarget
-from lumigraph.derive.compression.compress import Ladder, important
-from lumigraph.derive.compression.measure import truth_of
+from lumigraph.derive.compression.compress import Ladder, important, truth_of
 from lumigraph.evaluation import evaluate
 from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import write_bytes, write_json

@@ -25,14 +25,13 @@ import tyro
 
 from lumigraph import methods
 from lumigraph.commands.compress import size
-from lumigraph.derive.conversion import ConversionTarget, convert
-from lumigraph.derive.conversion.convert import new_student
+from lumigraph.derive.conversion import ConversionTarget, convert, new_student
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.figures.charts import standalone
 from lumigraph.files import claim, is_file, write_bytes, write_json
 from lumigraph.method.capabilities import FromField, needs
 from lumigraph.run import Run
-from lumigraph.run.converted import Converted
+from lumigraph.run.derived import Converted
 
 SEVEN = ("nerf", "mip-nerf", "instant-ngp", "plenoxels", "dvgo", "tensorf", "gaussian-splatting")
 CELL, SIDE, TOP = 64, 150, 120  # pixels of the map

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from lumigraph.exchange import SUFFIXES, read_gaussians, write_gaussians
 from lumigraph.gaussians.splatting import render
-from lumigraph.geometry.choice import evenly
+from lumigraph.geometry import evenly
 from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
 from lumigraph.run import open_any

@@ -20,12 +20,11 @@ from compression import Options as Pressed
 from compression import chart, rungs
 
 from lumigraph import methods
-from lumigraph.benchmark.cell import Cell, Settings
+from lumigraph.benchmark.cell import Cell, CellSettings, read_rows
 from lumigraph.benchmark.conduct import conduct
-from lumigraph.benchmark.results import read_rows
 from lumigraph.benchmark.table import size, table
 from lumigraph.budget import Budget
-from lumigraph.commands.benches.cells import located
+from lumigraph.commands.bench import place_of
 from lumigraph.figures.charts import standalone
 from lumigraph.files import read_json, scene_name, write_bytes, write_json
 from lumigraph.run import Run
@@ -47,7 +46,7 @@ class Options:
 
 
 def main(options: Options) -> int:
-    source, settings = located(options.scene), Settings(downscale=options.downscale, eval_views=options.views)
+    source, settings = place_of(options.scene), CellSettings(downscale=options.downscale, eval_views=options.views)
     there = [name for name in options.methods if name in methods.available()]
     cells = [Cell(name, scene_name(source), source, Budget(None, options.seconds)) for name in there]
     if code := conduct(cells, settings, options.output):

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from lumigraph.exchange import streamed_sog
 from lumigraph.gaussians.splatting import render
-from lumigraph.geometry.choice import evenly
+from lumigraph.geometry import evenly
 from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
 from lumigraph.run import open_any

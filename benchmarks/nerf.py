@@ -21,10 +21,10 @@ import tyro
 from torch import Tensor, nn
 
 from lumigraph.capture import open_scene
-from lumigraph.components.fields import dense
+from lumigraph.components.fields import layers
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
-from lumigraph.components.sampling.occupancy_mask import MaskNumbers, OccupancyMask
+from lumigraph.components.sampling.occupancy import MaskNumbers, OccupancyMask
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
@@ -55,7 +55,7 @@ def main(options: Options) -> None:
 
 
 class PlainLayer(nn.Linear):
-    """What `components.dense.Dense` does, without anything that makes it quick."""
+    """What `components.fields.layers.Dense` does, without anything that makes it quick."""
 
     def forward(self, x: Tensor) -> Tensor:
         y = super().forward(x.float())
@@ -64,7 +64,7 @@ class PlainLayer(nn.Linear):
 
 def plain(network: CoordinateNetwork) -> CoordinateNetwork:
     for module in network.modules():
-        if isinstance(module, dense.Dense):
+        if isinstance(module, layers.Dense):
             module.exact, module.__class__ = True, PlainLayer  # type: ignore[assignment]
     return network
 
@@ -74,7 +74,7 @@ def speed(options: Options) -> dict[str, float | str]:
     result: dict[str, float | str] = {"processor": processor(device), "device": str(device)}
     for name in ("ours", "plain"):
         method = build(NeRF, scene.frame, Config(rays=RayNumbers(rays_per_step=RAYS)), device, 0)
-        whole = mock.patch.multiple(dense, CHUNK_CPU=1 << 40, CHUNK_GPU=1 << 40)
+        whole = mock.patch.multiple(layers, CHUNK_CPU=1 << 40, CHUNK_GPU=1 << 40)
         if name == "plain":
             for network in (method.network.coarse, method.network):
                 plain(network)

@@ -27,7 +27,7 @@ from tyro.conf import Positional
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.files import write_json
-from lumigraph.geometry.choice import evenly
+from lumigraph.geometry import evenly
 from lumigraph.run import open_any
 
 SIZE, ANGLE = 400, 40.0  # pixels, degrees

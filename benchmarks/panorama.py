@@ -24,8 +24,15 @@ from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, OmnidirectionalStereo
 from lumigraph.capture import open_scene
-from lumigraph.export.panorama import level_camera, panorama, save_sphere, sphere_size
-from lumigraph.export.stereo import stereo_pair, surrounding_distances, top_bottom
+from lumigraph.export.panorama import (
+    level_camera,
+    panorama,
+    save_sphere,
+    sphere_size,
+    stereo_pair,
+    surrounding_distances,
+    top_bottom,
+)
 from lumigraph.files import write_json
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build

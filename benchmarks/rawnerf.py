@@ -24,10 +24,10 @@ from torch import Tensor
 
 from lumigraph.camera.rays import Rendering
 from lumigraph.capture import open_scene
-from lumigraph.capture.raw.demosaic import demosaiced
+from lumigraph.capture.raw.photo import demosaiced
 from lumigraph.components.fields.development import decoded, encoded
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation.light import LIGHT_LAYER, in_light
+from lumigraph.evaluation.views import LIGHT_LAYER, in_light
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
 from lumigraph.methods import find

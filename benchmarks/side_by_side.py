@@ -17,10 +17,9 @@ import tyro
 from tyro.conf import Positional
 
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation.halves import judged_by_halves, left_half
-from lumigraph.evaluation.light import LIGHT_LAYER, in_light
+from lumigraph.evaluation.views import LIGHT_LAYER, in_light, judged_by_halves, left_half
 from lumigraph.figures import Row, colour_depth, contact_sheet, depth_range
-from lumigraph.geometry.choice import evenly
+from lumigraph.geometry import evenly
 from lumigraph.run import Run
 
 MOST = 60_000  # bytes of a picture

@@ -106,7 +106,7 @@ def look(run: Path, pictures: int) -> None:
     """Open a run in the viewer, look at it from several places, save a path, go."""
     from viewer_client import Client
 
-    from lumigraph.commands.controls import open_method
+    from lumigraph.commands.options import open_method
     from lumigraph.commands.view import subject_of
     from lumigraph.viewer import Viewer, choose_address
 

@@ -25,7 +25,7 @@ from lumigraph.files import write_json
 from lumigraph.files.ranges import changed
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.run import build
-from lumigraph.run.splat_file import SplatFile
+from lumigraph.run.opening import SplatFile
 from lumigraph.system.console import console
 
 PARTS = ("batch", "forward and loss", "backward", "optimiser", "after")

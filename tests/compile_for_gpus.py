@@ -14,7 +14,7 @@ from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
 from lumigraph import kernels
-from lumigraph.kernels._facts import operations, tensors
+from lumigraph.kernels._operation import operations, tensors
 
 TARGETS = [GPUTarget("cuda", 90, 32), GPUTarget("hip", "gfx942", 64)]
 

@@ -1,7 +1,8 @@
 """Before any test: Triton interprets where there is no GPU, and the shapes written at every door are executed.
 
 Around each: no test may hang, and its cost is noted. Costly files come first, so that workers end together; tests that
-need a browser come last, for they share one.
+need a browser come last, for they share one. In a fresh clone the contract compiles most kernels: meanwhile the other
+worker has tests that compile none, because a kernel that two workers compile at the same time is compiled twice.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from numba.core import event  # isort: skip
 
 LIMIT = 300  # seconds of waiting, in whatever state the machine is, that a test's setup, body or end may take
 PACKAGE = Path(lumigraph.__file__).parent
+FIRST = ["test_contract", "test_bounds", "test_seeded_faults"]  # the last two run kernels as plain Python
 JIT = re.compile(r"^\s*(import|from) (numba|triton)\b", re.MULTILINE)
 
 
@@ -54,6 +56,10 @@ manager = install_import_hook(["lumigraph"], checker)
 covered = checked_modules()
 manager.hook.should_instrument = covered.__contains__  # type: ignore[method-assign, attr-defined]
 
+from lumigraph.system.allocation import settle_memory  # noqa: E402
+
+settle_memory()  # as commands do: memory that one training step frees is kept for the next
+
 
 # Background jobs of a shell ignore Ctrl-C, and so would what tests start; they press it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -65,11 +71,12 @@ event.register("numba:compile", LEDGER.compiling)
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    def browser_then_cost(item: pytest.Item) -> tuple[bool, float]:
-        share = share_of(item.get_closest_marker("budget"))[1]
-        return "chromium" in getattr(item, "fixturenames", ()), -share
+    def order(item: pytest.Item) -> tuple[bool, int, float]:
+        file, share = item.path.stem, share_of(item.get_closest_marker("budget"))[1]
+        place = FIRST.index(file) if file in FIRST else len(FIRST)
+        return "chromium" in getattr(item, "fixturenames", ()), place, -share
 
-    items.sort(key=browser_then_cost)
+    items.sort(key=order)
     from lumigraph import methods
 
     LEDGER.methods = len(methods.available())

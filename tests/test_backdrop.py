@@ -9,8 +9,7 @@ from solids import Seen, around, ball
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.scene import Frame
-from lumigraph.export.backdrop import backdrop
-from lumigraph.export.page import opening_of_scene
+from lumigraph.export.page import backdrop, opening_of_scene
 
 SKY, GROUND, FLOOR = (0.5, 0.7, 0.9), (0.3, 0.5, 0.1), -0.5
 

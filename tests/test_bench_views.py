@@ -12,18 +12,16 @@ from budgets import budget
 from test_benchmark import Here
 from test_priors import prior_run
 
-from lumigraph.benchmark.cell import Cell, Settings, train_command
-from lumigraph.benchmark.conduct import Patience, conduct
-from lumigraph.benchmark.curves import over_views
-from lumigraph.benchmark.pictures import draw_charts
-from lumigraph.benchmark.published import FEW_VIEW_FIGURES
+from lumigraph.benchmark.cell import FEW_VIEW_FIGURES, Cell, CellSettings, train_command
+from lumigraph.benchmark.conduct import Patience, conduct, draw_charts
+from lumigraph.benchmark.table import over_views
 from lumigraph.budget import Budget
-from lumigraph.commands.benches.views import BenchViews
+from lumigraph.commands.bench import BenchViews
 from lumigraph.commands.cli import main
 
 pytestmark = budget("runs")
 
-SETTINGS = Settings(device="cpu", eval_views=1)
+SETTINGS = CellSettings(device="cpu", eval_views=1)
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +103,7 @@ def test_without_a_collection_there_is_no_prior(ball_folder, tmp_path, monkeypat
 
 def test_objects_of_a_category_keep_the_size_they_were_asked_for():
     def words(source):
-        return train_command(Cell("nerf", "x", source, Budget(1, None), views=2), Settings(downscale=8))
+        return train_command(Cell("nerf", "x", source, Budget(1, None), views=2), CellSettings(downscale=8))
 
     assert "--downscale" in words("procedural:still-life") and "--downscale" not in words("procedural:toys,member=8")
 

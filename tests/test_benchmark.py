@@ -16,11 +16,8 @@ import pytest
 from budgets import budget
 from PIL import Image
 
-from lumigraph.benchmark.cell import Cell, Settings
-from lumigraph.benchmark.conduct import Patience, conduct
-from lumigraph.benchmark.launch import launch, reason
-from lumigraph.benchmark.pictures import draw_charts
-from lumigraph.benchmark.published import FIGURES, published
+from lumigraph.benchmark.cell import FIGURES, Cell, CellSettings, published
+from lumigraph.benchmark.conduct import Patience, conduct, draw_charts, launch, reason
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
@@ -28,7 +25,7 @@ from lumigraph.run import Run
 
 pytestmark = budget("runs", 20)
 
-SETTINGS = Settings(device="cpu", eval_views=2)
+SETTINGS = CellSettings(device="cpu", eval_views=2)
 
 
 class Here:
@@ -107,7 +104,7 @@ def test_what_is_done_is_kept(cells, output):
     again = Here()
     assert conduct(cells[:1], SETTINGS, output, launch=again) == 0
     assert again.seen == [] and len(rows(output)) == 3
-    assert conduct(cells[:1], Settings(device="cpu", eval_views=3), output, launch=again) == 0
+    assert conduct(cells[:1], CellSettings(device="cpu", eval_views=3), output, launch=again) == 0
     assert again.seen == ["eval"] and len(rows(output)) == 3
     assert rows(output)[0]["protocol"]["views"] == 3
 
@@ -165,7 +162,7 @@ def test_a_chart_is_marked_at_its_own_budgets(done, tmp_path):
 
 def test_photographs_at_several_scales_count_once(ball_folder, tmp_path):
     output = tmp_path / "out"
-    conduct([cell(ball_folder)], Settings(device="cpu", scales=2), output, launch=Here())
+    conduct([cell(ball_folder)], CellSettings(device="cpu", scales=2), output, launch=Here())
     (row,) = rows(output)
     assert row["train_views"] == 9 and row["protocol"]["views"] == 6
     assert set(row["by_resolution"]) == {"24x24", "12x12"} and row["shown"]["resolution"] == "24x24"
@@ -177,7 +174,7 @@ def test_photographs_at_several_scales_count_once(ball_folder, tmp_path):
 
 def test_cells_that_share_nothing_are_kept_apart(ball_folder, done, tmp_path):
     with pytest.raises(LumigraphError, match="begun with --preset auto, which is now paper"):
-        conduct([cell(ball_folder)], Settings(device="cpu", preset="paper"), done, launch=Here())
+        conduct([cell(ball_folder)], CellSettings(device="cpu", preset="paper"), done, launch=Here())
     with pytest.raises(LumigraphError, match="Two scenes are called ball"):
         conduct([cell(tmp_path)], SETTINGS, done, launch=Here())
 

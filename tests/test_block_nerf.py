@@ -21,14 +21,13 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
 from lumigraph.large.weights import inverse_distance, seeing, shares
 from lumigraph.methods.block_nerf import BlockNeRF
-from lumigraph.methods.block_nerf.moving import CELLS, Moving
-from lumigraph.methods.block_nerf.visibility import Visibility, transmittance
+from lumigraph.methods.block_nerf.parts import CELLS, Moving, Visibility, transmittance
 from lumigraph.run import build
 from lumigraph.training import fit
 

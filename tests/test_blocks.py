@@ -26,12 +26,12 @@ from lumigraph.budget import Budget
 from lumigraph.capture import Places, open_scene, places_of, read_capture
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.large import BlockRun, crossings, layout, monitor, planning, training, worker
-from lumigraph.large.on_ray import Workers
+from lumigraph.large import BlockRun, layout, monitor, planning, training, worker
 from lumigraph.large.plan import Plan, Task
+from lumigraph.large.training import Workers
 from lumigraph.methods import find
 from lumigraph.run import Run, open_any
-from lumigraph.run.splat_file import SplatFile
+from lumigraph.run.opening import SplatFile
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 15)
@@ -73,7 +73,7 @@ def places(ground: np.ndarray, forward: tuple[float, float, float] = (1.0, 0.0, 
 
 @pytest.mark.parametrize("rig", [1, 3])
 def test_crossings_and_corners_of_streets_are_found(rig):
-    found = crossings.find_crossings(crossing_streets(3, 2, 40.0, 2.0, rig))
+    found = layout.find_crossings(crossing_streets(3, 2, 40.0, 2.0, rig))
     expected = np.array([[x, y] for x in (0, 40, 80) for y in (0, 40)])
     away = np.linalg.norm(found[:, None] - expected, axis=-1)
     assert len(found) == 6 and away.min(0).max() < 2.0
@@ -81,7 +81,7 @@ def test_crossings_and_corners_of_streets_are_found(rig):
 
 def test_two_lanes_are_one_street():
     """A drive along every street once in each direction, as `procedural:city` has it, meets where streets do."""
-    found = crossings.find_crossings(places_of(read_capture("procedural:city,crossings=6,views=420,size=32")).ground)
+    found = layout.find_crossings(places_of(read_capture("procedural:city,crossings=6,views=420,size=32")).ground)
     expected = np.array([[x, y] for x in (0, 36, 72) for y in (0, 36)])
     away = np.linalg.norm(found[:, None] - expected, axis=-1)
     assert len(found) == 6 and away.min(0).max() < 5.0
@@ -91,7 +91,7 @@ def test_a_survey_flight_and_a_road_have_no_crossings():
     grid = np.stack(np.meshgrid(np.arange(20) * 3.0, np.arange(20) * 3.0), -1).reshape(-1, 2)
     road = np.stack([np.arange(100.0), np.zeros(100)], -1)
     for ground in (grid + 0.2 * np.random.default_rng(0).standard_normal(grid.shape), road):
-        assert not len(crossings.find_crossings(ground))
+        assert not len(layout.find_crossings(ground))
 
 
 @pytest.mark.parametrize("wish", ["auto", "6"])

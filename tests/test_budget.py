@@ -17,7 +17,7 @@ from lumigraph.evaluation import evaluate, held_out_poses
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 
-pytestmark = budget("runs", 8)
+pytestmark = budget("runs", 16)
 
 
 @pytest.mark.parametrize("said", [{}, {"steps": 3, "seconds": 1.0}, {"steps": 0}, {"seconds": -1.0}])

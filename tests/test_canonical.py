@@ -17,13 +17,19 @@ from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.composition import standing
 from lumigraph.datasets.alignment import angles
-from lumigraph.derive.canonical import Config, Instance, sampled, solve
-from lumigraph.derive.canonical.harmonics import band, harmonics, turning
-from lumigraph.derive.canonical.learning import drawn, learn, losses
-from lumigraph.derive.canonical.mean_shape import best_rotations, described
-from lumigraph.derive.canonical.moments import moments
-from lumigraph.derive.canonical.network import Canonicaliser, rotations_of
-from lumigraph.derive.canonical.rotations import near, nearest_rotation, random, spread
+from lumigraph.derive.canonical import CanonicalConfig, Instance, sampled, solve
+from lumigraph.derive.canonical.canonicalise import best_rotations, described
+from lumigraph.derive.canonical.harmonics import (
+    band,
+    harmonics,
+    moments,
+    near,
+    nearest_rotation,
+    random,
+    spread,
+    turning,
+)
+from lumigraph.derive.canonical.network import Canonicaliser, drawn, learn, losses, rotations_of
 from lumigraph.errors import LumigraphError
 from lumigraph.geometry import Similarity
 from lumigraph.run import Run, State, open_any
@@ -32,7 +38,7 @@ from lumigraph.synthetic.members import member_stage, members_of
 
 pytestmark = budget("runs", 15)
 
-QUICK = Config(steps=12, points=256, channels=8, templates=3)
+QUICK = CanonicalConfig(steps=12, points=256, channels=8, templates=3)
 CUBE = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
 
 
@@ -145,7 +151,7 @@ def test_chairs_in_any_pose_come_to_stand_alike():
 def test_learning_lowers_what_it_is_told_to():
     """On poses that it has not seen; and the seed decides all of it."""
     instances, _ = zip(*(chair(i, 20) for i in range(4)), strict=True)
-    config = Config(points=256, channels=12, batch=4)
+    config = CanonicalConfig(points=256, channels=12, batch=4)
 
     def loss(steps: int) -> float:
         points, weights = drawn(instances, config, torch.Generator().manual_seed(5))

@@ -22,7 +22,6 @@ from views import draw, look_at, pattern, spoil, write_views
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
-from lumigraph.capture.folds import jumps
 from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
@@ -31,6 +30,7 @@ from lumigraph.capture.motion.pairs import aggregated, alike, choose_matching, e
 from lumigraph.capture.motion.pairs import near as near_by
 from lumigraph.capture.motion.reconstruction import Reconstruction
 from lumigraph.capture.motion.stages import WORKER, Stages, key_of
+from lumigraph.capture.oddities import jumps
 from lumigraph.capture.photos import Intake, Photo
 from lumigraph.capture.transforms import read as read_transforms
 from lumigraph.commands import capture as command
@@ -374,10 +374,11 @@ def test_photographs_of_one_place_are_alike():
         np.clip(places[i % 3][chance.permutation(300)[:200]] + chance.normal(0, 4, (200, 128)), 0, 255).astype(np.uint8)
         for i in range(12)
     ]
-    similar = aggregated(photos)
+    similar = aggregated(photos.__getitem__, len(photos))
     assert all((i - j) % 3 == 0 for i, j in alike(similar, 3))
     assert all(abs(i - j) >= 6 for i, j in alike(similar, 3, apart=6))
-    assert np.isfinite(aggregated([np.zeros((0, 128), np.uint8), *photos])).all()
+    photos = [np.zeros((0, 128), np.uint8), *photos]
+    assert np.isfinite(aggregated(photos.__getitem__, len(photos))).all()
 
 
 def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):

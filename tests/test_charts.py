@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 from budgets import budget
 
-from lumigraph.benchmark.curves import curves
+from lumigraph.benchmark.table import curves
 from lumigraph.figures.charts import (
     COLOURS,
     DASHES,

@@ -13,19 +13,19 @@ import torch
 from balls import RED, WHITE, Dense, Splatted, eye
 from test_gaussian_splatting import new
 
-from lumigraph.camera.crop import Box, Crop, Sphere
+from lumigraph.camera.crop import Crop, CropBox, Sphere
 from lumigraph.camera.rays import Rays
 from lumigraph.commands import cli
 from lumigraph.composition import PickedCloud, cropped
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
-from lumigraph.gaussians.cleaning import cleaned, extent, unwanted
+from lumigraph.gaussians.cloud import cleaned, extent, unwanted
 from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.run import Run, open_any
 from lumigraph.training import fit
 
 CROPS: dict[str, Crop] = {
-    "box": Box((-0.3, -0.5, -0.2), (0.4, 0.1, 0.6)),
+    "box": CropBox((-0.3, -0.5, -0.2), (0.4, 0.1, 0.6)),
     "sphere": Sphere((0.1, -0.2, 0.3), 0.45),
 }
 
@@ -68,7 +68,7 @@ def test_rays_are_inside_between_where_they_enter_and_leave(kind, generator):
 
 @pytest.mark.parametrize("method", [Dense(RED), Splatted(RED)], ids=["ray", "cloud"])
 def test_a_cropped_method_shows_what_lies_inside(method):
-    half = cropped(method, Box((-1.0, 0.0, -1.0), (1.0, 1.0, 1.0)))
+    half = cropped(method, CropBox((-1.0, 0.0, -1.0), (1.0, 1.0, 1.0)))
     camera = eye((-3.0, 0, 0))
     whole, seen = method.render(camera).opacity, half.render(camera).opacity
     y = camera.rays(camera.pixels()).at(torch.full((whole.numel(),), 3.0))[:, 1].view_as(whole)
@@ -162,7 +162,7 @@ def test_exports_of_a_part_hold_as_many_as_another_reader_counts(cloud_run, tmp_
     folder = str(cloud_run.folder)
     assert cli.main(["export", "splats", folder, str(tmp_path / "a.ply"), "--box", *"-1 -1 -1 1 1 0".split()]) == 0
     assert cli.main(["export", "splats", folder, str(tmp_path / "b.ply"), "--units", "source", "--box", *numbers]) == 0
-    expected = int(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)).holds(cloud.means).sum())
+    expected = int(CropBox((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)).holds(cloud.means).sum())
     for name in ("a.ply", "b.ply"):
         assert plyfile.PlyData.read(tmp_path / name)["vertex"].count == expected
     assert cli.main(["clean", str(tmp_path / "a.ply"), "--sphere", *"0 0 0 0.8".split(), "--units", "source",

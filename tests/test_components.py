@@ -11,13 +11,11 @@ import tiny
 import torch
 
 from lumigraph.camera.rays import Rays
-from lumigraph.components.fields.activations import truncated_exp
-from lumigraph.components.fields.mlp import MLP
-from lumigraph.components.sampling.carving import visual_hull
-from lumigraph.components.sampling.occupancy import OccupancyGrid
-from lumigraph.components.training.exposure import Exposure
-from lumigraph.components.training.lazy_adam import LazyAdam
+from lumigraph.components.fields.layers import MLP, truncated_exp
+from lumigraph.components.sampling.occupancy import OccupancyGrid, visual_hull
+from lumigraph.components.training.photometric import Exposure
 from lumigraph.components.training.pose_refinement import PoseRefinement
+from lumigraph.components.training.row_optimizers import LazyAdam
 from lumigraph.datasets.images import ImageStore
 from lumigraph.run.checkpoint import take_shapes
 

@@ -11,11 +11,11 @@ import torch
 from balls import BLUE, RED, WHITE, Dense, Marched, Pictured, Splatted, eye
 from budgets import budget
 
-from lumigraph.camera.crop import Box
+from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands import cli
 from lumigraph.composition import Placed, compose, frame_around, standing
-from lumigraph.composition.union import union
+from lumigraph.composition.composed import union
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians
@@ -194,7 +194,7 @@ def test_density_adds_up_per_unit_of_the_picture():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_box_cuts_a_part(kind):
     """Without the half towards -x, the ball behind it in -x is seen from +x to end in the middle."""
-    half = Box((0.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    half = CropBox((0.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     parts = [Placed(KINDS[kind](RED), HERE, half), Placed(KINDS[kind](BLUE), at(0.0, 0, 0, scale=0.4))]
     both = compose(WHITE, parts)
     rgb, depth, _ = middle(both.render(eye((3.0, 0, 0))))
@@ -266,7 +266,7 @@ def folder(tmp_path_factory):
 def test_a_file_opens_as_it_was_written(folder):
     parts = [
         CompositionPart("red.ply", HERE),
-        CompositionPart("blue.ply", at(0, -0.75, 0), Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))),
+        CompositionPart("blue.ply", at(0, -0.75, 0), CropBox((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))),
     ]
     write_composition(folder / "two.json", parts, lead=1)
     read, lead = read_composition(folder / "two.json")

@@ -16,12 +16,11 @@ from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.commands.compress import bytes_in
 from lumigraph.derive.compression import LADDER
-from lumigraph.derive.compression.ladder import RUNG_POSITIONS, rung_at
-from lumigraph.derive.compression.measure import bytes_of, decibels, rendered, squared_error
-from lumigraph.derive.compression.model import Model
+from lumigraph.derive.compression.compress import bytes_of, decibels, rendered, squared_error
+from lumigraph.derive.compression.model import RUNG_POSITIONS, Model, rung_at
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run, build
-from lumigraph.run.compressed import Compressed
+from lumigraph.run.derived import Compressed
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 15)

@@ -19,18 +19,17 @@ from lumigraph.commands.cli import main
 from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logit, teacher_of
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
-from lumigraph.derive.conversion import ConversionTarget, convert, ways
-from lumigraph.derive.conversion.renderings import between, rendered_scene
+from lumigraph.derive.conversion import ConversionTarget, between, convert, rendered_scene, ways
 from lumigraph.errors import LumigraphError
-from lumigraph.export.splats import export_splats
+from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
 from lumigraph.method.capabilities import FromField, HasField, can
-from lumigraph.methods.gaussian_splatting.surfaces import rotation_to_normal
+from lumigraph.methods.gaussian_splatting.initialization import rotation_to_normal
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, open_any
-from lumigraph.run.converted import Converted
+from lumigraph.run.derived import Converted
 from lumigraph.system.signals import Stopped
 from lumigraph.training import fit
 
@@ -267,8 +266,8 @@ def test_photographs_are_learnt_from_where_they_are(ball_folder, tmp_path, capsy
 
 
 def test_a_splat_file_is_a_teacher(made, tmp_path, monkeypatch):
-    monkeypatch.setattr("lumigraph.run.splat_file.ring", partial(ring, size=48))
-    export_splats(made.method().gaussians(), made.frame, tmp_path / "cloud.ply")
+    monkeypatch.setattr("lumigraph.run.opened.ring", partial(ring, size=48))
+    write_gaussians(tmp_path / "cloud.ply", made.method().gaussians().transformed(made.frame.to_source.matrix))
     kind = methods.find("plenoxels")
     said = convert(
         open_any(tmp_path / "cloud.ply"),
@@ -284,9 +283,7 @@ def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monke
     aim = ConversionTarget(methods.find("plenoxels").smallest(), steps=12, views=1)
     straight = convert(ball_run, "plenoxels", tmp_path / "straight", aim)
     stopping = lambda *told, **more: replace(fit(*told, **more, pause_at=5), signal=2)  # noqa: E731
-    monkeypatch.setattr(
-        sys.modules["lumigraph.derive.conversion.convert"], "fit", stopping
-    )  # the function has its name
+    monkeypatch.setattr(sys.modules["lumigraph.derive.conversion"], "fit", stopping)  # the function has its name
     with pytest.raises(Stopped):
         convert(ball_run, "plenoxels", tmp_path / "broken", aim)
     assert Converted.read(tmp_path / "broken") is None and Run(tmp_path / "broken").state.step == 5

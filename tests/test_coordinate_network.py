@@ -7,9 +7,9 @@ import torch
 from budgets import budget
 from torch.nn import functional as F
 
-from lumigraph.components.fields import dense
+from lumigraph.components.fields import layers
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
-from lumigraph.components.fields.dense import Dense, in_chunks
+from lumigraph.components.fields.layers import Dense, in_chunks
 from lumigraph.datasets.scene import Frame
 from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.mip_nerf import MipNeRF
@@ -72,7 +72,7 @@ def test_direction_changes_colour_and_not_density(generator):
 @pytest.mark.parametrize(("kind", "tolerance"), [(torch.float32, 1e-6), (torch.bfloat16, 1e-1)])
 @pytest.mark.parametrize("samples", [0, 1, 33, 200])
 def test_a_layer_and_its_gradients(samples, kind, tolerance, relu, generator, monkeypatch):
-    monkeypatch.setattr(dense, "product_type", lambda device: kind)
+    monkeypatch.setattr(layers, "product_type", lambda device: kind)
     layer = Dense(20, 24, relu)
     torch.nn.init.kaiming_uniform_(layer.weight, 5**0.5, generator=generator)
     torch.nn.init.normal_(layer.bias, generator=generator)
@@ -92,8 +92,8 @@ def test_a_layer_and_its_gradients(samples, kind, tolerance, relu, generator, mo
 
 def test_gradients_of_weights_are_summed_in_float32(monkeypatch):
     """Very many equal chunks: in bfloat16 the sum would stop growing at 256 times one of them."""
-    monkeypatch.setattr(dense, "product_type", lambda device: torch.bfloat16)
-    monkeypatch.setattr(dense, "CHUNK_CPU", 1)
+    monkeypatch.setattr(layers, "product_type", lambda device: torch.bfloat16)
+    monkeypatch.setattr(layers, "CHUNK_CPU", 1)
     layer = Dense(1, 1)
     (y,) = in_chunks(lambda x: (layer(x),), torch.ones(1000, 1))
     y.float().sum().backward()
@@ -102,7 +102,7 @@ def test_gradients_of_weights_are_summed_in_float32(monkeypatch):
 
 @pytest.mark.parametrize("samples", [0, 1, 7, 8, 30])
 def test_chunks_change_nothing(samples, generator, monkeypatch):
-    monkeypatch.setattr(dense, "CHUNK_CPU", 8)
+    monkeypatch.setattr(layers, "CHUNK_CPU", 8)
     network = CoordinateNetwork(6, 4, 3, 16, 2, **EXACT)
     x, d = torch.randn(samples, 6, generator=generator), torch.randn(samples, 4, generator=generator)
     for a, b in zip(in_chunks(network, x, d), network(x, d), strict=True):
@@ -110,7 +110,7 @@ def test_chunks_change_nothing(samples, generator, monkeypatch):
 
 
 def test_only_where_it_is_worth_asking(generator, monkeypatch):
-    monkeypatch.setattr(dense, "ROUND", 4)
+    monkeypatch.setattr(layers, "ROUND", 4)
     network = CoordinateNetwork(6, 4, 3, 16, 2, **EXACT)
     x, d = torch.randn(30, 6, generator=generator), torch.randn(30, 4, generator=generator)
     where = torch.rand(30, generator=generator) < 0.3

@@ -164,7 +164,7 @@ def test_a_short_budget_asks_fewer_photographs(monkeypatch):
         return [[] for _ in views]
 
     monkeypatch.setattr(dense_points.time, "perf_counter", lambda: next(clock))  # so that a sweep takes a second
-    monkeypatch.setattr(dense_points, "FEWEST_VIEWS", 3)
+    monkeypatch.setattr(dense_points, "MIN_VIEWS", 3)
     monkeypatch.setattr(dense_points, "choose_neighbours", alone)
     for seconds in (2.0, 8.0, math.inf):
         dense_points.dense_points(ball(), seconds)

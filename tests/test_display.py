@@ -18,8 +18,7 @@ from lumigraph.datasets.scene import Batch
 from lumigraph.run import build
 from lumigraph.system.console import console
 from lumigraph.training import fit
-from lumigraph.training.announce import how_long, learner, learnt_from, machine
-from lumigraph.training.display import TrainingDisplay, sizes, time_left
+from lumigraph.training.display import TrainingDisplay, how_long, learner, learnt_from, machine, sizes, time_left
 
 pytestmark = budget("runs", 8)
 

@@ -9,7 +9,7 @@ import torch
 from budgets import budget
 
 from lumigraph import kernels
-from lumigraph.kernels import HashLevels, _facts, composite, hash_encode, march, perceptron, rasterize, tile
+from lumigraph.kernels import HashLevels, _operation, composite, hash_encode, march, perceptron, rasterize, tile
 
 pytestmark = budget("kernels")
 
@@ -80,7 +80,7 @@ def test_a_door_refuses(call):
         call()
 
 
-@pytest.mark.parametrize("name", _facts.operations())
+@pytest.mark.parametrize("name", _operation.operations())
 def test_every_operation_has_a_door(name):
     assert hasattr(getattr(kernels, name), "__wrapped__")
 

@@ -13,7 +13,7 @@ from budgets import budget
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
 from lumigraph.components.fields.voxels import VoxelGrid, corners, shape_of, tight_box
-from lumigraph.components.training.lazy_adam import LazyAdam
+from lumigraph.components.training.row_optimizers import LazyAdam
 from lumigraph.datasets.scene import Frame
 from lumigraph.evaluation import evaluate
 from lumigraph.explain.activation import fits

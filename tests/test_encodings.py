@@ -8,7 +8,7 @@ import pytest
 import torch
 from budgets import budget
 
-from lumigraph.components.fields.encodings import FourierFeatures, FrequencyEncoding, IntegratedEncoding
+from lumigraph.components.fields.encodings import FourierEncoding, FrequencyEncoding, IntegratedEncoding
 
 pytestmark = budget("methods")
 
@@ -59,14 +59,14 @@ def test_gradients_of_frequencies(keep, generator):
 
 
 def test_gradients_of_fourier_features(generator):
-    encoding = FourierFeatures(torch.randn(6, 2, generator=generator)).double()
+    encoding = FourierEncoding(torch.randn(6, 2, generator=generator)).double()
     assert torch.autograd.gradcheck(encoding, points(generator, 5, 2).double().requires_grad_())
 
 
 def test_inner_products_of_fourier_features_know_only_differences(generator):
     """gamma(p) . gamma(q) = sum_j cos(2 pi b_j . (p - q)): the kernel is stationary (Tancik 2020, section 4)."""
     frequencies = 3 * torch.randn(64, 2, generator=generator)
-    encoding = FourierFeatures(frequencies).double()
+    encoding = FourierEncoding(frequencies).double()
     p, q = points(generator, 20, 2).double(), points(generator, 20, 2).double()
     product = (encoding(p) * encoding(q)).sum(1)
     expected = (2 * math.pi * (p - q) @ frequencies.double().t()).cos().sum(1)
@@ -76,8 +76,8 @@ def test_inner_products_of_fourier_features_know_only_differences(generator):
 
 
 def test_frequencies_survive_saving_and_octaves_need_none(generator):
-    encoding = FourierFeatures(torch.randn(4, 2, generator=generator))
-    other = FourierFeatures(torch.zeros(4, 2))
+    encoding = FourierEncoding(torch.randn(4, 2, generator=generator))
+    other = FourierEncoding(torch.zeros(4, 2))
     other.load_state_dict(encoding.state_dict())
     p = points(generator, 9, 2)
     assert torch.equal(other(p), encoding(p))

@@ -20,7 +20,7 @@ from listing import names
 
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import REORDERED, SUFFIXES, is_splat_file, read_gaussians, write_gaussians
-from lumigraph.exchange.morton import morton_order
+from lumigraph.exchange.codes import morton_order
 from lumigraph.exchange.spz import gzipped
 from lumigraph.gaussians import Gaussians, turned
 

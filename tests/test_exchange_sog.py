@@ -19,8 +19,8 @@ from test_gaussians import cloud as soft_cloud
 from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import is_splat_file, read_gaussians, write_gaussians
-from lumigraph.exchange.bundle import zipped
-from lumigraph.exchange.levels import levels, nearest_level
+from lumigraph.exchange.checks import zipped
+from lumigraph.exchange.codes import levels, nearest_level
 from lumigraph.exchange.sog import encode
 from lumigraph.gaussians.splatting import render
 from lumigraph.metrics import psnr

@@ -8,7 +8,7 @@ import torch
 from budgets import budget
 
 from lumigraph.capture import open_scene
-from lumigraph.capture.fewer import spread_out, with_fewer_views
+from lumigraph.capture.views import spread_out, with_fewer_views
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run

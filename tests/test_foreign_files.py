@@ -19,7 +19,7 @@ from PIL import Image
 from lumigraph import methods
 from lumigraph.capture.motion.folder import WRITTEN_FILES, claim_results, copy_photographs
 from lumigraph.capture.photos import Photo
-from lumigraph.capture.photos.track import untracked
+from lumigraph.capture.photos.photo import untracked
 from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import atomic as files
@@ -78,15 +78,23 @@ WRITE_NOTHING = {"info", "methods"}
 WITHIN_RUNS = {"resume", "view"}  # see the tests of checkpoints and of what is saved in the viewer
 
 
+@pytest.fixture(scope="module")
+def template(ball_run, ball_folder, tmp_path_factory) -> Path:
+    """A folder with four runs, photographs and a picture. Nobody may change it."""
+    folder = tmp_path_factory.mktemp("template")
+    shutil.copytree(ball_run.folder, folder / "ball")
+    shutil.copytree(ball_folder, folder / "photographs")
+    gs_run(folder / "gs")
+    octree_run(folder / "octree")
+    prior_run(folder / "prior")
+    Image.new("RGB", (16, 16)).save(folder / "one.png")
+    return folder
+
+
 @pytest.fixture
-def home(ball_run, ball_folder, tmp_path, monkeypatch):
-    """A folder with three runs, photographs, a picture, and things that nobody may touch."""
-    shutil.copytree(ball_run.folder, tmp_path / "ball")
-    shutil.copytree(ball_folder, tmp_path / "photographs")
-    gs_run(tmp_path / "gs")
-    octree_run(tmp_path / "octree")
-    prior_run(tmp_path / "prior")
-    Image.new("RGB", (16, 16)).save(tmp_path / "one.png")
+def home(template, tmp_path, monkeypatch) -> Path:
+    """A copy of the template, and the working directory."""
+    shutil.copytree(template, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

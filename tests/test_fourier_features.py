@@ -17,11 +17,10 @@ from PIL import Image
 from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.dense import Dense
+from lumigraph.components.fields.layers import Dense
 from lumigraph.datasets.scene import Frame
-from lumigraph.explain.encodings import GRID_POINTS, compare, kernel_at_start, learn
+from lumigraph.explain.encodings import GRID_POINTS, compare, kernel_at_start, learn, spectrum, tangent_kernel
 from lumigraph.explain.encodings_page import write_page
-from lumigraph.explain.tangent_kernel import spectrum, tangent_kernel
 from lumigraph.methods.fourier_features import Config, FourierFeatures, frequencies
 from lumigraph.run import build
 
@@ -154,7 +153,7 @@ def comparison(photograph):
 def test_gaussian_features_win_and_their_best_scale_lies_inside(comparison):
     assert comparison.gain > 5 and comparison.peak_inside and comparison.best("gaussian").scale == 4
     small, best, large = comparison.of("gaussian")
-    assert large.learnt - large.held_out > 5 > abs(small.learnt - small.held_out)  # too large learns by heart
+    assert large.learnt - large.held_out > 5 > abs(small.learnt - small.held_out)  # too large memorises
     assert len(comparison.fits) == 2 + 2 * 3 and [fit.encoding for fit in comparison.leading][0] == "none"
 
 

@@ -32,7 +32,7 @@ from lumigraph.paths.keyframes import CameraPath
 from lumigraph.run import Run, open_any
 from lumigraph.run.composition import CompositionPart, write_composition
 
-pytestmark = budget("capture", 10)
+pytestmark = budget("capture", 20)
 
 SEED = 18
 Open = Callable[[Path], object]

@@ -17,13 +17,12 @@ from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.components.training.exposure import gain_between
-from lumigraph.components.training.lights import spread_of_exposure
+from lumigraph.components.training.photometric import gain_between, spread_of_exposure
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import judged_by_halves, left_half
 from lumigraph.export.film import animated
 from lumigraph.files.ranges import changed
 from lumigraph.method.controls import Control, moment
@@ -400,7 +399,7 @@ def test_info_lists_controls(trained, capsys):
     ("command", "fault"),
     [
         (["eval", "--set", "contrast=1"], "no control 'contrast'; there are: brightness, ink, time"),
-        (["render", "--set", "brightness"], "--set brightness does not say what a control should be"),
+        (["render", "--set", "brightness"], "--set brightness gives no value for a control"),
         (["render", "--set", "brightness=9"], "brightness=9 cannot be; give a number from 0 to 2"),
         (["render", "--animate", "time=3"], "--animate time=3 goes nowhere"),
         (["render", "--animate", "time=3:9"], "time=9 cannot be"),
@@ -435,7 +434,7 @@ def test_an_export_shows_what_was_told(trained, tmp_path):
 
 def test_photographs_are_named(tmp_path):
     """A control that wants a photograph takes its name as well as its number."""
-    from lumigraph.commands.controls import open_method
+    from lumigraph.commands.options import open_method
 
     scene = tiny.scene()
     made = ngp(scene, exposure_correction="yes", refine_cameras=True)

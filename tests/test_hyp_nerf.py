@@ -15,15 +15,13 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
-from lumigraph.derive.conversion.ways import way
+from lumigraph.derive.conversion import way
 from lumigraph.errors import LumigraphError
 from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels
 from lumigraph.methods import find
 from lumigraph.methods.hyp_nerf import FOUND, HypNeRF, around, held, patch
-from lumigraph.methods.hyp_nerf.hash_instance import HashInstance, HashShape
-from lumigraph.methods.hyp_nerf.hypernetwork import HyperNetwork
-from lumigraph.methods.hyp_nerf.instance_codes import AVERAGE, InstanceCodes
+from lumigraph.methods.hyp_nerf.networks import AVERAGE, HashInstance, HashShape, HyperNetwork, InstanceCodes
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State
 

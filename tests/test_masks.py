@@ -16,12 +16,11 @@ from test_gaussian_splatting import new
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.motion.folder import copy_masks
-from lumigraph.capture.objects.masking import doubts, mask_object
-from lumigraph.capture.objects.region import find_table
+from lumigraph.capture.objects import doubts, mask_object
 from lumigraph.capture.objects.segment import segment
-from lumigraph.capture.objects.view import ObjectView
+from lumigraph.capture.objects.view import ObjectView, find_table
 from lumigraph.capture.photos import gather
-from lumigraph.capture.photos.track import untracked
+from lumigraph.capture.photos.photo import untracked
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
@@ -135,7 +134,7 @@ def test_an_object_before_a_wall_is_found_and_learnt_alone(tmp_path):
     folder = tmp_path / "scene"
     truth = write_ball(folder)
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    masked = mask_object(folder, choose_reader(folder).read(folder), untracked)
+    masked = mask_object(folder, choose_reader(folder).read(folder))
     assert masked.photographs == 12 and masked.sheet.is_file()
     assert any("no table" in doubt for doubt in masked.doubts)
     for name, inside in truth.items():
@@ -145,7 +144,7 @@ def test_an_object_before_a_wall_is_found_and_learnt_alone(tmp_path):
     scene = open_scene(folder)
     assert scene.frame.has_alpha and scene.frame.reach == 1
     with pytest.raises(LumigraphError, match="is there already"):
-        mask_object(folder, choose_reader(folder).read(folder), untracked)
+        mask_object(folder, choose_reader(folder).read(folder))
 
 
 def test_noise_holds_no_object():
@@ -156,7 +155,7 @@ def test_noise_holds_no_object():
         for i in range(len(scene))
     ]
     with pytest.raises(LumigraphError, match="no object can be told from the rest"):
-        segment(views, None, untracked)
+        segment(views, None)
 
 
 def test_what_is_unsure_is_told():
@@ -164,7 +163,7 @@ def test_what_is_unsure_is_told():
     rgb = [torch.from_numpy(photographed(pose)[0]) for pose in tiny.poses()[::2]]
     cameras = [scene.cameras[i].resized(SIDE / tiny.SIZE) for i in range(0, 12, 2)]
     views = [ObjectView.of(f"{i}.jpg", camera, x) for i, (camera, x) in enumerate(zip(cameras, rgb, strict=True))]
-    sure = replace(segment(views, None, untracked), overlaps=np.full(6, 0.9))
+    sure = replace(segment(views, None), overlaps=np.full(6, 0.9))
     assert sure.distinct > 0.95
     assert [doubt[:8] for doubt in doubts(sure)] == ["no table"]
     unsure = replace(sure, distinct=0.6, overlaps=np.where(np.arange(6) == 2, 0.3, 0.9), body=sure.region.cells)

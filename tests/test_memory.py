@@ -16,7 +16,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.export.film import film
 from lumigraph.files.ranges import changed
 from lumigraph.run import build
-from lumigraph.run.needs import bytes_of
+from lumigraph.run.settings import bytes_of
 from lumigraph.system import memory
 from lumigraph.system.memory import peak_memory, want_of_memory
 from lumigraph.training import fit
@@ -31,7 +31,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.export.film import film
 from lumigraph.system.memory import peak_memory, want_of_memory
 from lumigraph.run import build
-from lumigraph.run.needs import bytes_of
+from lumigraph.run.settings import bytes_of
 before = peak_memory(torch.device("cpu"))
 taken = torch.ones({size}, dtype=torch.uint8)
 del taken

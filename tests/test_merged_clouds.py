@@ -8,7 +8,7 @@ import pytest
 import torch
 from balls import WHITE, Pictured, Splatted, eye
 
-from lumigraph.camera.crop import Box
+from lumigraph.camera.crop import CropBox
 from lumigraph.composition import PickedCloud, Placed
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians import Gaussians, joined
@@ -62,7 +62,7 @@ def test_overlapping_blocks_give_the_world_once(world):
 
 
 def test_crops_are_cells_where_no_centres_are_given(world):
-    parts = [Placed(PickedCloud(WHITE, world), Similarity.make(1.0), Box(*x)) for x in CELLS]
+    parts = [Placed(PickedCloud(WHITE, world), Similarity.make(1.0), CropBox(*x)) for x in CELLS]
     one = merged(parts)
     inside = world.means[:, 0] < 2.0
     assert len(one) == int(inside.sum()) and torch.allclose(one.means.amax(0)[0], world.means[inside, 0].max())

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
 
 from lumigraph.camera import Camera
-from lumigraph.camera.crop import Box, Sphere
+from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
@@ -30,8 +30,7 @@ from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
-from lumigraph.export.polygons import BLOCK, Grid, zero_level
-from lumigraph.export.surface import simplified, smoothed
+from lumigraph.export.surface import BLOCK, Grid, simplified, smoothed, zero_level
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.run import Run
@@ -142,7 +141,7 @@ def test_a_crop_is_all_that_is_meshed(kind):
 def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     frame = Frame(bounds=((-0.4,) * 3, (0.4,) * 3), near=0.1, reach=4.0)
     assert meshed_box(frame, None).upper == pytest.approx((0.6,) * 3)
-    assert meshed_box(frame, 100.0) == Box((-4.0,) * 3, (4.0,) * 3)
+    assert meshed_box(frame, 100.0) == CropBox((-4.0,) * 3, (4.0,) * 3)
     assert meshed_box(replace(frame, reach=1.0), None).upper == pytest.approx((0.4,) * 3)
     mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, extent=2.0)
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1

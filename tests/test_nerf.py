@@ -11,7 +11,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.camera.rays import Rays
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
-from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.components.sampling.occupancy import OccupancyMask
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Forward, Frame, Scene
 from lumigraph.errors import LumigraphError

@@ -11,18 +11,16 @@ import torch
 from budgets import budget
 
 from lumigraph.camera.rays import Look, Rays, Samples
-from lumigraph.components.fields.appearance import PhotographCodes
-from lumigraph.components.fields.code_space import fitted
+from lumigraph.components.fields.appearance import PhotographCodes, fitted
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.method.controls import Control
-from lumigraph.methods.nerf_w import NeRFW
-from lumigraph.methods.nerf_w.transient import Transient, with_transient
+from lumigraph.methods.nerf_w import NeRFW, Transient, with_transient
 from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.volume import composite

@@ -12,13 +12,13 @@ from balls import RED, Splatted
 from budgets import budget
 
 import lumigraph
+from lumigraph import paths as films
 from lumigraph.commands import render
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.film import film
 from lumigraph.files import write_json
 from lumigraph.geometry import Similarity
-from lumigraph.paths import film as films
 from lumigraph.paths import film_cameras
 from lumigraph.run import Run, State, open_any
 from lumigraph.run.composition import CompositionPart, write_composition

@@ -14,9 +14,8 @@ import torch
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import packing
 from lumigraph.exchange.packing import Recipe, Stored, Table
-from lumigraph.exchange.packing.clusters import clustered, nearest
 from lumigraph.exchange.packing.file import HEAD, MAGIC
-from lumigraph.exchange.packing.forms import Coded, Half, Scaled, most_important
+from lumigraph.exchange.packing.forms import Coded, Half, Scaled, clustered, most_important, nearest
 from lumigraph.exchange.packing.streams import Stream, packed, unpacked
 
 HERE = Path("weights.packed")

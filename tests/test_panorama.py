@@ -22,8 +22,17 @@ from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export import panorama as panoramas
-from lumigraph.export.panorama import level_camera, panorama, save_sphere, sphere, standpoint
-from lumigraph.export.stereo import columns_at_once, stereo_pair, surrounding_distances, top_bottom
+from lumigraph.export.panorama import (
+    columns_at_once,
+    level_camera,
+    panorama,
+    save_sphere,
+    sphere,
+    standpoint,
+    stereo_pair,
+    surrounding_distances,
+    top_bottom,
+)
 from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import look_at
 from lumigraph.method import RayMethod

@@ -20,8 +20,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from lumigraph.capture.photos import Intake, gather, is_bare, is_video
 from lumigraph.capture.photos.judge import MIN_SHARPNESS, blurred, judge, sharpness
-from lumigraph.capture.photos.movement import Odometer
-from lumigraph.capture.photos.video import choose, extract
+from lumigraph.capture.photos.video import Odometer, choose, extract
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.export.video import open_video
 

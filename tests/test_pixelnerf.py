@@ -19,9 +19,7 @@ from lumigraph.components.fields.kept_photographs import KeptPhotographs, padded
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.pixelnerf.picture_encoder import PictureEncoder, finer
-from lumigraph.methods.pixelnerf.picture_lookup import look_up
-from lumigraph.methods.pixelnerf.residual_network import ResidualNetwork
+from lumigraph.methods.pixelnerf.networks import PictureEncoder, ResidualNetwork, finer, look_up
 from lumigraph.run import build
 
 pytestmark = budget("methods", 10)

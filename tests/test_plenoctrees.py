@@ -14,7 +14,7 @@ from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
-from lumigraph.export.octree import contents, parents
+from lumigraph.exchange.baked import contents, parents
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.kernels.octree_cells import Tree, code_of, levels_of

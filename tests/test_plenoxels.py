@@ -7,8 +7,8 @@ import tiny
 import torch
 
 from lumigraph import kernels
-from lumigraph.components.training.lazy_rmsprop import LazyRMSprop
-from lumigraph.components.training.sparsity import cauchy
+from lumigraph.components.training.regularizers import cauchy
+from lumigraph.components.training.row_optimizers import LazyRMSprop
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels import Nodes
 from lumigraph.methods.plenoxels import Config, Plenoxels, undecided

@@ -16,10 +16,10 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
-from lumigraph.capture.folds import about_fold
+from lumigraph.capture.oddities import about_fold
 from lumigraph.components.fields.encodings import FrequencyEncoding
-from lumigraph.components.training.coarse_to_fine import BEGINS, ENDS, FIRST, band_weights
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
+from lumigraph.components.training.schedules import BEGINS, ENDS, FIRST, band_weights
 from lumigraph.datasets.alignment import aligning, moves
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores

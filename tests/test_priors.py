@@ -19,10 +19,10 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import MAX_OPEN, Collection
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation.reveal import reveal
+from lumigraph.evaluation.views import reveal
 from lumigraph.method.prior import Prior
 from lumigraph.run import Run, State, build
-from lumigraph.run.inferred import Inferred
+from lumigraph.run.derived import Inferred
 from lumigraph.system import memory
 
 pytestmark = budget("capture", 20)
@@ -134,7 +134,7 @@ def test_what_is_no_prior_is_refused(prior, ball_run, ball_folder, tmp_path, cap
     again = said(capsys, "infer", tmp_path / "found", ball_folder, "--output", tmp_path / "other")
     assert "is no prior, for it learnt from photographs" in again
     many = said(capsys, "infer", prior.folder, "procedural:toys", "--output", tmp_path / "other")
-    assert "is told one scene" in many and "procedural:toys,member=0" in many
+    assert "takes one scene" in many and "procedural:toys,member=0" in many
 
 
 def test_more_views_than_memory_holds_are_refused(tmp_path, monkeypatch):

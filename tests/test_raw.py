@@ -15,8 +15,8 @@ from lumigraph.capture import open_scene
 from lumigraph.capture.motion.reconstruction import also_unreadable
 from lumigraph.capture.photos import gather
 from lumigraph.capture.raw import RawPhoto, is_raw, open_raw
-from lumigraph.capture.raw.demosaic import demosaiced, repeated
 from lumigraph.capture.raw.library import turned_pattern
+from lumigraph.capture.raw.photo import demosaiced, repeated
 from lumigraph.color.srgb import srgb_from_linear
 from lumigraph.datasets.images import resized
 from lumigraph.errors import LumigraphError, LumigraphWarning

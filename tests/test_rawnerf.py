@@ -15,12 +15,10 @@ from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
 from lumigraph.components.fields.development import decoded, encoded, exposed, toned, white
 from lumigraph.datasets.scene import Batch
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.light import in_light
-from lumigraph.export.exr import exr
-from lumigraph.export.film import film
+from lumigraph.evaluation.views import in_light
+from lumigraph.export.film import exr, film
 from lumigraph.files.ranges import changed
-from lumigraph.methods.rawnerf import RawNeRF, layers_of
-from lumigraph.methods.rawnerf.thin_lens import through_lens
+from lumigraph.methods.rawnerf import RawNeRF, layers_of, through_lens
 from lumigraph.training import fit
 
 

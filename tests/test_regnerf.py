@@ -12,8 +12,7 @@ import torch
 from budgets import budget
 
 from lumigraph.camera.rays import Samples
-from lumigraph.components.training.regularizers import near_thickness
-from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
+from lumigraph.components.training.regularizers import near_thickness, patches, roughness, unseen_cameras
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from lumigraph.components.sampling.frustums import blurred, frustum_moments
-from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.components.sampling.cone_sampler import blurred, frustum_moments
+from lumigraph.components.sampling.occupancy import OccupancyMask
 from lumigraph.components.sampling.sampling import inverse_transform, stratified
 
 

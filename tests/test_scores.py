@@ -15,7 +15,7 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.benchmark.cell import Cell, Settings
+from lumigraph.benchmark.cell import Cell, CellSettings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
 from lumigraph.budget import Budget
@@ -24,11 +24,10 @@ from lumigraph.datasets.shapes import Shapes
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes
 from lumigraph.evaluation.report import write_report
-from lumigraph.metrics import Score, named, scores_of
-from lumigraph.metrics.surfaces import chamfer_distance, intersection_over_union, normal_consistency
+from lumigraph.metrics import Score, chamfer_distance, intersection_over_union, named, normal_consistency, scores_of
 from lumigraph.run import Run, build
 from lumigraph.training import fit
-from lumigraph.viewer.training_panel import describe, measure_of
+from lumigraph.viewer.viewer import describe, measure_of
 
 pytestmark = budget("runs", 10)
 
@@ -191,12 +190,12 @@ def test_a_benchmark_of_shapes_has_their_columns(shaped, tmp_path, monkeypatch):
         log.parent.mkdir(parents=True, exist_ok=True)
         return main(list(arguments))
 
-    assert conduct([cell, dataclasses.replace(cell, seed=1)], Settings(device="cpu"), tmp_path, launch=here) == 0
+    assert conduct([cell, dataclasses.replace(cell, seed=1)], CellSettings(device="cpu"), tmp_path, launch=here) == 0
     page = (tmp_path / "results.md").read_text()
     assert "| IoU | chamfer-L1 | normal consistency |" in page and "PSNR |" not in page and "s/view" not in page
     rows = json.loads((tmp_path / "results.json").read_text())["cells"]
     assert all(f"{named(scores_of(row), 'IoU').value:.4f}" in page for row in rows) and "shown" not in rows[0]
-    assert conduct([cell], Settings(device="cpu"), tmp_path, launch=lambda *_: pytest.fail("it is done")) == 0
+    assert conduct([cell], CellSettings(device="cpu"), tmp_path, launch=lambda *_: pytest.fail("it is done")) == 0
     assert "| – |" in markdown([*rows, rows[0] | {"scores": None, "failed": "rain", "run": "b"}])
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lumigraph.figures import Row, contact_sheet
-from lumigraph.figures.sheet import SCREEN, Layout
+from lumigraph.figures import SCREEN, Layout, Row, contact_sheet
 
 
 def rows(count: int, height: int, width: int, columns: int = 4) -> list[Row]:

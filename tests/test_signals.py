@@ -32,7 +32,7 @@ COMMANDS = {
     "export mesh RUN OUT.ply": "lumigraph.export.mesh.render_depth_maps",
     "export points RUN OUT.ply": "lumigraph.export.points.render_depth_maps",
     "export panorama RUN OUT.png": "lumigraph.export.panorama.panorama",
-    "export stereo RUN OUT.png": "lumigraph.export.stereo.stereo_pair",
+    "export stereo RUN OUT.png": "lumigraph.export.panorama.stereo_pair",
     "export web RUN OUT.html": "lumigraph.export.page.views_page",
     "export splats RUN OUT.ply": "lumigraph.run.open_any",
     "compose RUN RUN --output OUT.json": "lumigraph.run.open_any",
@@ -176,9 +176,7 @@ def test_pycolmap_is_loaded_at_one_place():
 def test_children_die_with_their_parent(tmp_path):
     """A parent that is killed outright, and its child, which writes its number and sleeps."""
     child = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60)"
-    parent = (
-        f"import sys; from lumigraph.system.processes import start; start([sys.executable, '-c', {child!r}]).wait()"
-    )
+    parent = f"import sys; from lumigraph.system.signals import start; start([sys.executable, '-c', {child!r}]).wait()"
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
     with subprocess.Popen(
         [sys.executable, "-c", parent], env=environment, stdout=subprocess.PIPE, text=True

@@ -25,8 +25,8 @@ from lumigraph.files.ranges import changed
 from lumigraph.kernels.block_march import ALPHA
 from lumigraph.method.capabilities import HasAtlas, can
 from lumigraph.methods.snerg import ATLAS, FIELD, VOXELS, SNeRG
+from lumigraph.methods.snerg.baked_voxels import VisibilityGrid
 from lumigraph.methods.snerg.deferred_field import encoded
-from lumigraph.methods.snerg.visibility_grid import VisibilityGrid
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State, open_any
 from lumigraph.training import fit

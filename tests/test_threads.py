@@ -17,7 +17,7 @@ from lumigraph.system.allocation import USER_SETTINGS
 
 LOOP = """
 import lumigraph, torch, numpy
-from lumigraph.camera.lens.undistortion import undistort
+from lumigraph.camera.loops import undistort
 none = numpy.zeros((0, 2), numpy.float32)
 undistort(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
 print(torch.ones(1 << 18).exp().sum())

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lumigraph.methods.tensorf.factorised import FactorGrid
-from lumigraph.methods.tensorf.truncation import decomposed, truncate
+from lumigraph.methods.tensorf.factorised import FactorGrid, decomposed, truncate
 
 
 def seen(grid: FactorGrid, summed: bool) -> torch.Tensor:

@@ -9,7 +9,7 @@ from numba import njit
 
 from lumigraph.camera.rays import Look, Rays, Samples
 from lumigraph.components.sampling.proposal import Proposal, edges_of, proposal_loss
-from lumigraph.components.sampling.proposal_sampler import MIN_WEIGHT, ProposalNumbers, ProposalSampler
+from lumigraph.components.sampling.samplers import MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.training.regularizers import depth_loss, distortion_loss, scale_gradients
 from lumigraph.datasets.scene import Forward

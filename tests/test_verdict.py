@@ -96,7 +96,7 @@ def test_advice_follows_what_was_measured():
     assert "fewer steps than a draft" in advice(FLAT, False, more, True) and more in advice(None, False, more, True)
     assert advice(FLAT, True, more, True) == "it has settled; more photographs would help more than time"
     assert "photographs" not in advice(FLAT, True, more, False) and more not in advice(FLAT, True, more, False)
-    assert "cannot be told" in advice(None, True, more, True)
+    assert "it is unknown" in advice(None, True, more, True)
 
 
 @pytest.mark.parametrize(
@@ -126,4 +126,4 @@ def test_next_commands_name_the_run(tmp_path):
 
 
 def test_what_is_known_by_heart_is_said():
-    assert "by heart" in beside_training(25.0, 19.0) and beside_training(25.0, 24.0) == "25.00 dB while training"
+    assert "memorised" in beside_training(25.0, 19.0) and beside_training(25.0, 24.0) == "25.00 dB while training"

@@ -22,27 +22,23 @@ from budgets import budget
 from torch import nn
 from viewer_client import Client
 
-from lumigraph.camera.crop import Box
+from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.figures import EMPTY_COLOUR, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
-from lumigraph.gaussians.cleaning import cleaned
+from lumigraph.gaussians.cloud import cleaned
 from lumigraph.method import Method, RayMethod
 from lumigraph.run import Run
 from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
-from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
-from lumigraph.viewer.crop import render_inside
-from lumigraph.viewer.extras import PALETTE
-from lumigraph.viewer.flight import upwards
-from lumigraph.viewer.modes import along_axis, extra_modes, normals, picture
-from lumigraph.viewer.pace import Pace
-from lumigraph.viewer.painter import Painter
-from lumigraph.viewer.splats import UNIT_SCALE, splats
+from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, rows, upwards
+from lumigraph.viewer.modes import PALETTE, along_axis, extra_modes, normals, picture
+from lumigraph.viewer.painter import Pace, Painter
+from lumigraph.viewer.shared import render_inside
 from lumigraph.viewer.turns import IDLE_RENDER_SHARE, RENDER_SHARE, NotWantedError, Turns
-from lumigraph.viewer.view_request import ViewRequest
+from lumigraph.viewer.visitor import UNIT_SCALE, splats
 
 WHITE = (1.0, 1.0, 1.0)
 # A client may leave at any moment; viser warns of what was still on its way.
@@ -208,7 +204,7 @@ def test_extras_are_offered_once_a_rendering_has_them(learnt, tmp_path):
         assert visitor.request().mode == "colour"  # until another is chosen
         dropdown.value = "Labels"
         assert visitor.request().mode == "Labels"
-        visitor.painter.ask()
+        visitor.painter.request()
         label = 255 * hex_colour(PALETTE[3]).numpy()
         deadline = time.monotonic() + 20
         while np.abs(client.picture(width=120)[45, 90] - label).max() > 8:  # JPEG's loss
@@ -259,7 +255,7 @@ def test_a_crop_begins_where_rays_enter_the_box(learnt):
     camera = scene.cameras[0]  # on the side of positive x
     method = Walls(scene.frame)
     assert (method.render(camera).rgb[..., 0] == 1).all()
-    seen = render_inside(method, camera, Box((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)))
+    seen = render_inside(method, camera, CropBox((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)))
     inside = seen.opacity == 1
     assert inside.sum() > 50
     assert (seen.rgb[inside] == torch.tensor([0.0, 0.0, 1.0])).all()
@@ -278,7 +274,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
             return seen.with_extra(wall=1 + (seen.rgb[:, 2] > 0).long(), where=rays.origins)
 
     bands = [
-        render_inside(Numbered(scene.frame), rows(camera, a, b), Box((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)))
+        render_inside(Numbered(scene.frame), rows(camera, a, b), CropBox((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)))
         for a, b in ((0, 1), (1, tiny.SIZE))
     ]
     assert (bands[0].opacity == 0).all() and (bands[0].extra["wall"] == 0).all()
@@ -292,7 +288,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
 def test_a_crop_of_other_methods_goes_by_depth(learnt):
     scene, _ = learnt
     camera = scene.cameras[0]
-    seen = render_inside(Wall(scene.frame, None), camera, Box((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)))
+    seen = render_inside(Wall(scene.frame, None), camera, CropBox((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)))
     y = camera.rays(camera.pixels()).at(seen.depth.reshape(-1).nan_to_num(0, 0))[:, 1].view_as(seen.depth)
     inside = seen.opacity == 1
     assert 0 < inside.sum() < inside.numel()
@@ -302,7 +298,7 @@ def test_a_crop_of_other_methods_goes_by_depth(learnt):
 
 def test_a_crop_of_a_cloud_picks_centres():
     cloud = some_cloud(50)
-    box = Box((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
+    box = CropBox((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
     kept = cleaned(cloud, box).means
     assert 0 < len(kept) < 50
     assert (kept[:, 0].abs() <= 0.5).all() and (kept[:, 1] <= 0.2).all()
@@ -446,17 +442,17 @@ class Easel:
 def test_a_painter_refines_at_rest_and_drops_what_is_out_of_date():
     easel = Easel()
     easel.painter.start()
-    easel.painter.ask()
+    easel.painter.request()
     assert easel.painter.settled.wait(20)
     assert easel.done == [0.1, 0.5, math.inf]
     for held in (0.5, math.inf):
         easel.held = held
         easel.begun.clear()
         easel.done.clear()
-        easel.painter.ask()
+        easel.painter.request()
         while held not in easel.begun:
             time.sleep(0.005)
-        easel.painter.ask()
+        easel.painter.request()
         easel.held = None
         assert easel.painter.settled.wait(20)
         assert easel.begun == {0.5: [0.1, 0.5], math.inf: [0.1, 0.5, math.inf]}[held] + [0.1, 0.5, math.inf]
@@ -469,11 +465,11 @@ def test_a_painter_survives_a_fault():
     easel = Easel()
     good, easel.painter._draw = easel.painter._draw, lambda *_: 1 / 0
     easel.painter.start()
-    easel.painter.ask()
+    easel.painter.request()
     assert easel.painter.settled.wait(20)
     assert isinstance(easel.faults[0], ZeroDivisionError)
     easel.painter._draw = good
-    easel.painter.ask()
+    easel.painter.request()
     assert easel.painter.settled.wait(20)
     easel.painter.stop()
     assert easel.done[-1] == math.inf

@@ -14,9 +14,9 @@ from test_viewer import some_cloud, subject
 from viewer_client import Client
 
 import lumigraph.methods
-from lumigraph.camera.crop import Box, Sphere
+from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.errors import LumigraphError
-from lumigraph.gaussians.cleaning import ISOLATION, MAX_SCALE, cleaned
+from lumigraph.gaussians.cloud import ISOLATION, MAX_SCALE, cleaned
 from lumigraph.viewer import Viewer, choose_address
 from lumigraph.viewer.crop_panel import BOX, SPHERE, circles, edges
 
@@ -94,9 +94,9 @@ def test_a_box_is_dragged_by_its_corners(cloud_viewer):
     client.turn(panel._shape, BOX)
     until(lambda: {"lower", "upper", "outline"} <= panel._nodes.keys())
     lower, upper = visitor._shared.subject.frame.bounds
-    assert visitor.request().crop == Box(lower, upper) and visitor.request().depth
+    assert visitor.request().crop == CropBox(lower, upper) and visitor.request().depth
     client.drag(panel._nodes["upper"], (0.25, 0.0, 0.5))
-    until(lambda: visitor.request().crop == Box(lower, (0.25, 0.0, 0.5)))
+    until(lambda: visitor.request().crop == CropBox(lower, (0.25, 0.0, 0.5)))
     assert panel._upper.value == (0.25, 0.0, 0.5)
     assert np.allclose(panel._nodes["outline"].points.reshape(-1, 3).max(0), (0.25, 0.0, 0.5))
     until(lambda: len(visitor._splats.buffer) == len(cleaned(cloud, visitor.request().crop)))
@@ -110,7 +110,7 @@ def test_outlines_lie_on_what_they_outline():
     sphere = Sphere((0.1, -0.2, 0.3), 0.5)
     ends = torch.from_numpy(circles(sphere)).reshape(-1, 3)
     assert torch.allclose((ends - torch.tensor(sphere.middle)).norm(dim=-1), torch.tensor(0.5).double())
-    box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    box = CropBox((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     lengths = np.linalg.norm(np.diff(edges(box), axis=1)[:, 0], axis=-1)
     assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
 

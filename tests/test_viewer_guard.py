@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.viewer import Viewer
 from lumigraph.viewer.address import Address, choose_address, free_port
-from lumigraph.viewer.frames import MAX_MESSAGE_BYTES, understood
+from lumigraph.viewer.guard import MAX_MESSAGE_BYTES, understood
 
 pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 TOKEN = "a-token-nobody-guesses"

@@ -22,8 +22,7 @@ from lumigraph.camera.rays import Rays
 from lumigraph.commands.cli import main
 from lumigraph.derive.conversion import ConversionTarget, convert
 from lumigraph.errors import LumigraphError
-from lumigraph.exchange.baked import Octree
-from lumigraph.exchange.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
+from lumigraph.exchange.baked import Octree, atlas_for_browser, breadth_first, clearance, octree_for_browser
 from lumigraph.export import page as pages
 from lumigraph.export.page import volume_bytes, volume_page
 from lumigraph.run import open_any

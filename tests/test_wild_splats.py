@@ -16,18 +16,32 @@ from test_nerf_w import two_lights
 
 from lumigraph import kernels
 from lumigraph.color.blending import over
-from lumigraph.components.training.lights import spread_of_light
+from lumigraph.components.training.photometric import spread_of_light
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.methods.gaussian_splatting import GaussianSplatting
-from lumigraph.methods.gaussian_splatting.affine_colours import fit_colours, recoloured, recoloured_harmonics
-from lumigraph.methods.gaussian_splatting.appearance import MIN_SPREAD
+from lumigraph.methods.gaussian_splatting.appearance import (
+    MIN_SPREAD,
+    fit_colours,
+    mean_skies,
+    recoloured,
+    recoloured_harmonics,
+    sky,
+    sky_harmonics,
+    sky_loss,
+)
+from lumigraph.methods.gaussian_splatting.cloud import (
+    MIN_VIEWS,
+    VIEW_BITS,
+    view_count,
+    with_view,
+    zero_unobserved_sh,
+)
 from lumigraph.methods.gaussian_splatting.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers
-from lumigraph.methods.gaussian_splatting.sky import mean_skies, sky, sky_harmonics, sky_loss
 from lumigraph.methods.gaussian_splatting.tidying import (
     MAX_ANISOTROPY,
     MAX_SCALE,
@@ -35,13 +49,6 @@ from lumigraph.methods.gaussian_splatting.tidying import (
     camera_distance,
     clamped_scales,
     near_camera,
-)
-from lumigraph.methods.gaussian_splatting.view_count import (
-    MIN_VIEWS,
-    VIEW_BITS,
-    view_count,
-    with_view,
-    zero_unobserved_sh,
 )
 from lumigraph.run import Run, build
 from lumigraph.training import fit

@@ -174,9 +174,9 @@ def contract(points: torch.Tensor) -> torch.Tensor:
     return (2 - 1 / radius) / radius * points
 
 
-def curved(rays: Rays, near: float, voxel: float, fine: int = 40) -> torch.Tensor:
+def curved(rays: Rays, near: float, voxel: float, fine: int = 10) -> torch.Tensor:
     """Distances along rays, a voxel of contracted coordinates from each to the next, counted in much smaller steps."""
-    t = near + torch.cat([torch.arange(0, 8, voxel / fine), 8 / (1 - torch.arange(1, 2000) / 2000)])
+    t = near + torch.cat([torch.arange(0, 8, voxel / fine), 8 / (1 - torch.arange(1, 500) / 500)])
     path = contract(rays.origins[:, None] + t[:, None] * rays.directions[:, None])
     gone = torch.nn.functional.pad(path.diff(dim=1).norm(dim=-1).cumsum(1), (1, 0))
     wanted = (torch.arange(int(gone[:, -1].max() / voxel)) * voxel).expand(len(gone), -1)

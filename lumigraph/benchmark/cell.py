@@ -1,26 +1,48 @@
-"""A cell of a benchmark: one training and its evaluation, as commands that anybody could type."""
+"""A cell of a benchmark: one training and its evaluation, as commands that a user could type; its results as a row."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from .. import files
 from ..budget import Budget
 from ..capture import requested
 from ..errors import LumigraphError
+from ..files.ranges import Lasted, Tally, typed
+from ..metrics import Score
 from ..run import Run
-from ..run.inferred import Inferred
+from ..run.derived import Inferred
+from ..run.records import Protocol, ViewScores
 from ..synthetic import is_category
 
 SHEET = "views.png"
 MEMBERS = "-members"  # behind a collection's name: its members, averaged
+Row = dict[str, Any]
+MEASURED = (
+    "scores",
+    "psnr",
+    "ssim",
+    "lpips",
+    "steps",
+    "training_seconds",
+    "compile_seconds",
+    "peak_memory",
+    "seconds_per_view",
+    "protocol",
+    "trained_on",
+    "evaluated_on",
+    "versions",
+)
 
 
 @dataclass(frozen=True)
-class Settings:
+class CellSettings:
     """Settings of all cells of a benchmark: the command line's options of the same names.
 
     eval_views: number of held-out views to compare; `None` for all
@@ -44,7 +66,6 @@ class Cell:
     """A method, what it learns, and for how long: seconds or steps.
 
     scene:      its short name, the same for all cells of the scene
-    source:     where it is
     views:      photographs to learn from; None for all
     collection: the name of the one whose member the scene is, with which it is averaged
     prior:      the run that makes the cell's out of so many photographs, which learns nothing; its budget is then that
@@ -86,14 +107,14 @@ def duration(budget: Budget) -> str:
     return f"{budget.seconds:g} s" if budget.seconds else f"{budget.steps} steps"
 
 
-def training(cell: Cell, folder: Path, settings: Settings) -> list[str]:
+def training(cell: Cell, folder: Path, settings: CellSettings) -> list[str]:
     """Arguments of `lumigraph` that train or resume the cell; empty if it is trained."""
     if (folder / "config.json").exists():
         return [] if trained(folder) else ["resume", str(folder)]
     return [*train_command(cell, settings), "--output", str(folder)]
 
 
-def train_command(cell: Cell, settings: Settings) -> list[str]:
+def train_command(cell: Cell, settings: CellSettings) -> list[str]:
     downscale = reduced(cell.source, settings.downscale)
     opened = {"--views": cell.views, "--downscale": downscale, "--reader": settings.reader}
     if cell.prior:
@@ -116,7 +137,7 @@ def reduced(source: str, downscale: int | None) -> int | None:
     return None if request is not None and is_category(request) else downscale
 
 
-def evaluation(cell: Cell, folder: Path, settings: Settings) -> list[str]:
+def evaluation(cell: Cell, folder: Path, settings: CellSettings) -> list[str]:
     """Arguments of `lumigraph` that evaluate the cell; empty if that is done."""
     if evaluated(folder, settings):
         return []
@@ -139,7 +160,7 @@ def trained(folder: Path) -> bool:
     return run.has_state and Budget.from_json(run.settings.budget).progress(run.state.step, run.state.seconds) >= 1
 
 
-def evaluated(folder: Path, settings: Settings) -> bool:
+def evaluated(folder: Path, settings: CellSettings) -> bool:
     """True if a run's latest state was evaluated with these settings."""
     run = Run(folder)
     result = run.evaluation()
@@ -162,7 +183,7 @@ class Claim:
     scenes: dict[str, str]
 
 
-def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
+def claim(output: Path, cells: Sequence[Cell], settings: CellSettings) -> None:
     """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far, or
     if somebody else's files lie where the results go."""
     path = output / "settings.json"
@@ -183,3 +204,151 @@ def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
     for name in ("results.json", "results.md", SHEET, *(chart.name for chart in output.glob("*-over-*.svg"))):
         files.claim(output / name, "benchmark")
     files.write_json(path, known, ours=True)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Validated fields of every cell in results.json. run: its folder, within the output's"""
+
+    method: str
+    scene: str
+    budget: dict[str, Any]
+    seed: int
+    run: Annotated[str, msgspec.Meta(pattern=r"\Aruns/[^/\\\x00]+\Z")]
+    views: Tally | None = None
+    failed: str | None = None
+    collection: str = ""
+    prior: str | None = None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Validated fields of cells that did not fail."""
+
+    protocol: Protocol
+    train_views: Tally
+    model_bytes: Tally
+    peak_memory: Tally
+    steps: Tally
+    training_seconds: Lasted
+    compile_seconds: Lasted
+    trained_on: str
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+    scores: list[Score] = field(default_factory=list)
+    seconds_per_view: Lasted | None = None
+    shown: ViewScores | None = None
+    published: Published | None = None
+
+
+@dataclass(frozen=True)
+class Results:
+    """And of all of them."""
+
+    cells: list[Row] = field(default_factory=list)
+
+
+def row_of(cell: Cell, output: Path, settings: CellSettings, failure: str | None) -> Row:
+    """A cell's figures out of its run's folder, under the names that eval.json has for them; or why there are none."""
+    folder = output / "runs" / cell.name
+    row: Row = {
+        "method": cell.method,
+        "scene": cell.scene,
+        "views": cell.views,
+        "budget": {name: value for name, value in asdict(cell.budget).items() if value is not None},
+        "seed": cell.seed,
+        "command": shlex.join(["lumigraph", *train_command(public(cell), settings)]),
+        "run": f"runs/{cell.name}",
+        "failed": failure,
+        "collection": cell.collection,
+        "prior": cell.prior and Path(cell.prior).name,
+    }
+    if failure:
+        return row
+    run = Run(folder)
+    result = run.evaluation() or {}
+    figure = published(cell.method, cell.scene) if cell.views is None and settings.scales == 1 else None
+    row |= {name: result[name] for name in MEASURED if name in result}
+    row |= {
+        "train_views": run.settings.splits.get("train", 0) // settings.scales,
+        "model_bytes": run.model_bytes,
+        "published": figure and asdict(figure),
+    }
+    if (views := result.get("views")) and "members" not in result["protocol"]:
+        row["shown"] = views[len(views) // 2 // settings.scales]  # at full size
+    if "by_resolution" in result:
+        row["by_resolution"] = result["by_resolution"]
+    return row
+
+
+def public(cell: Cell) -> Cell:
+    """A cell without the places where its scene and its prior lie on this machine."""
+    source = cell.scene if Path(cell.source).exists() else cell.source
+    return replace(cell, source=source, prior=cell.prior and Path(cell.prior).name)
+
+
+def read_rows(output: Path) -> dict[str, Row]:
+    """The rows so far by their runs, earlier commands' among them."""
+    path = output / "results.json"
+    if not path.exists():
+        return {}
+    rows = files.read_json(path, Results).cells
+    for row in typed(list[Begun], rows, path):
+        Budget.from_json(row.budget, f"{path}: {row.run}")
+    typed(list[Measured], [row for row in rows if not row.get("failed")], path)
+    return {row["run"]: row for row in rows}
+
+
+@dataclass(frozen=True)
+class Published:
+    """Held-out PSNR in dB of one scene, at what resolution, and who says so."""
+
+    psnr: float
+    resolution: str
+    source: str
+
+
+FIGURES: dict[tuple[str, str], Published] = {
+    ("nerf", "lego"): Published(32.54, "800x800", "Mildenhall et al. 2020"),
+    ("nerf", "chair"): Published(33.00, "800x800", "Mildenhall et al. 2020"),
+    ("nerf", "fern"): Published(25.17, "1008x756", "Mildenhall et al. 2020"),
+    ("mip-nerf", "lego"): Published(35.70, "800x800", "Barron et al. 2021"),
+    ("instant-ngp", "lego"): Published(36.39, "800x800", "Müller et al. 2022, black background"),
+    ("gaussian-splatting", "lego"): Published(35.78, "800x800", "Kerbl et al. 2023"),
+    ("tensorf", "lego"): Published(36.46, "800x800", "Chen et al. 2022"),
+}
+
+
+@dataclass(frozen=True)
+class Few:
+    """Held-out PSNR in dB from few photographs, the mean of several scenes; where a figure's source says how many and
+    of what.
+
+    views: photographs that were learnt from; None where the source does not say
+    """
+
+    method: str
+    psnr: float
+    views: int | None
+    scenes: str
+    source: str
+
+
+STUDY = "a study of few photographs by others, protocol not known"
+FEW_VIEW_FIGURES: tuple[Few, ...] = (
+    Few("mip-nerf", 14.62, 3, "LLFF", "Niemeyer et al. 2022"),
+    Few("regnerf", 19.08, 3, "LLFF", "Niemeyer et al. 2022"),
+    Few("mip-nerf", 8.68, 3, "DTU", "Niemeyer et al. 2022"),
+    Few("regnerf", 18.89, 3, "DTU", "Niemeyer et al. 2022"),
+    Few("pixelnerf", 19.31, 3, "DTU", "Yu et al. 2021"),
+    Few("nerf", 24.3, None, "not stated", STUDY),
+    Few("pixelnerf", 23.2, None, "not stated", STUDY),
+    Few("regnerf", 25.2, None, "not stated", STUDY),
+    Few("snerg", 24.0, None, "not stated", STUDY),
+)
+
+
+def published(method: str, scene: str) -> Published | None:
+    """Figure of the method's own paper for a scene of this name; `None` if unknown."""
+    return FIGURES.get((method, scene.lower()))

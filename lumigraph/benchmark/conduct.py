@@ -1,25 +1,77 @@
-"""From cells to results: what is still to be done about each, in a process of its own, and the table after each."""
+"""Train and evaluate the cells of a benchmark, each in a process of its own, so that neither memory nor a fault of one
+affects another; after each, write the table and charts."""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
 from .. import files
+from ..capture.pictures import readable
 from ..errors import LumigraphError
+from ..evaluation import file_name
+from ..figures import Row as Line
+from ..figures import contact_sheet, save_picture
+from ..figures.charts import line_chart, standalone
 from ..files.locks import check_place, held
+from ..metrics import scores_of
+from ..run import Run
 from ..system.progress import clock, counting
-from .cell import Cell, Settings, claim, evaluation, training
-from .launch import STOP_CODES, Launch, claim_log, launch, reason
-from .pictures import draw_charts, draw_views
-from .results import read_rows, row_of
-from .table import markdown
+from ..system.signals import Interrupt, start
+from .cell import SHEET, Cell, CellSettings, Row, claim, evaluation, read_rows, row_of, training
+from .table import markdown, over_time, over_views, places, resolution
+
+Launch = Callable[[Sequence[str], Path], int]
+STOP_CODES = (130, 143)  # after Ctrl-C and SIGTERM
+PROMPT = b"$ lumigraph "  # each command in a log begins so
+POLL_SECONDS = 0.2  # seconds between looks at whether to stop
+
+
+def launch(arguments: Sequence[str], log: Path) -> int:
+    """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count.
+
+    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It does so too
+    when this process is killed. It stands apart from the terminal, which would send it Ctrl-C a second time.
+    """
+    with files.explained(log):
+        log.parent.mkdir(parents=True, exist_ok=True)
+        out = open(log, "ab")
+    with out, Interrupt() as interrupt:
+        out.write(PROMPT + f"{' '.join(arguments)}\n".encode())
+        out.flush()
+        command = [sys.executable, "-m", "lumigraph", *arguments]
+        process = start(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
+        passed_on = False
+        try:
+            while process.poll() is None:
+                if interrupt.signal and not passed_on and os.name != "nt":  # Windows signals both by itself
+                    process.send_signal(interrupt.signal)
+                    passed_on = True
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(POLL_SECONDS)
+        finally:
+            if process.poll() is None:  # a second Ctrl-C
+                process.kill()
+                process.wait()
+    if interrupt.signal:
+        return 128 + interrupt.signal  # even if the command was done just then
+    return process.returncode if process.returncode >= 0 else 128 - process.returncode
 
 
 def conduct(
     cells: Sequence[Cell],
-    settings: Settings,
+    settings: CellSettings,
     output: Path,
     tell: Callable[[str], object] = print,
     launch: Launch = launch,
@@ -38,7 +90,7 @@ def conduct(
 
 
 def carry_on(
-    cells: Sequence[Cell], settings: Settings, output: Path, tell: Callable[[str], object], launch: Launch
+    cells: Sequence[Cell], settings: CellSettings, output: Path, tell: Callable[[str], object], launch: Launch
 ) -> int:
     """All cells, one after the other, in a folder that is ours alone."""
     rows, patience = read_rows(output), Patience()
@@ -65,7 +117,7 @@ def carry_on(
     return 0
 
 
-def carry_out(cell: Cell, output: Path, settings: Settings, launch: Launch) -> tuple[int, str | None]:
+def carry_out(cell: Cell, output: Path, settings: CellSettings, launch: Launch) -> tuple[int, str | None]:
     """Train and evaluate a cell as far as that is not done. Returns the last exit code, and why it failed if it did."""
     folder, log = output / "runs" / cell.name, log_of(cell, output)
     for task in (training, evaluation):
@@ -83,7 +135,7 @@ def log_of(cell: Cell, output: Path) -> Path:
     return output / "runs" / f"{cell.name}.log"
 
 
-def unfinished(cell: Cell, output: Path, settings: Settings) -> bool:
+def unfinished(cell: Cell, output: Path, settings: CellSettings) -> bool:
     folder = output / "runs" / cell.name
     try:
         return bool(training(cell, folder, settings) or evaluation(cell, folder, settings))
@@ -104,3 +156,76 @@ class Patience:
         beside = sum(self.needed) / len(self.needed) if self.needed else 0.0
         seconds = sum(cell.seconds + beside for cell in todo)
         return f"{'about' if self.needed else 'at least'} {clock(max(seconds, 0))} left"
+
+
+def claim_log(log: Path) -> None:
+    """Raise LumigraphError unless lines may be added to a log: it is a benchmark's, or not there."""
+    with files.explained(log):
+        if os.path.lexists(log) and (log.is_symlink() or log.read_bytes()[: len(PROMPT)] != PROMPT):
+            raise LumigraphError(f"{log} is no log of a benchmark; move it away, or choose another --output")
+
+
+def reason(log: Path, code: int) -> str:
+    """Why a command failed: the sentence it said last."""
+    if code > 128:
+        return f"ended by signal {code - 128}" + (", perhaps because memory was short" if code == 137 else "")
+    lines = [line for line in log.read_text("utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1].removeprefix("lumigraph: ") if lines else f"exit code {code}"
+
+
+def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
+    """Draw what the rows have at least two points of. Returns the names of the files."""
+    drawn = []
+    for place, found in places([row for row in rows if not row["failed"]]):
+        seconds = {row["budget"].get("seconds") for row in found if row["views"] is None}
+        headline = scores_of(found[0])[0]
+        for name, series, label, ticks in (
+            ("time", over_time(found), "seconds of training", () if None in seconds else sorted(seconds)),
+            ("views", over_views(found), "photographs to learn from", sorted({row["train_views"] for row in found})),
+        ):
+            if not any(len(one.x) > 1 for one in series):
+                continue
+            chart = line_chart(
+                series,
+                label,
+                ", ".join(part for part in (f"held-out {headline.name}", headline.unit) if part),
+                log_x=True,
+                marks=True,
+                smoothed=False,
+                note=", ".join([*(one.name for one in series if len(series) == 1), place, resolution(found[0])]),
+                x_ticks=ticks,
+            )
+            drawn.append(f"{place}-{headline.name.lower().replace(' ', '-')}-over-{name}.svg")
+            files.write_bytes(output / drawn[-1], standalone(chart), "benchmark")
+    return drawn
+
+
+def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
+    """One held-out view of each scene as its photograph and as every method shows it, after its longest training."""
+    measured = [row for row in rows if not row["failed"] and "shown" in row]
+    best: dict[tuple[str, str, int], dict[str, Row]] = {}
+    for row in sorted(measured, key=lambda row: (*row["budget"].values(), -row["seed"])):
+        best.setdefault((row["scene"], row["shown"]["name"], row["train_views"]), {})[row["method"]] = row
+    methods = sorted({method for cells in best.values() for method in cells})
+    photographs: dict[tuple[str, str], Float[Tensor, "height width 3"]] = {}
+    lines = []
+    for (scene, name, views), cells in sorted(best.items()):
+        if (scene, name) not in photographs:  # opening a scene takes a while
+            opened = Run(output / next(iter(cells.values()))["run"]).scene()
+            shot = opened.photograph(opened.names.index(name))
+            photographs[scene, name] = shot.before(opened.frame.background)
+        truth = photographs[scene, name]
+        seen = [rendering(cells[method], output) if method in cells else torch.ones_like(truth) for method in methods]
+        scores = [str(scores_of(cells[method]["shown"])[0]) if method in cells else "" for method in methods]
+        lines.append(Line([f"{scene}, {views} views", *scores], [truth, *seen]))
+    if not lines:
+        return []
+    save_picture(output / SHEET, contact_sheet("Held-out views", ["photograph", *methods], lines), "benchmark")
+    return [SHEET]
+
+
+def rendering(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
+    """A run's rendering of a view, as the evaluation kept it."""
+    path = output / row["run"] / "eval" / f"{file_name(row['shown']['name'])}.png"
+    with readable(path), Image.open(path) as image:
+        return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255

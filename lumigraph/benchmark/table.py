@@ -1,18 +1,18 @@
-"""A benchmark as Markdown: a short table that averages seeds, and one with a row for each cell and its protocol."""
+"""A benchmark as Markdown and curves: a table that averages seeds, one with a row for each cell, scores over time."""
 
 from __future__ import annotations
 
 import re
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
+from .. import methods
+from ..budget import Budget
+from ..figures.charts import COLOURS, Series
 from ..metrics import named, scores_of
-from .cell import MEMBERS
-from .curves import learnt_for, over_views, places, together
-from .published import FEW_VIEW_FIGURES
-from .results import Row
+from .cell import FEW_VIEW_FIGURES, MEMBERS, Row, duration
 
 NONE = "–"
 
@@ -20,21 +20,22 @@ NONE = "–"
 def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
     """The whole page of a benchmark. pictures: names of files beside it."""
     measured = [row for row in rows if not row["failed"]]
-    parts = ["# Methods side by side", few_photographs(measured), short_table(measured)]
-    parts += ["\n".join(f"![{name}]({name})" for name in pictures)]
-    parts += ["## Every cell", full_table(rows)]
+    charts = "\n".join(f"![{name}]({name})" for name in pictures)
+    parts = ["# Methods side by side", few_photographs(measured), short_table(measured), charts]
     parts += [
+        "## Every cell",
+        full_table(rows),
         "PSNR in dB and SSIM are means over held-out views, larger is better; LPIPS (AlexNet), smaller is better. "
         "Of shapes, IoU and normal consistency are better when larger, chamfer-L1 (tenths of the longest side) when "
         "smaller. Training is without compiling, which happens on first use. Memory is the training process's peak, "
-        "on a GPU that of its tensors. Published figures follow their own protocols and are no figures of ours."
+        "on a GPU that of its tensors. Published figures follow their own protocols and are no figures of ours.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def few_photographs(rows: Sequence[Row]) -> str:
     """For each scene or collection a line for each method and a column for each number of photographs, with what
-    others report below; nothing where nobody learnt from fewer than all."""
+    others report below; empty where all cells learnt from all photographs."""
     parts = []
     for place, found in places(rows):
         if all(row["views"] is None for row in found):
@@ -183,3 +184,71 @@ def spread(values: Sequence[float | None], form: str) -> str:
 def size(bytes_: int) -> str:
     """A size in MB or GB as text; empty if unknown."""
     return NONE if not bytes_ else f"{bytes_ / 1e9:.2f} GB" if bytes_ >= 1e9 else f"{bytes_ / 1e6:.3g} MB"
+
+
+def together(row: Row) -> str:
+    """Key that rows are averaged by: the scene, or the collection that the scene is a member of."""
+    return row.get("collection") or row["scene"]
+
+
+def places(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row]]]:
+    """The rows of each scene and of each collection's members, by its name."""
+    for place in sorted(set(map(together, rows))):
+        yield place, [row for row in rows if together(row) == place]
+
+
+def over_time(rows: Sequence[Row]) -> list[Series]:
+    """The first score over seconds of training, from all photographs."""
+    return curves([row for row in rows if row["views"] is None], "training_seconds", learnt_for)
+
+
+def over_views(rows: Sequence[Row]) -> list[Series]:
+    """The first score over the number of photographs. Of a collection's members only what all of them have."""
+    members = {row["scene"] for row in rows}
+    points: dict[tuple[Any, ...], set[str]] = {}
+    for row in rows:
+        points.setdefault(point_of(row), set()).add(row["scene"])
+    return curves([row for row in rows if points[point_of(row)] == members], "train_views", point_of, per=learnt_for)
+
+
+def point_of(row: Row) -> tuple[str, int, str]:
+    return row["method"], row["train_views"], learnt_for(row)
+
+
+def learnt_for(row: Row) -> str:
+    """Budget of a row's cell as text; for a prior's cell, that of the other cells."""
+    return duration(Budget.from_json(row["budget"]))
+
+
+def curves(
+    rows: Sequence[Row], x: str, point: Callable[[Row], Any], per: Callable[[Row], Any] = lambda row: ""
+) -> list[Series]:
+    """The first score over x, a curve for each method. Cells of one point, which differ in their seeds or members
+    alone, are their means.
+
+    point: what cells of one point have in common;  per: what else tells curves apart, of one method by their dashes
+    """
+    groups: dict[tuple[str, Any], dict[Any, list[Row]]] = {}
+    for row in rows:
+        groups.setdefault((row["method"], per(row)), {}).setdefault(point(row), []).append(row)
+    others, drawn = sorted({other for _, other in groups}), colours({method for method, _ in groups})
+    series = []
+    for (method, other), points in sorted(groups.items()):
+        found = sorted(
+            (statistics.fmean(row[x] for row in cells), statistics.fmean(scores_of(row)[0].value for row in cells))
+            for cells in points.values()
+        )
+        name = f"{method}, {other}" if len(others) > 1 else method
+        x_of, y_of = [at for at, _ in found], [score for _, score in found]
+        series.append(Series(name, x_of, y_of, drawn[method], others.index(other)))
+    return series
+
+
+def colours(names: set[str]) -> dict[str, int]:
+    """The colour of each method in a chart of these: its own, or the next that is free where another has that."""
+    chosen: dict[str, int] = {}
+    for name in sorted(names, key=methods.colour):
+        own = methods.colour(name) % COLOURS
+        free = [own, *(colour for colour in range(COLOURS) if colour not in chosen.values())]
+        chosen[name] = free[1] if own in chosen.values() and len(free) > 1 else own
+    return chosen

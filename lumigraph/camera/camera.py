@@ -98,10 +98,8 @@ class Camera:
         For a batch of one: the shared projection of cells into silhouettes, masks and superpixels.
         """
         pixels, valid = self.project(points)
-        places, last = (
-            pixels.nan_to_num(-1.0, -1.0, -1.0).clamp(-1, 1e6).floor().long().flip(-1),
-            self.size[0].flip(-1) - 1,
-        )
+        places = pixels.nan_to_num(-1.0, -1.0, -1.0).clamp(-1, 1e6).floor().long().flip(-1)
+        last = self.size[0].flip(-1) - 1
         inside = valid & (places >= 0).all(-1) & (places <= last).all(-1)
         return places.clamp_min(0).minimum(last), inside
 
@@ -110,27 +108,26 @@ class Camera:
         size = (self.size * factor).round().clamp_min(1).to(self.size.dtype)
         return replace(self, size=size, lens=self.lens.resized((size.double() / self.size).to(self.pose.dtype)))
 
+    def reduced(self, factor: int) -> Camera:
+        """Cameras of pictures a whole number of times smaller, without the rows and columns that fill no square."""
+        scale = torch.full((1, 2), 1 / factor, device=self.pose.device)
+        return replace(self, lens=self.lens.resized(scale), size=self.size // factor)
+
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Camera:
         """The cameras in another frame, x' = M x: positions and eyes' distances scale, rotations stay rotations."""
         similarity = similarity.to(self.pose)
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
         rotation = similarity[:3, :3] / scale @ self.pose[:, :, :3]
         position = self.position @ similarity[:3, :3].mT + similarity[:3, 3]
-        return replace(
-            self, pose=torch.cat([rotation, position[:, :, None]], -1), lens=self.lens.enlarged(float(scale))
-        )
+        pose = torch.cat([rotation, position[:, :, None]], -1)
+        return replace(self, pose=pose, lens=self.lens.enlarged(float(scale)))
 
     @staticmethod
     def cat(cameras: Sequence[Camera]) -> Camera:
         """One batch from several."""
         pose, size = torch.cat([c.pose for c in cameras]), torch.cat([c.size for c in cameras])
-        return Camera(
-            pose,
-            Lens.cat([c.lens for c in cameras]),
-            size,
-            join(c.time for c in cameras),
-            join(c.image_index for c in cameras),
-        )
+        time, image_index = join(c.time for c in cameras), join(c.image_index for c in cameras)
+        return Camera(pose, Lens.cat([c.lens for c in cameras]), size, time, image_index)
 
 
 def ring(
@@ -140,7 +137,7 @@ def ring(
     size: int = 800,
     count: int = RING_CAMERAS,
 ) -> Camera:
-    """Cameras around a box that look at its middle, for what nobody has photographed.
+    """Cameras on a circle around a box, turned to its middle, for scenes without photographs.
 
     distance: from the middle, scene units
     angle:    of view, degrees

@@ -44,7 +44,7 @@ class Crop(ABC):
 
 
 @dataclass(frozen=True)
-class Box(Crop):
+class CropBox(Crop):
     """A box by two corners, of which lower is nowhere above upper.
 
     place: similarity from the frame in which the corners are said and the sides are upright
@@ -74,7 +74,7 @@ class Box(Crop):
         enter, leave = rays.through_box(rays.origins.new_tensor((self.lower, self.upper)))
         return enter * here.scale, leave * here.scale
 
-    def moved(self, place: Similarity) -> Box:
+    def moved(self, place: Similarity) -> CropBox:
         return replace(self, place=(place @ self._place).rows)
 
     @property

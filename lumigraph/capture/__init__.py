@@ -24,15 +24,15 @@ from .assemble import Before as Before
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
-from .fewer import with_all_views, with_fewer_views
 from .masks import with_masks
-from .multiscale import multiscale as multiscale
 from .part import CapturePart as CapturePart
+from .part import Places as Places
 from .part import part_of
+from .part import places_of as places_of
 from .pictures import list_images
-from .places import Places as Places
-from .places import places_of as places_of
 from .raw import with_raw
+from .views import multiscale as multiscale
+from .views import with_all_views, with_fewer_views
 
 READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"
@@ -173,7 +173,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
-    """The reader that knows what lies in a folder. Raises LumigraphError if none does."""
+    """The reader that recognises a folder. Raises LumigraphError if none does."""
     if not exists(folder):
         raise LumigraphError(f"{folder} does not exist; check the path")
     if not folder.is_dir():

@@ -14,16 +14,15 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Equirectangular, Lens, Pinhole
-from ..datasets.images import ImageSource, ImageStore, in_parallel, load
-from ..datasets.scene import Forward, Frame, Scene
+from ..datasets.images import ImageSource, in_parallel, load
+from ..datasets.scene import Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
 from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
-from .forward import find_forward
-from .normalise import ScenePlacement, find_place
+from .normalise import find_forward, find_place, similarity
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
@@ -89,16 +88,24 @@ def assemble(
 
     # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
     away = poses[:, :, 3].mean(0)
-    cameras = make_cameras(shots, moved(poses, translation(-away)), lenses, images.sizes)
-    upright = None if before is None else in_four(before.upright)
+    centred = similarity(np.eye(3), away, 1.0)
+    cameras = make_cameras(shots, moved(poses, centred), lenses, images.sizes)
+    upright = None if before is None else before.upright
     with counting("Looking for what the cameras look at"):
         place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
-    matrix = place.scene_from_source @ translation(-away)
+    matrix = place.scene_from_source @ centred
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
-    forward = None
-    if place.reach > 1 and capture.around is None:
+    frame = replace(
+        place.frame,
+        has_alpha=images.has_alpha,
+        image_count=len(images),
+        source_from_scene=tuple((a, b, c, d) for a, b, c, d in np.linalg.inv(matrix).tolist()),
+        times=span(cameras.time),
+    )
+    if frame.is_open and capture.around is None:
         train = splits["train"]
-        forward = find_forward(capture, [shots[i] for i in train.tolist()], cameras[train], matrix, place.near)
+        seen = [shots[i] for i in train.tolist()]
+        frame = replace(frame, forward=find_forward(capture, seen, cameras[train], matrix, frame.near))
     layers, left_out = make_layers(shots, chosen, images, matrix)
     for warning in left_out:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
@@ -106,7 +113,7 @@ def assemble(
     return Scene(
         cameras,
         images,
-        make_frame(place, matrix, images, forward, cameras.time),
+        frame,
         splits,
         [shot.name for shot in shots],
         capture.source,
@@ -165,16 +172,9 @@ def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
     near = (np.abs(capture.points) <= MAX_COORDINATE).all(-1)
     if near.all():
         return capture, []
-    kept = replace(
-        capture,
-        points=capture.points[near],
-        point_colours=None if capture.point_colours is None else capture.point_colours[near],
-        sightings=None if capture.sightings is None else capture.sightings[near],
-    )
     stray = counted(int((~near).sum()), "point")
-    return kept, [
-        f"{capture.source} has {stray} that are not finite or {MAX_COORDINATE:g} units away; using the others"
-    ]
+    told = f"{capture.source} has {stray} that are not finite or {MAX_COORDINATE:g} units away; using the others"
+    return capture.with_points(near), [told]
 
 
 def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:
@@ -191,26 +191,10 @@ def make_cameras(
     return Camera(torch.from_numpy(poses).float(), Lens.cat(lenses), sizes, time, torch.arange(len(shots)))
 
 
-def make_frame(
-    place: ScenePlacement,
-    scene_from_source: np.ndarray,
-    images: ImageStore,
-    forward: Forward | None,
-    time: Float[Tensor, " camera"] | None,
-) -> Frame:
-    back = np.linalg.inv(scene_from_source)
-    first, last = (None, None) if time is None else (float(time.min()), float(time.max()))
-    return Frame(
-        bounds=place.bounds,
-        reach=place.reach,
-        near=place.near,
-        background=place.background,
-        has_alpha=images.has_alpha,
-        image_count=len(images),
-        source_from_scene=tuple((a, b, c, d) for a, b, c, d in back.tolist()),
-        forward=forward,
-        times=None if first is None or last is None or first == last else (first, last),
-    )
+def span(times: Float[Tensor, " camera"] | None) -> tuple[float, float] | None:
+    """First and last moment; None where there are none, or one alone."""
+    found = None if times is None else (float(times.min()), float(times.max()))
+    return None if found is None or found[0] == found[1] else found
 
 
 def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "camera 3 4"]:
@@ -218,18 +202,6 @@ def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4
     rotation = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ poses[:, :, :3]
     position = poses[:, :, 3] @ matrix[:3, :3].T + matrix[:3, 3]
     return np.concatenate([rotation, position[:, :, None]], -1)
-
-
-def in_four(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix
-
-
-def translation(by: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, 3] = by
-    return matrix
 
 
 def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:

@@ -19,7 +19,7 @@ from ..datasets.images import ImageStore, Layer, LayerSource, in_parallel, resiz
 from ..datasets.images.layer import known
 from ..depth_maps import back_project
 from ..errors import LumigraphError
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from .capture import Capture, PixelPlane, Shot
 from .numbers import kind_of, read_numbers
 from .photos.exif import exposure
@@ -33,10 +33,8 @@ DEPTH_VIEWS, POINTS_PER_VIEW = 64, 300  # depth maps that sparse points are draw
 def make_layers(
     shots: list[Shot], chosen: list[Chosen], images: ImageStore, scene_from_source: Float[np.ndarray, "4 4"]
 ) -> tuple[dict[str, Layer], list[str]]:
-    """Layers by name, nothing of which is read yet; and what the user should know, one sentence each.
-
-    Raises LumigraphError where values of one name are not of one kind, or a file's header cannot be read.
-    """
+    """Layers by name, nothing of which is read yet; and what the user should know, one sentence each. Raises
+    LumigraphError where values of one name are not of one kind, or a file's header cannot be read."""
     unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
     turn = scene_from_source[:3, :3] / unit
     found = [shot.planes | own_bits(c.plane) for shot, c in zip(shots, chosen, strict=True)]

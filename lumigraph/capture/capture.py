@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from ..camera.lens import Lens
 
@@ -111,3 +111,10 @@ class Capture:
     around: tuple[tuple[float, float, float], float] | None = None
     notes: list[str] = field(default_factory=list)
     kept: bool = False
+
+    def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
+        """The capture with some of its points alone."""
+        points, colours, sightings = (
+            None if x is None else x[kept] for x in (self.points, self.point_colours, self.sightings)
+        )
+        return replace(self, points=points, point_colours=colours, sightings=sightings)

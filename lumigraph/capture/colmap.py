@@ -22,24 +22,9 @@ MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colm
 MAX_SIDE = 10**5  # pixels
 EXPECTED_FILES = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
 
-# COLMAP's list of parameters begins with one focal length or two and the centre. For each model, which it is, and where
-# the rest of the list has what our lenses call their distortion.
-FOCAL_AND_CENTRE = {1: (0, 0, 1, 2), 2: (0, 1, 2, 3)}
-PLANAR = {
-    "SIMPLE_PINHOLE": (1, ()),
-    "PINHOLE": (2, ()),
-    "SIMPLE_RADIAL": (1, (3,)),
-    "RADIAL": (1, (3, 4)),
-    "OPENCV": (2, (4, 5, 6, 7)),
-    "FULL_OPENCV": (2, (4, 5, 6, 7, 8, 9, 10, 11)),
-}
-FISHEYE = {
-    "SIMPLE_FISHEYE": (1, ()),
-    "FISHEYE": (2, ()),
-    "SIMPLE_RADIAL_FISHEYE": (1, (3,)),
-    "RADIAL_FISHEYE": (1, (3, 4)),
-    "OPENCV_FISHEYE": (2, (4, 5, 6, 7)),
-}
+# COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
+PLANAR = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 
 
 def recognises(folder: Path) -> bool:
@@ -56,10 +41,8 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder.
-
-    Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and absent image folders.
-    """
+    """The capture in a folder. Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and
+    absent image folders."""
     place = model_folder(folder)
     assert place is not None
     model = read_model(place)
@@ -80,8 +63,7 @@ def read(folder: Path) -> Capture:
             f"{folders[min(folders)]} holds none of the {len(names)} photographs that {place} lists, "
             f"such as {names[0]}; put them into {folder / 'images'}"
         )
-    cloud = read_points(place, model)
-    return Capture(str(folder), shots, cloud.positions, cloud.colours, cloud.sightings, missing)
+    return Capture(str(folder), shots, missing=missing, **vars(read_points(place, model)))
 
 
 def read_model(place: Path) -> pycolmap.Reconstruction:
@@ -106,8 +88,8 @@ def read_model(place: Path) -> pycolmap.Reconstruction:
 
 
 def check_whole(place: Path) -> None:
-    """Walk through a binary model: pycolmap would ask for all the memory there is, or go on for hours, to read lists
-    that are longer than their file.
+    """Walk through a binary model: to read a list that is longer than its file, pycolmap would allocate all memory or
+    run for hours.
 
     Raises LumigraphError for a list that ends early, and for a rotation that is none.
     """
@@ -125,7 +107,6 @@ def check_whole(place: Path) -> None:
 
 def walk_images(data: bytes, path: Path) -> int:
     """Per image an id, a pose of seven numbers, a camera, a name that ends in zero, and a list of (x, y, point).
-
     Returns where the list ends, as the other walks do."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
@@ -175,9 +156,9 @@ def check_text(path: Path) -> None:
                 check_turn([float(word) for word in words[1:5]] or [1.0], words[-1], path)
 
 
-def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
-    """Camera position of each photograph."""
-    return {i.name: i.cam_from_world().inverse().translation for i in model.images.values() if i.has_pose}
+def poses_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Camera-to-world pose (3, 4) of each placed photograph, by its name."""
+    return {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values() if i.has_pose}
 
 
 def read_points(place: Path, model: pycolmap.Reconstruction) -> SparsePoints:
@@ -205,12 +186,11 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
             f"{place}: camera {camera.camera_id} has model {kind}, which no lens here follows; "
             f"run COLMAP's image_undistorter and use its folder"
         )
-    focals, bends = (PLANAR | FISHEYE)[kind]
-    four = p[list(FOCAL_AND_CENTRE[focals])]
-    distortion = torch.zeros(1, 8 if kind in PLANAR else 4)
-    distortion[0, : len(bends)] = p[list(bends)]
+    parts = camera.focal_length_idxs(), camera.principal_point_idxs(), camera.extra_params_idxs()
+    focal, centre, bends = (p[None, list(part)] for part in parts)
+    focal = focal.expand(1, 2).contiguous()
     if kind in FISHEYE:
-        return Fisheye(four[None, :2], four[None, 2:], distortion)
-    if not distortion.any():
-        return Pinhole(four[None, :2], four[None, 2:])
-    return OpenCV(four[None, :2], four[None, 2:], distortion)
+        return Fisheye(focal, centre, torch.nn.functional.pad(bends, (0, 4 - bends.shape[1])))
+    if not bends.any():
+        return Pinhole(focal, centre)
+    return OpenCV(focal, centre, torch.nn.functional.pad(bends, (0, 8 - bends.shape[1])))

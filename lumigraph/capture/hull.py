@@ -16,19 +16,12 @@ from ..datasets.images import ImageStore
 from ..datasets.scene import Vector
 
 MAX_VIEWS = 24
-GRID_SIDES = (
-    32,
-    32,
-    64,
-)  # cells along each side of the searched box, one per round; each round searches the result of the last
+GRID_SIDES = (32, 32, 64)  # cells along each side of the searched box; each round searches the result of the last
 MAX_DOUBLINGS = 2  # of the first box, while the hull touches its walls
 MIN_OPACITY = 8  # of 255: a pixel of higher opacity, or further from the background, belongs to the object
 BORDER_SHARE = 0.97  # of the pixels at the pictures' edges have one colour, where there is a plain background
 MIN_VIEW_SHARE = 0.5  # share of the views that must have a point inside their picture
-MAX_DISAGREEMENTS = (
-    0.0,
-    0.1,
-)  # share of the views that may disagree: first none, then some, because masks are seldom perfect
+MAX_DISAGREEMENTS = (0.0, 0.1)  # share of the views: first none, then some, because masks are seldom perfect
 
 
 @dataclass(frozen=True)
@@ -39,26 +32,19 @@ class Silhouette:
     inside: Bool[Tensor, "height width"]
 
 
-@dataclass(frozen=True)
-class Silhouettes:
-    """Outlines of an object, and the colour it stands before: the photographs' own, or white where they have alpha."""
-
-    outlines: list[Silhouette]
-    background: Vector
-
-
 def silhouettes(
     cameras: Camera, images: ImageStore, views: list[int], centre: Float[np.ndarray, " 3"]
-) -> Silhouettes | None:
-    """Outlines of an object that has alpha or stands before one plain colour.
+) -> tuple[list[Silhouette], Vector] | None:
+    """Outlines of an object that has alpha or stands before one plain colour. None where the photographs show neither.
 
-    None where the photographs show neither. centre: what the cameras look at, roughly
+    centre: what the cameras look at, roughly
+    Returns also the colour behind the object: that of the photographs, or white where they have alpha.
     """
     position = cameras.position[views].double().numpy() - centre
     position /= np.linalg.norm(position, axis=-1, keepdims=True).clip(min=1e-9)
     chosen = [views[i] for i in farthest(position, MAX_VIEWS)]
     if images.has_alpha:
-        return Silhouettes([Silhouette(cameras[i], images[i][..., 3] > MIN_OPACITY) for i in chosen], (1.0, 1.0, 1.0))
+        return [Silhouette(cameras[i], images[i][..., 3] > MIN_OPACITY) for i in chosen], (1.0, 1.0, 1.0)
     if not isinstance(cameras.lens, Pinhole | OpenCV):
         return None  # the black around a fisheye's circle is no background
     edges = torch.cat([border(images[i]) for i in chosen]).int()
@@ -66,7 +52,7 @@ def silhouettes(
     if not differs(edges, colour).float().mean() <= 1 - BORDER_SHARE:
         return None
     red, green, blue = (colour / 255).tolist()
-    return Silhouettes([Silhouette(cameras[i], filled(differs(images[i], colour))) for i in chosen], (red, green, blue))
+    return [Silhouette(cameras[i], filled(differs(images[i], colour))) for i in chosen], (red, green, blue)
 
 
 def differs(pixels: Tensor, colour: Tensor) -> Tensor:
@@ -92,10 +78,8 @@ def filled(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]
 def hull_box(
     outlines: list[Silhouette], centre: Float[np.ndarray, " 3"], half: float
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
-    """Two corners of the box around the object, which lies within about `half` of `centre`.
-
-    None where the silhouettes enclose nothing, or no end to it.
-    """
+    """Two corners of the box around the object, which lies within about `half` of `centre`. None where the silhouettes
+    enclose nothing, or no end to it."""
     for slack in MAX_DISAGREEMENTS:
         low, high = centre - half, centre + half
         for _ in range(MAX_DOUBLINGS + 1):
@@ -126,7 +110,7 @@ def carve(
     cell = (high - low) / grid
     axes = [torch.from_numpy(low[k] + cell[k] * (np.arange(grid) + 0.5)).float() for k in range(3)]
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is proposal_loss
+    radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is lost
     seen, missed = torch.zeros(len(points)), torch.zeros(len(points))
     for outline in outlines:
         places, inside_picture = outline.camera.locate(points)

@@ -31,10 +31,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder.
-
-    Raises LumigraphError where the array is no such table or its rows are not as many as there are images.
-    """
+    """The capture in a folder. Raises LumigraphError where the array is no such table or its rows are not as many as
+    there are images."""
     path = folder / "poses_bounds.npy"
     try:
         table = np.array(load_array(path))
@@ -62,10 +60,8 @@ def read(folder: Path) -> Capture:
         pose = np.stack([right, down, -backward, position], -1)
         shots.append(Shot(name, pose, lens, size, files, depths=(float(depths[0]), float(depths[1]))))
     cloud = folder / "sparse/0/points3D.bin"
-    if not cloud.is_file():
-        return Capture(str(folder), shots)
-    points = read_points3d(cloud)
-    return Capture(str(folder), shots, points.positions, points.colours, points.sightings)
+    points = vars(read_points3d(cloud)) if cloud.is_file() else {}
+    return Capture(str(folder), shots, **points)
 
 
 def lens_of(width: float, height: float, focal: float, bend: tuple[float, float] | None) -> Lens:

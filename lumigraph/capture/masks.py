@@ -25,12 +25,8 @@ IMAGE_FOLDERS = ("images", "image", "input", "photos", "photographs", "frames") 
 
 def find_mask(folder: Path, name: str) -> Path | None:
     """The mask of a photograph in a folder of masks; None where there is none."""
-    for within in inner_names(name):
-        candidates = (folder / f"{within}.png", folder / PurePosixPath(within).with_suffix(".png"))
-        for path in candidates:
-            if path.is_file():
-                return path
-    return None
+    names = (x for own in inner_names(name) for x in (f"{own}.png", PurePosixPath(own).with_suffix(".png")))
+    return next((folder / x for x in names if (folder / x).is_file()), None)
 
 
 def inner_names(name: str) -> Iterator[str]:
@@ -53,22 +49,21 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
             shot if shot.mask is not None else replace(shot, mask=find_mask(folder / MASKS, shot.name))
             for shot in shots
         ]
-        tell_unmatched(folder / MASKS, any(shot.mask is not None for shot in shots))
+        warn_unmatched(folder / MASKS, any(shot.mask is not None for shot in shots))
     if (folder / OBJECT_MASKS).is_dir():
         found = [replace(shot, alpha=find_mask(folder / OBJECT_MASKS, shot.name)) for shot in shots]
         there = [shot for shot in found if shot.alpha is not None]
-        tell_unmatched(folder / OBJECT_MASKS, bool(there))
+        warn_unmatched(folder / OBJECT_MASKS, bool(there))
         if there:
             missing += [f"{OBJECT_MASKS} of {shot.name}" for shot in found if shot.alpha is None]
             shots = there
     return replace(capture, shots=shots, missing=missing)
 
 
-def tell_unmatched(folder: Path, matched: bool) -> None:
+def warn_unmatched(folder: Path, matched: bool) -> None:
     if not matched and list_images(folder):
-        warnings.warn(
+        text = (
             f"None of the masks in {folder} is named after a photograph, so they are passed over; call them "
-            "image.png or image.jpg.png for image.jpg",
-            LumigraphWarning,
-            3,
+            "image.png or image.jpg.png for image.jpg"
         )
+        warnings.warn(text, LumigraphWarning, 3)

@@ -40,11 +40,8 @@ def read_shapes(path: Path) -> Shapes:
     Of many, every 8th by name is for testing. What the Shapes should tell its user is a LumigraphWarning too.
     Raises LumigraphError for files that hold no surface and no points.
     """
-    files = (
-        [path]
-        if path.is_file()
-        else sorted(filter(is_mesh, path.rglob("*")), key=lambda file: natural(file.as_posix()))
-    )
+    found = [path] if path.is_file() else filter(is_mesh, path.rglob("*"))
+    files = sorted(found, key=lambda file: natural(file.as_posix()))
     if not files:
         raise LumigraphError(f"{path} holds no meshes; name a file or a folder of {', '.join(SUFFIXES)}")
     members = [read_shape(file, name_of(file, path)) for file in track(files, "Reading meshes", len(files))]
@@ -114,7 +111,7 @@ def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
         found = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
         if part.visual.defined and len(found) == len(part.vertices):
             return found
-    except Exception:  # a picture that is missing should keep nobody from the shape
+    except Exception:  # a missing texture must not prevent reading the shape
         pass
     return np.full((len(part.vertices), 3), DEFAULT_GREY, np.uint8)
 
@@ -122,12 +119,9 @@ def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
 def cloud(part: Any) -> Mesh:
     points = np.asarray(part.vertices, np.float64)
     colours = np.asarray(getattr(part, "colors", ()))
-    known = (
-        colours[:, :3].astype(np.uint8)
-        if len(colours) == len(points)
-        else np.full((len(points), 3), DEFAULT_GREY, np.uint8)
-    )
-    return Mesh(points, np.zeros((0, 3), np.int64), known)
+    if len(colours) != len(points):
+        colours = np.full((len(points), 3), DEFAULT_GREY)
+    return Mesh(points, np.zeros((0, 3), np.int64), colours[:, :3].astype(np.uint8))
 
 
 def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
@@ -136,7 +130,7 @@ def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
         return None
     try:
         table = PlyData.read(path)["vertex"].data
-    except Exception:  # read by another library before, which knows of no normals either
+    except Exception:  # it was read by another library, which has no normals either
         return None
     if not {"nx", "ny", "nz"} <= set(table.dtype.names):
         return None

@@ -1,4 +1,5 @@
-"""Place a capture: the similarity that maps its box of interest into [-1, 1]^3, and the reach of the rest.
+"""The similarity that maps a capture's box of interest into [-1, 1]^3, the reach of the rest, and the plane in front of
+all that forward-facing cameras see.
 
 Three kinds of knowledge, best first: what the source says itself, silhouettes of an object, and sparse points together
 with where the cameras look. Nothing here depends on which program found the poses, nor on a user's numbers.
@@ -12,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from ..camera import Camera
 from ..datasets.images import ImageStore
-from ..datasets.scene import Vector
-from ..geometry.choice import evenly
-from .capture import Capture
+from ..datasets.scene import Forward, Frame, Vector
+from ..geometry import evenly
+from .capture import Capture, Shot
 from .hull import hull_box, silhouettes
 from .up import find_upright, upright_by
 
@@ -33,17 +35,20 @@ MIN_NEAR = 1e-3
 INDOOR_NEAR = 0.02  # of the half-size: near distance for cameras inside a box, without other evidence
 ZERO_EXTENT = 1e-9  # units of the source that count as zero
 SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
+MIN_AXIS_COSINE = math.cos(math.radians(30))  # of the angle between a camera's axis and the mean camera's
+MAX_TANGENT = math.tan(math.radians(70))  # of the angle between a viewing ray and the mean camera's axis
+MAX_MAGNIFICATION = 2.0  # relative to infinity: a plane just before the cameras must not squeeze the background
+BORDER_POINTS = tuple((x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0))  # of a picture, and its centre
+NEAR_PLANE_SCALE = 0.75  # times the distance from the mean camera to the nearest point, as in LLFF
+OUTLIER_SHARE = 0.005  # of the sparse points may lie nearer
 
 
 @dataclass(frozen=True)
 class ScenePlacement:
-    """The frame of a scene: scene_from_source is the similarity x_scene = M x_source; the rest as in `Frame`."""
+    """The similarity x_scene = M x_source, and the scene's frame as far as it follows from its geometry."""
 
     scene_from_source: Float[np.ndarray, "4 4"]
-    bounds: tuple[Vector, Vector]
-    reach: float
-    near: float
-    background: Vector
+    frame: Frame
 
 
 UNIT_CUBE: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -56,7 +61,7 @@ def find_place(
     cameras: Camera,
     images: ImageStore,
     views: list[int],
-    upright: Float[np.ndarray, "4 4"] | None = None,
+    upright: Float[np.ndarray, "3 3"] | None = None,
 ) -> ScenePlacement:
     """Placement of the capture.
 
@@ -68,24 +73,24 @@ def find_place(
     if capture.bounds is not None:
         return stated_place(capture, cameras, background)
     upright = upright_of(capture, cameras) if upright is None else upright
-    turned = cameras.transformed(torch.from_numpy(upright))
+    turned = cameras.transformed(torch.from_numpy(similarity(upright, np.zeros(3), 1.0)))
     if capture.around is not None:
         return part_place(capture, turned, upright, background)
     gaze = find_gaze(capture, turned, upright)
     found = silhouettes(turned, images, views, gaze.centre)
-    box = None if found is None else hull_box(found.outlines, gaze.centre, gaze.distance)
+    box = None if found is None else hull_box(found[0], gaze.centre, gaze.distance)
     if found is None or box is None:
         return open_place(capture, upright, gaze, background)
-    return object_place(upright, box, turned, capture.background or found.background)
+    return object_place(upright, box, turned, capture.background or found[1])
 
 
-def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "4 4"]:
+def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings up to +z in a capture's frame: none where it states bounds, which stand upright."""
     if capture.bounds is not None:
-        return np.eye(4)
+        return np.eye(3)
     if capture.up is not None:
         return upright_by(np.array(capture.up))
-    cloud = reliable_points(capture, np.eye(4))
+    cloud = reliable_points(capture, np.eye(3))
     return find_upright(cameras, None if cloud is None else cloud.points)
 
 
@@ -95,7 +100,7 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
     cameras: in the turned frame
     """
     assert capture.around is not None
-    centre, half = upright[:3, :3] @ np.array(capture.around[0]), capture.around[1]
+    centre, half = upright @ np.array(capture.around[0]), capture.around[1]
     cloud = reliable_points(capture, upright)
     depths = None if cloud is None else visible_depths(cameras, cloud)
     near = INDOOR_NEAR * half if depths is None else NEAR_SCALE * float(np.nanpercentile(depths[:, 0], 2))
@@ -105,9 +110,8 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
     elif cloud is not None:
         reach = power_of_two(quantile(np.abs(cloud.points - centre).max(-1), cloud.weights, REACH_QUANTILE) / half)
     near = near if capture.near is None else capture.near
-    return ScenePlacement(
-        similarity(upright, centre, half), UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background
-    )
+    frame = Frame(UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(upright, centre, half), frame)
 
 
 def stated_place(capture: Capture, cameras: Camera, background: Vector) -> ScenePlacement:
@@ -118,7 +122,8 @@ def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Scene
     bounds = box_in_scene(low, high, centre, half)
     reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
     near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
-    return ScenePlacement(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
+    frame = Frame(bounds, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(np.eye(3), centre, half), frame)
 
 
 def object_place(
@@ -129,9 +134,8 @@ def object_place(
     centre, half = 0.5 * (low + high), 0.5 * BOX_MARGIN * float((high - low).max())
     low, high = centre - 0.5 * BOX_MARGIN * (high - low), centre + 0.5 * BOX_MARGIN * (high - low)
     near = max(nearest_to_box(cameras, low, high) / half, MIN_NEAR)
-    return ScenePlacement(
-        similarity(upright, centre, half), box_in_scene(low, high, centre, half), 1.0, near, background
-    )
+    frame = Frame(box_in_scene(low, high, centre, half), 1.0, near, background)
+    return ScenePlacement(similarity(upright, centre, half), frame)
 
 
 def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
@@ -155,7 +159,6 @@ class Gaze:
 
     centre:     the middle of it
     distance:   typical, from the cameras
-    converging: whether their axes meet there
     half:       half-size of a box that holds what matters most
     nearest:    distance of the nearest thing any of them sees
     cloud:      sparse points, if there are any
@@ -163,7 +166,6 @@ class Gaze:
 
     centre: Float[np.ndarray, " 3"]
     distance: float
-    converging: bool
     half: float
     nearest: float
     cloud: WeightedPoints | None
@@ -190,7 +192,7 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
         centre, distance = (position + middle * forward).mean(0), float(middle)
     around = not converging and np.linalg.norm(forward.mean(0)) < MIN_MEAN_DIRECTION
     half = distance if around else BOX_SHARE * distance  # from inside, all that is seen lies at that distance
-    return Gaze(centre, distance, converging, half, float(nearest), cloud)
+    return Gaze(centre, distance, half, float(nearest), cloud)
 
 
 def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> ScenePlacement:
@@ -207,7 +209,8 @@ def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Ve
     if capture.reach is not None:
         reach = power_of_two(capture.reach / half)
     near = NEAR_SCALE * gaze.nearest if capture.near is None else capture.near
-    return ScenePlacement(similarity(upright, centre, half), UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
+    frame = Frame(UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(upright, centre, half), frame)
 
 
 def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
@@ -231,14 +234,12 @@ def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | N
     keep = np.isfinite(capture.points).all(-1) & (sightings >= 2)
     if keep.sum() < 16:
         return None
-    return WeightedPoints(capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64))
+    return WeightedPoints(capture.points[keep] @ upright.T, sightings[keep].astype(np.float64))
 
 
 def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, "camera 2"] | None:
-    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture.
-
-    NaN for a picture that none are in, None if that is so for all.
-    """
+    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture. NaN for a picture that
+    none are in, None if that is so for all."""
     chosen = evenly(range(len(cloud.points)), SAMPLED_POINTS)
     points, weights = cloud.points[chosen], cloud.weights[chosen]
     sampled = torch.from_numpy(points).float()
@@ -264,7 +265,7 @@ def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarr
 def similarity(upright: np.ndarray, centre: np.ndarray, half: float) -> Float[np.ndarray, "4 4"]:
     """Turn, then bring a centre to the origin and a half-size to 1."""
     matrix = np.eye(4)
-    matrix[:3, :3] = upright[:3, :3] / half
+    matrix[:3, :3] = upright / half
     matrix[:3, 3] = -np.asarray(centre) / half
     return matrix
 
@@ -285,3 +286,64 @@ def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
     return float(
         values[order][np.searchsorted(np.cumsum(weights[order]), share * weights.sum()).clip(max=len(values) - 1)]
     )
+
+
+def find_forward(
+    capture: Capture, shots: list[Shot], cameras: Camera, scene_from_source: Float[np.ndarray, "4 4"], near: float
+) -> Forward | None:
+    """Forward-facing frame of an unbounded capture; None if its cameras do not all look one way.
+
+    shots, cameras: those to learn from; cameras in the scene's frame
+    near:           distance from every camera within which nothing is, in scene units
+    They do where each looks within 30 degrees of the mean camera, and a plane across its axis stands beyond all of them
+    and before all that they see.
+    """
+    pose = mean_pose(cameras)
+    if float((cameras.forward.double() @ pose[:, 2]).min()) < MIN_AXIS_COSINE:
+        return None
+    standing = (cameras.position.double() - pose[:, 3]) @ pose[:, 2]
+    unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
+    stated = [shot.depths[0] * unit for shot in shots if shot.depths is not None]
+    cloud = reliable_points(capture, np.eye(3))
+    if len(stated) == len(shots):
+        nearest = float((standing + torch.tensor(stated)).min())
+    elif cloud is not None:
+        points = torch.from_numpy(cloud.points @ scene_from_source[:3, :3].T + scene_from_source[:3, 3])
+        nearest = float(((points - pose[:, 3]) @ pose[:, 2]).quantile(OUTLIER_SHARE))
+    else:
+        nearest = float(standing.min()) + near
+    foremost = float(standing.max())
+    if nearest <= foremost:
+        return None
+    plane = max(NEAR_PLANE_SCALE * nearest, foremost)
+    scale = fitting_scale(cameras, pose, plane)
+    rows = tuple((a, b, c, d) for a, b, c, d in pose.tolist())
+    return None if scale is None else Forward(rows, scale, plane)
+
+
+def mean_pose(cameras: Camera) -> Float[Tensor, "3 4"]:
+    """The mean position, and the rotation nearest to all (the chordal mean)."""
+    mean = cameras.pose.double().mean(0)
+    u, _, vt = torch.linalg.svd(mean[:, :3])
+    proper = torch.tensor([1, 1, torch.linalg.det(u @ vt)], dtype=torch.float64)
+    return torch.cat([u * proper @ vt, mean[:, 3:]], 1)
+
+
+def fitting_scale(cameras: Camera, pose: Float[Tensor, "3 4"], plane: float) -> tuple[float, float] | None:
+    """Factors on x / z and y / z in the mean camera that bring everything visible beyond the plane into [-1, 1]; None
+    for lenses of too wide an angle.
+
+    Mildenhall 2020 takes the focal lengths over half the picture. Cameras beside the mean one then see places beyond 1,
+    which a positional encoding cannot tell from others.
+    """
+    count = len(BORDER_POINTS) * len(cameras)
+    pixels = (torch.tensor(BORDER_POINTS) * cameras.size[:, None]).reshape(count, 2)
+    rays = cameras.rays(pixels, torch.arange(len(cameras)).repeat_interleave(len(BORDER_POINTS)))
+    origins, directions = (rays.origins - pose[:, 3]) @ pose[:, :3], rays.directions.double() @ pose[:, :3]
+    if float(directions[:, 2].min()) <= 0:
+        return None
+    at_infinity = directions[:, :2] / directions[:, 2:]
+    at_plane = (origins[:, :2] + at_infinity * (plane - origins[:, 2:])) / plane
+    far, near = (x.abs().amax(0) for x in (at_infinity, at_plane))
+    width, height = near.clamp(far, MAX_MAGNIFICATION * far).tolist()
+    return None if float(far.max()) > MAX_TANGENT else (1 / width, 1 / height)

@@ -75,10 +75,8 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
 
 
 def load_array(path: Path) -> Any:
-    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine.
-
-    Raises ValueError, and what np.load raises.
-    """
+    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine. Raises ValueError,
+    and what np.load raises."""
     if not zipfile.is_zipfile(path):
         return np.load(path, mmap_mode="r", allow_pickle=False)
     with zipfile.ZipFile(path) as packed:
@@ -209,11 +207,6 @@ def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
     if orientation in (3, 4, 7, 8):
         values = values[::-1]
     return values[:, ::-1] if orientation in (2, 3, 6, 7) else values
-
-
-def colours(values: np.ndarray) -> np.ndarray:
-    """Grey as RGB; RGB and RGBA as they are."""
-    return np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
 
 
 def as_bytes(values: np.ndarray, encoding: str) -> np.ndarray:

@@ -1,15 +1,20 @@
-"""Part of a capture: the photographs of one block of a large scene, which becomes a scene with a frame of its own."""
+"""Parts of a large capture, each of which becomes a scene with its own frame; and camera positions without pixels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from jaxtyping import Float
 
+from ..camera import Camera
+from ..camera.lens import Pinhole
 from ..errors import LumigraphError
 from ..files.ranges import Point, Positive
-from .assemble import HOLD_OUT, in_order
+from .assemble import HOLD_OUT, checked_pose, in_order
 from .capture import Capture, Shot
+from .normalise import upright_of
 
 MAX_POINT_RADII = 16.0  # radii of a part within which sparse points are kept: beyond is the sky
 
@@ -28,10 +33,8 @@ class CapturePart:
 
 
 def part_of(capture: Capture, part: CapturePart) -> Capture:
-    """The capture with these photographs alone, and a box of interest of that radius around that centre.
-
-    Raises LumigraphError where some of the photographs are not there.
-    """
+    """The capture with these photographs alone, and a box of interest of that radius around that centre. Raises
+    LumigraphError where some of the photographs are not there."""
     shots = {shot.name: shot for shot in with_splits(capture.shots)}
     if lost := [name for name in part.photographs if name not in shots]:
         raise LumigraphError(
@@ -45,13 +48,7 @@ def part_of(capture: Capture, part: CapturePart) -> Capture:
     found = replace(capture, shots=chosen, missing=[], bounds=None, reach=reach, around=(part.centre, part.radius))
     if capture.points is None:
         return found
-    near = np.linalg.norm(capture.points - part.centre, axis=-1) < MAX_POINT_RADII * part.radius
-    return replace(
-        found,
-        points=capture.points[near],
-        point_colours=None if capture.point_colours is None else capture.point_colours[near],
-        sightings=None if capture.sightings is None else capture.sightings[near],
-    )
+    return found.with_points(np.linalg.norm(capture.points - part.centre, axis=-1) < MAX_POINT_RADII * part.radius)
 
 
 def with_splits(shots: list[Shot]) -> list[Shot]:
@@ -60,3 +57,46 @@ def with_splits(shots: list[Shot]) -> list[Shot]:
         return shots
     purposes = {shot.name: "train" if i % HOLD_OUT else "test" for i, shot in enumerate(in_order(shots, None))}
     return [replace(shot, split=purposes[shot.name]) for shot in shots]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Photograph i is called names[i] and serves the purpose splits[i].
+
+    positions, forwards: in the source's frame and units; where it looks, unit length
+    upright:   the rotation that brings up to +z
+    """
+
+    names: list[str]
+    splits: list[str | None]
+    positions: Float[np.ndarray, "photograph 3"]
+    forwards: Float[np.ndarray, "photograph 3"]
+    upright: Float[np.ndarray, "3 3"]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def ground(self) -> Float[np.ndarray, "photograph 2"]:
+        """Positions seen from above."""
+        return (self.positions @ self.upright.T)[:, :2]
+
+
+def places_of(capture: Capture) -> Places:
+    """The places of a capture's photographs by name, 2 ahead of 10. Raises LumigraphError for a capture without
+    photographs, and for poses that are none."""
+    shots = with_splits(in_order(capture.shots, None))
+    if not shots:
+        raise LumigraphError(f"{capture.source} has no photograph with a pose; add some")
+    poses = np.stack([checked_pose(shot, capture.source) for shot in shots])
+    away = poses[:, :, 3].mean(0)  # single precision is for what is near the origin
+    near = np.concatenate([poses[:, :, :3], poses[:, :, 3:] - away[:, None]], -1)
+    lens = Pinhole(torch.ones(len(shots), 2), torch.ones(len(shots), 2))
+    cameras = Camera(torch.from_numpy(near).float(), lens, torch.ones(len(shots), 2, dtype=torch.int64))
+    return Places(
+        [shot.name for shot in shots],
+        [shot.split for shot in shots],
+        poses[:, :, 3],
+        poses[:, :, 2],
+        upright_of(capture, cameras),
+    )

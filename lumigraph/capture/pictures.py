@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import warnings
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
 from .capture import PixelPlane, Shot
-from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
+from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, kind_of, read_numbers, tiff_tags, turned
 
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
 MAX_KEPT = 1.2  # times as long a side stays as it is, rather than losing sharpness for few pixels
@@ -28,7 +29,7 @@ EXIF_UPRIGHT = (None, 0, 1)
 EXIF_SIDEWAYS = (5, 6, 7, 8)
 
 Size = tuple[int, int]
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `check_pixels` knows what is too much
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `check_pixels` limits the size
 
 
 def find_file(path: Path) -> Path:
@@ -105,31 +106,22 @@ def choose(shot: Shot, downscale: int | None) -> Chosen:
     if isinstance(shot.image, dict):
         return choose_file(shot, shot.image, downscale)
     pixels = shot.image
-    if isinstance(pixels, np.ndarray):
-        own: Size = (pixels.shape[1], pixels.shape[0])
-    else:
-        assert shot.size is not None, f"{shot.name} is made when asked, so its size must be said"
-        own = shot.size
+    own = (pixels.shape[1], pixels.shape[0]) if isinstance(pixels, np.ndarray) else shot.size
+    assert own is not None, f"{shot.name} is made when asked, so its size must be said"
     calibrated = shot.size or own
     wanted = reduced(calibrated, downscale)
     size = smaller(own, wanted)
 
     def make() -> np.ndarray:
         made = pixels if isinstance(pixels, np.ndarray) else pixels()
-        return made if size == own else np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
+        return np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
 
     identity = shot.identity if shot.mask is None and shot.alpha is None else None
     return Chosen(ImageSource(size, masked(make, shot, size, False), identity), calibrated, wanted)
 
 
 def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Chosen:
-    if shot.size is None:
-        path = files[min(files)]
-        stored, orientation = measure(path)
-        stored = (stored[0] * min(files), stored[1] * min(files))
-        calibrated = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
-    else:
-        calibrated = shot.size
+    calibrated = shot.size or upright_size(files)
     wanted = reduced(calibrated, downscale)
     times = max(1, round(max(calibrated) / max(wanted)))
     fitting = [k for k in files if times % k == 0 or (downscale is None and k <= times)]
@@ -203,13 +195,20 @@ def measure(path: Path) -> tuple[Size, int | None]:
             return image.size, image.getexif().get(EXIF_ORIENTATION)
 
 
+def upright_size(files: dict[int, Path]) -> Size:
+    """Full size of a photograph in files that are reduced so many times, upright as EXIF says."""
+    (width, height), orientation = measure(files[min(files)])
+    width, height = width * min(files), height * min(files)
+    return (height, width) if orientation in EXIF_SIDEWAYS else (width, height)
+
+
 def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
     """Pixels as uint8 (height, width, 3 or 4), upright if asked, area-averaged down to a size."""
     if (kind := deep(path)) is not None:
         return as_bytes(resized(read_deep(path, turn), size, kind.encoding), kind.encoding)
     with readable(path), Image.open(path) as image:
         upright = ImageOps.exif_transpose(image) if turn else image
-        return np.asarray(resize(eight_bits(upright), size))
+        return np.asarray(eight_bits(upright).resize(size, Image.Resampling.BOX))
 
 
 def deep(path: Path) -> Kind | None:
@@ -224,7 +223,8 @@ def deep(path: Path) -> Kind | None:
 def read_deep(path: Path, turn: bool) -> np.ndarray:
     """All bits of a photograph, RGB or RGBA, upright if asked."""
     with readable(path):
-        values = colours(read_numbers(path))
+        values = read_numbers(path)
+        values = np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
         return turned(values, measure(path)[1]) if turn else values
 
 
@@ -254,33 +254,22 @@ def eight_bits(image: Image.Image) -> Image.Image:
     return image.convert("RGBA" if see_through else "RGB")
 
 
-def resize(image: Image.Image, size: Size) -> Image.Image:
-    """The image at another size, by averaging areas; with alpha, each colour counts as much as it is opaque."""
-    return image if image.size == size else image.resize(size, Image.Resampling.BOX)
-
-
 def masked(
     make: Callable[[], np.ndarray], shot: Shot, size: Size, turn: bool
 ) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    """Reader of a shot's pixels with the alpha of its silhouette, and of its mask."""
+    """Reader of a shot's pixels, whose alpha is multiplied by the silhouette, and of its mask."""
 
     def read() -> tuple[np.ndarray, np.ndarray | None]:
-        pixels = make() if shot.alpha is None else with_alpha(make(), read_alpha(shot.alpha, size, turn))
+        pixels = make()
+        if shot.alpha is not None:
+            grey = Image.fromarray(read_grey(shot.alpha, size, turn))
+            alpha = np.asarray(grey.resize(size, Image.Resampling.BOX))
+            if pixels.shape[2] == 4:
+                alpha = (pixels[..., 3].astype(np.uint16) * alpha + 127) // 255
+            pixels = np.concatenate([pixels[..., :3], alpha[..., None].astype(np.uint8)], -1)
         return pixels, None if shot.mask is None else read_mask(shot.mask, size, turn)
 
     return read
-
-
-def with_alpha(pixels: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """RGBA: another alpha beside the colours, times the one that they have."""
-    if pixels.shape[2] == 4:
-        alpha = (pixels[..., 3].astype(np.uint16) * alpha + 127) // 255
-    return np.concatenate([pixels[..., :3], alpha[..., None].astype(np.uint8)], -1)
-
-
-def read_alpha(path: Path, size: Size, turn: bool) -> np.ndarray:
-    """A silhouette at a size, (height, width) of uint8: its brightest channel, times its alpha where it has one."""
-    return np.asarray(Image.fromarray(read_grey(path, size, turn)).resize(size, Image.Resampling.BOX))
 
 
 def read_grey(path: Path, size: Size, turn: bool) -> np.ndarray:
@@ -297,30 +286,21 @@ def read_grey(path: Path, size: Size, turn: bool) -> np.ndarray:
 
 def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
     """Mask of the pixels whose whole area is unmasked (brighter than half)."""
-    if isinstance(mask, np.ndarray):
-        grey = Image.fromarray(mask.astype(bool))
-    else:
-        grey = Image.fromarray(read_grey(mask, size, turn) > 127)
-    if grey.size == size:
-        return np.asarray(grey)
+    grey = Image.fromarray(mask.astype(bool) if isinstance(mask, np.ndarray) else read_grey(mask, size, turn) > 127)
     return np.asarray(grey.convert("L").resize(size, Image.Resampling.BOX)) > 254
 
 
-class readable:  # noqa: N801
-    """Inside this block, whatever a damaged file makes an image library raise becomes one sentence."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind, fault, trace) -> None:
-        if isinstance(fault, Exception) and not isinstance(fault, LumigraphError):
-            raise LumigraphError(
-                f"{self.path} cannot be read as an image ({describe(fault)}); "
-                f"restore it, or delete it so that it is skipped"
-            ) from fault
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Context in which any fault that an image library raises for a file becomes one sentence."""
+    try:
+        yield
+    except LumigraphError:
+        raise
+    except Exception as fault:
+        raise LumigraphError(
+            f"{path} cannot be read as an image ({describe(fault)}); restore it, or delete it so that it is skipped"
+        ) from fault
 
 
 def describe(fault: Exception) -> str:

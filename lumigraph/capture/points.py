@@ -17,10 +17,10 @@ POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera po
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Positions, colours, and how many photographs saw each."""
+    """Positions, colours, and how many photographs saw each; fields of `Capture`."""
 
-    positions: Float[np.ndarray, "point 3"]
-    colours: UInt8[np.ndarray, "point 3"]
+    points: Float[np.ndarray, "point 3"]
+    point_colours: UInt8[np.ndarray, "point 3"]
     sightings: np.ndarray
 
 
@@ -64,10 +64,8 @@ def read_points3d(path: Path) -> SparsePoints:
 
 
 def similarity(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> np.ndarray | None:
-    """The 4x4 similarity that takes source points onto target points, least squares (Umeyama 1991).
-
-    None where they do not agree to 2% of their spread, or are too few to tell.
-    """
+    """The 4x4 similarity that takes source points onto target points, least squares (Umeyama 1991). None where they do
+    not agree to 2% of their spread, or are too few to tell."""
     if len(source) < 4:
         return None
     a, b = source - source.mean(0), target - target.mean(0)

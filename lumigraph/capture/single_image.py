@@ -1,7 +1,7 @@
-"""One image file is a scene too: a picture on a wall, and a camera straight before it that sees exactly that picture.
+"""One image file as a scene: a picture on a wall, and a camera straight before it that sees exactly that picture.
 
 The camera takes it twice. One shot is masked to the pixels to learn from, the other to those held out: every second
-pixel, drawn at random. What a method makes of the pixels between is then scored like any held-out view.
+pixel, drawn at random. The pixels between are then scored like any held-out view.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ import torch
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
 from .capture import Capture, Shot
-from .pictures import EXIF_SIDEWAYS, IMAGE_SUFFIXES, check_downscale, measure, read_image, reduced
+from .pictures import IMAGE_SUFFIXES, check_downscale, read_image, reduced, upright_size
 
 DEFAULT_MAX_SIDE = 512  # pixels of the longer side of the picture
 MIN_SIDE = 16  # pixels; the windows of SSIM are 11 wide
 CAMERA_DISTANCE = 2.0  # where the longer side of the picture is 2
 BOX_THICKNESS = 0.05  # of the box around the picture
-CAMERA_POSE = np.array(
-    [[1.0, 0, 0, 0], [0, 0, 1, -CAMERA_DISTANCE], [0, -1, 0, 0]]
-)  # right is +x, down is -z, forward is +y
+# Right is +x, down is -z, forward is +y.
+CAMERA_POSE = np.array([[1.0, 0, 0, 0], [0, 0, 1, -CAMERA_DISTANCE], [0, -1, 0, 0]])
 SPLIT_SEED = 0  # of the held-out pixels
 
 
@@ -38,8 +37,7 @@ def read(path: Path, downscale: int | None = None) -> Capture:
     Raises LumigraphError for files that are no image and for pictures that are very small.
     """
     check_downscale(downscale)
-    stored, orientation = measure(path)
-    whole = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
+    whole = upright_size({1: path})
     size = width, height = reduced(whole, downscale or math.ceil(max(whole) / DEFAULT_MAX_SIDE))
     if min(size) < MIN_SIDE:
         raise LumigraphError(

@@ -20,7 +20,7 @@ from ..files import is_file, read_json
 from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from . import colmap
 from .capture import Capture, PixelPlane, Shot
-from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
+from .pictures import find_file, reductions, upright_size, versions
 from .points import SparsePoints, read_ply, similarity
 
 EXPECTED_FILES = "transforms.json (instant-ngp, nerfstudio)"
@@ -109,10 +109,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder.
-
-    Raises LumigraphError for malformed JSON, frames without a usable pose, and unknown lenses.
-    """
+    """The capture in a folder. Raises LumigraphError for malformed JSON, unusable poses, and unknown lenses."""
     path = folder / "transforms.json"
     whole, plain = read_frames_file(path)
     splits = published_splits(whole)
@@ -126,21 +123,12 @@ def read(folder: Path) -> Capture:
         reach = 0.5 * whole.aabb_scale / whole.scale
     if whole.up is not None and not any(whole.up):
         raise LumigraphError(f'{path}: "up" points nowhere; correct it or remove it')
-    return Capture(
-        str(folder),
-        shots,
-        None if points is None else points.positions,
-        None if points is None else points.colours,
-        None if points is None else points.sightings,
-        missing,
-        reach=reach,
-        up=whole.up,
-        notes=folded(folder),
-    )
+    cloud = {} if points is None else vars(points)
+    return Capture(str(folder), shots, missing=missing, reach=reach, up=whole.up, notes=folded(folder), **cloud)
 
 
 def folded(folder: Path) -> list[str]:
-    """Folds that `lumigraph capture` reported, if it made the folder: it knows the matches of photographs."""
+    """Folds that `lumigraph capture` reported, if it made the folder, from the matches of photographs."""
     path = folder / "capture.json"
     said = read_json(path, Made).warnings if path.is_file() else []
     return [f"{folder}: {warning}" for warning in said if "folded" in warning]
@@ -166,7 +154,8 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
             missing.append(name)
             continue
         where = f"{path}: {called(frame)}"
-        size = stated_size(about) or upright_size(files)
+        stated = None if about.w is None or about.h is None else (round(about.w), round(about.h))
+        size = stated or upright_size(files)
         lens = read_lens(about, size, where)
         shots.append(
             Shot(
@@ -239,22 +228,12 @@ def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
     return found
 
 
-def upright_size(files: dict[int, Path]) -> tuple[int, int]:
-    (width, height), orientation = measure(files[min(files)])
-    width, height = width * min(files), height * min(files)
-    return (height, width) if orientation in EXIF_SIDEWAYS else (width, height)
-
-
 def read_pose(about: Posed, where: str) -> np.ndarray:
     if len(about.transform_matrix) not in (3, 4):
         raise LumigraphError(f"{where} has no 4x4 transform_matrix of numbers; correct it or remove the frame")
     pose = np.array(about.transform_matrix[:3], np.float64)
     pose[:, :3] *= OPENCV_FROM_OPENGL
     return pose
-
-
-def stated_size(about: Posed) -> tuple[int, int] | None:
-    return None if about.w is None or about.h is None else (round(about.w), round(about.h))
 
 
 def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
@@ -310,10 +289,10 @@ def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str
         return None
     positions = {Path(s.name).stem: s.pose[:, 3] for s in shots}
     model = colmap.read_model(place)
-    found = {Path(name).stem: position for name, position in colmap.positions(model).items()}
+    found = {Path(name).stem: pose[:, 3] for name, pose in colmap.poses_of(model).items()}
     both = sorted(positions.keys() & found.keys())
     matrix = similarity(np.array([found[k] for k in both]), np.array([positions[k] for k in both]))
     if matrix is None:
         return None
-    points = colmap.read_points(place, model)
-    return SparsePoints(points.positions @ matrix[:3, :3].T + matrix[:3, 3], points.colours, points.sightings)
+    cloud = colmap.read_points(place, model)
+    return replace(cloud, points=cloud.points @ matrix[:3, :3].T + matrix[:3, 3])

@@ -11,44 +11,40 @@ from jaxtyping import Float
 from ..camera import Camera
 from ..geometry import turning
 
+Direction = Float[np.ndarray, " 3"]
+Points = Float[np.ndarray, "point 3"]
+
 MIN_UP_COSINE = math.cos(math.radians(15))  # a source axis nearer to up than this is up
 MAX_ROW_TILT = 0.03  # mean square of image rows along up where cameras are held level: 10 degrees
-MIN_ROW_TURN = (
-    0.02,
-    4,
-)  # mean square of image rows across their main direction, if cameras turn about up: 8 degrees; ratio to the former
+# Mean square of image rows across their main direction, if cameras turn about up: 8 degrees; and its ratio to the tilt.
+MIN_ROW_TURN, MIN_TURN_RATIO = 0.02, 4
 ALONG_COSINE = 0.9  # from which on a camera looks along a direction
 MIN_OBLIQUE_SHARE = 0.1  # share of the cameras that must look elsewhere than the rest
 MIN_MEAN_UP = 0.5  # length of the pictures' mean up; below it cameras were turned about their axes
 MIN_USABLE_UP = 0.2  # length of the mean up below which it is no evidence
 MIN_AGREEMENT = 0.7  # cosine between the pictures' mean up and the normal of their rows, if that is up
 MIN_MAP_SPREAD = 0.4  # times the distance to the scene: deviation of positions both ways from which on they are a map's
-PLANE_SPREADS = (
-    0.2,
-    0.2,
-)  # of the positions' extent: the smallest deviation at most, and the middle one at least, of a plane
+PLANE_SPREAD = 0.2  # of the positions' extent: on a plane the smallest deviation is less, the middle one more
 MIN_MAP_COSINE = 0.5  # between a map's plane and the view: drones look no flatter than that
 
 
-def find_upright(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, "4 4"]:
+def find_upright(cameras: Camera, points: Points | None = None) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
     up = common_up(cameras, points)
-    return np.eye(4) if up is None else upright_by(up)
+    return np.eye(3) if up is None else upright_by(up)
 
 
-def upright_by(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
+def upright_by(up: Direction) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings a direction to +z, or the axis that is close to it."""
     up = unit(up)
     nearest = np.zeros(3)
     nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
     if up @ nearest > MIN_UP_COSINE:
         up = nearest
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn_onto_z(up)
-    return matrix
+    return turn_onto_z(up)
 
 
-def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, " 3"] | None:
+def common_up(cameras: Camera, points: Points | None = None) -> Direction | None:
     """The direction that was up where the photographs were taken, unit length; None if nothing tells.
 
     Cameras are held level rather than straight ahead, by hand as by a drone's gimbal: up is the direction most at right
@@ -62,7 +58,7 @@ def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = Non
     places = cameras.position.double().numpy()
     own, gaze = -downs.mean(0), forwards.mean(0)
     values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    level, turning = vectors[:, 0], values[1] > max(MIN_ROW_TURN[0], MIN_ROW_TURN[1] * values[0])
+    level, turning = vectors[:, 0], values[1] > max(MIN_ROW_TURN, MIN_TURN_RATIO * values[0])
     elsewhere = np.quantile(np.abs(forwards @ level), MIN_OBLIQUE_SHARE) < ALONG_COSINE
     if turning and values[0] < MAX_ROW_TILT and elsewhere:
         return upwards(level, own, gaze)
@@ -75,11 +71,8 @@ def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = Non
 
 
 def from_above(
-    places: Float[np.ndarray, "camera 3"],
-    own: Float[np.ndarray, " 3"],
-    gaze: Float[np.ndarray, " 3"],
-    points: Float[np.ndarray, "point 3"] | None,
-) -> Float[np.ndarray, " 3"] | None:
+    places: Float[np.ndarray, "camera 3"], own: Direction, gaze: Direction, points: Points | None
+) -> Direction | None:
     """Up, unit length, of cameras that look one way, at a ground from above; None if they look at things ahead.
 
     They were above if they were turned about their axes, as a drone is that flies to and fro; or if they are spread
@@ -90,11 +83,7 @@ def from_above(
         return None
     _, sizes, axes = np.linalg.svd(places - places.mean(0), full_matrices=False)
     back, normal = -unit(gaze), axes[-1] * np.sign(-axes[-1] @ gaze)
-    flat = (
-        sizes[2:].sum() < PLANE_SPREADS[0] * sizes[0]
-        and sizes[1] > PLANE_SPREADS[1] * sizes[0]
-        and normal @ back > MIN_MAP_COSINE
-    )
+    flat = sizes[2:].sum() < PLANE_SPREAD * sizes[0] < sizes[1] and normal @ back > MIN_MAP_COSINE
     if np.linalg.norm(own) < MIN_MEAN_UP:
         return normal if flat else back
     if not flat or points is None or not len(points):
@@ -103,18 +92,16 @@ def from_above(
     return normal if sizes[1] / math.sqrt(len(places)) > MIN_MAP_SPREAD * distance > 0 else None
 
 
-def upwards(
-    axis: Float[np.ndarray, " 3"], own: Float[np.ndarray, " 3"], gaze: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " 3"]:
+def upwards(axis: Direction, own: Direction, gaze: Direction) -> Direction:
     """Side of an axis with the pictures' own up; if that is undecided, the side that cameras look from."""
     side = axis @ own
     return axis * np.sign(side if abs(side) > MIN_USABLE_UP else -axis @ gaze)
 
 
-def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def unit(vector: Direction) -> Direction:
     return vector / np.linalg.norm(vector)
 
 
-def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def turn_onto_z(up: Direction) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes a direction to +z."""
     return turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 0.0, 1.0])).numpy()

@@ -2,16 +2,277 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from .benches.kernels import BenchKernels
-from .benches.methods import BenchMethods
-from .benches.views import BenchViews
+from .. import methods
+from ..budget import Budget
+from ..errors import LumigraphError
+from ..files import claim
+from ..files.ranges import Count, Downscale, Scales, Seconds, Seed, Steps
+from .capture import posed
+from .common import choose_device, say, scene_name, show
+from .options import DeviceOption, Overwrite, ReaderOption, StepsOption, needed, option
+from .train import DEFAULT_SECONDS
 
-# One line for each benchmark; the files are in benches/.
+FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
+
+if TYPE_CHECKING:
+    from ..benchmark.cell import Cell, CellSettings
+
+
+@dataclass(frozen=True)
+class BenchKernels:
+    """Measure every kernel's throughput on every engine, and its ratio to the reference in the same run."""
+
+    output: Annotated[Path | None, option("FILE.json", "print the table only")] = None
+    """File for the figures, in addition to the table."""
+    overwrite: Overwrite = False
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        from ..kernels.bench import bench_kernels
+
+        if self.output is not None:
+            claim(self.output, "benchmark", self.overwrite)
+        bench_kernels(device=choose_device(self.device), output=self.output)
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """Options of benchmarks that train methods and compare them."""
+
+    methods: Annotated[tuple[str, ...], needed("METHOD ...")]
+    """Methods to train, for example instant-ngp gaussian-splatting."""
+    scenes: Annotated[tuple[str, ...], needed("SCENE ...")]
+    """Scenes to train on, as for `lumigraph train`."""
+    output: Annotated[Path, needed("OUTPUT")]
+    """Folder for runs, table and charts."""
+    seeds: Annotated[tuple[Seed, ...], option("N")] = (0,)
+    """Seeds of all random choices; several give means with deviations."""
+    eval_views: Annotated[Count | None, option("N", "all")] = None
+    """Compare only this number of held-out views, evenly spread."""
+    lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
+    """Files with the weights of LPIPS, as for `lumigraph eval`."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
+    reader: ReaderOption = None
+    scales: Annotated[Scales, option("N")] = 1
+    """Number of resolutions of every photograph, each half of the one before; scores average over all."""
+    device: DeviceOption = "auto"
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """Defaults of the methods' options: the papers', or those tuned for a CPU; auto decides by --device."""
+
+    def checked(self) -> CellSettings:
+        """Settings of all cells. Raises LumigraphError for impossible ones, before anything is opened or trained."""
+        from ..benchmark.cell import CellSettings
+        from ..metrics.lpips import load_lpips, named_files
+
+        for name in self.methods:
+            methods.check(name)
+        choose_device(self.device)
+        weights = tuple(path.resolve() for path in named_files(self.lpips))
+        if weights:
+            load_lpips(weights)
+        return CellSettings(
+            self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights
+        )
+
+    def conduct(self, cells: Sequence[Cell], settings: CellSettings) -> int:
+        """Train and compare all cells."""
+        from ..benchmark.conduct import conduct
+
+        code = conduct(cells, settings, self.output, say)
+        if code:
+            say("Stopped; what is done is kept, and the same command goes on")
+            return code
+        show({"table": str(self.output / "results.md"), "figures": str(self.output / "results.json")})
+        return 0
+
+
+def budgets(seconds: Sequence[float], steps: Sequence[int]) -> list[Budget]:
+    """Budgets in seconds or steps, DEFAULT_SECONDS without either. Raises LumigraphError for both."""
+    if seconds and steps:
+        raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+    return [Budget(n, None) for n in steps] or [Budget(None, s) for s in seconds or (DEFAULT_SECONDS,)]
+
+
+def place_of(scene: str) -> str:
+    """Source with poses for a scene that a user names, independent of the current folder: paths become absolute."""
+    source = posed(scene)
+    path = Path(source).expanduser()
+    return str(path.resolve()) if path.exists() else source
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchMethods(Cells):
+    """Train methods on scenes, for several durations and from several seeds, and compare held-out views.
+
+    Every cell is a separate run in OUTPUT/runs, trained by `lumigraph train` and compared by `lumigraph eval` in
+    separate processes. OUTPUT/results.md has the table, results.json all figures; charts show PSNR over time. Ctrl-C
+    stops; the same command continues.
+    """
+
+    seconds: Annotated[tuple[Seconds, ...], option("S", "60")] = ()
+    """Training time in seconds; several give a chart."""
+    steps: Annotated[tuple[Steps, ...], option("N", "as long as --seconds")] = ()
+    """Train for these numbers of steps instead."""
+
+    def run(self) -> int:
+        from ..benchmark.cell import Cell
+
+        times, settings = budgets(self.seconds, self.steps), self.checked()
+        cells = [
+            Cell(methods.check(name), scene_name(place), place, budget, seed)
+            for place in map(place_of, self.scenes)
+            for budget in times
+            for seed in self.seeds
+            for name in self.methods
+        ]
+        return self.conduct(cells, settings)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A scene: its source, its short name, and the name of its collection, if any."""
+
+    source: str
+    scene: str
+    collection: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchViews(Cells):
+    """Train methods on fewer and fewer photographs of a scene, and compare the same held-out views.
+
+    The photographs are spread evenly over the cameras, and each subset contains the smaller ones. A table and a chart
+    show PSNR over the number of photographs; the rest is as in `lumigraph bench methods`. For a collection, held-out
+    members are scenes, and the mean is shown. Priors, such as pixelnerf, take the photographs as input. The prior is a
+    run of --priors, or one that is trained first, on the first collection of --scenes.
+    """
+
+    methods: Annotated[
+        tuple[str, ...], needed("METHOD ...", f"Methods to train (default: {' '.join(FEW_VIEW_METHODS)}).")
+    ] = FEW_VIEW_METHODS
+    views: Annotated[tuple[Count | Literal["all"], ...], option("N")] = (2, 3, 4, 6, 9, 15, 25, 50, "all")
+    """Numbers of training photographs; those that a scene does not have are left out."""
+    seconds: Annotated[Seconds | None, option("S", "60")] = None
+    """Training time in seconds."""
+    steps: StepsOption = None
+    members: Annotated[Count, option("N")] = 4
+    """Number of held-out members of a collection, evenly spread."""
+    priors: Annotated[tuple[Path, ...], option("RUN ...", "trained first, on the first collection of --scenes")] = ()
+    """Runs trained on a collection."""
+    prior_seconds: Annotated[Seconds | None, option("S", "as long as the others")] = None
+    """Training time of priors in seconds."""
+    prior_steps: Annotated[Steps | None, option("N", "as long as --prior-seconds")] = None
+    """Train priors for this number of steps instead."""
+
+    def run(self) -> int:
+        (budget,) = budgets(given(self.seconds), given(self.steps))
+        longer = self.prior_seconds is not None or self.prior_steps is not None
+        (of_priors,) = budgets(given(self.prior_seconds), given(self.prior_steps)) if longer else (budget,)
+        settings = self.checked()
+        sources = list(map(place_of, self.scenes))
+        names = [methods.check(name) for name in self.methods]
+        learnt, cells = self.by_priors(names, sources, of_priors)
+        names = [name for name in names if name in learnt or not learns_across(name)]
+        if not names:
+            raise LumigraphError("There is no method left to compare; name a collection among --scenes, or --priors")
+        for place in (place for source in sources for place in self.places(source)):
+            cells += self.cells_of(place, names, budget, learnt)
+        return self.conduct(cells, settings)
+
+    def by_priors(
+        self, names: Sequence[str], sources: Sequence[str], budget: Budget
+    ) -> tuple[dict[str, dict[int, Path]], list[Cell]]:
+        """The prior's run for each method that learns from collections and each seed, and cells that train those that
+        are not there."""
+        from ..benchmark.cell import Cell
+        from ..capture import kind_of
+        from ..datasets.collection import Collection
+        from ..run import Run
+
+        there = {Run(path).method_name: path.resolve() for path in self.priors}
+        collection = next((source for source in sources if kind_of(source) is Collection), None)
+        learnt: dict[str, dict[int, Path]] = {}
+        cells = []
+        for name in filter(learns_across, names):
+            if self.scales > 1:
+                raise LumigraphError(f"{name} takes photographs of one size, so --scales cannot be {self.scales}")
+            if name in there:
+                learnt[name] = dict.fromkeys(self.seeds, there[name])
+            elif collection is None:
+                say(f"{name} learns from a collection, and there is none among --scenes, nor --priors; leaving it out")
+            else:
+                trained = [Cell(name, scene_name(collection), collection, budget, seed) for seed in self.seeds]
+                learnt[name] = {cell.seed: (self.output / "runs" / cell.name).resolve() for cell in trained}
+                cells += trained
+        return learnt, cells
+
+    def places(self, source: str) -> Iterator[Place]:
+        """The source itself, or held-out members of the collection that it is."""
+        from ..benchmark.cell import MEMBERS
+        from ..capture import kind_of, open_dataset, sources_of
+        from ..datasets.collection import Collection
+        from ..geometry import evenly
+
+        if kind_of(source) is not Collection:
+            yield Place(source, scene_name(source))
+            return
+        collection, of_member = open_dataset(source), sources_of(source)
+        assert isinstance(collection, Collection)
+        held_out = [collection.names[i] for i in collection.splits["test"].tolist()]
+        for name in evenly(held_out, self.members):
+            yield Place(of_member[name], scene_name(name), scene_name(source) + MEMBERS)
+
+    def cells_of(
+        self, place: Place, names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
+    ) -> Iterator[Cell]:
+        """A place's cells: each number of photographs, each seed, each method."""
+        from ..benchmark.cell import Cell
+
+        there = self.there(place.source)
+        for number in self.possible(place.source, there):
+            for seed in self.seeds:
+                for name in names:
+                    cell = Cell(name, place.scene, place.source, budget, seed, number, place.collection)
+                    if name in learnt:  # a prior gets all photographs as input
+                        cell = replace(cell, views=number or there, prior=str(learnt[name][seed]))
+                    yield cell
+
+    def there(self, source: str) -> int:
+        """Number of a scene's training photographs."""
+        from ..benchmark.cell import reduced
+        from ..capture import open_scene
+
+        downscale = reduced(source, self.downscale)
+        return len(open_scene(source, downscale=downscale, reader=self.reader).splits["train"])
+
+    def possible(self, source: str, there: int) -> list[int | None]:
+        """The numbers of views that a scene has photographs for; `None` is all."""
+        left_out = [views for views in self.views if views != "all" and views > there]
+        if left_out:
+            say(f"{source} has {there} photographs to learn from; leaving out {', '.join(map(str, left_out))}")
+        return [None if views == "all" else views for views in self.views if views not in left_out]
+
+
+def learns_across(name: str) -> bool:
+    """True if a method learns from collections and takes a scene as input."""
+    from ..datasets.collection import Collection
+
+    return methods.find(name).learns_from is Collection
+
+
+def given(value: float | int | None) -> tuple:
+    return () if value is None else (value,)
+
+
 What = (
     Annotated[BenchKernels, subcommand("kernels")]
     | Annotated[BenchMethods, subcommand("methods")]

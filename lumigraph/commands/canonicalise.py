@@ -11,7 +11,8 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from ..files import claim_folder
 from ..files.ranges import Seed, Steps, between
-from .common import choose_device, needed, option, show, typed
+from .common import choose_device, show, typed
+from .options import needed, option
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,12 @@ class Canonicalise:
         found = found_in(self.runs, self.cells, choose_device(self.device))
         solution = canonicalise(found, config, output, self.like)
         least = int(solution.agreement.argmin())
-        show(
-            {
-                "aligned": f"{len(found)} runs, each in a file of its own in {output}",
-                "shared": f"{100 * solution.explained:.0f} % of what they are",
-                "least alike": f"{found[least].name}, {float(solution.agreement[least]):.2f} of 1",
-                "picture": str(output / "canonical.png"),
-                "next": typed("view", output / f"{found[0].name}.json"),
-            }
-        )
+        rows = {
+            "aligned": f"{len(found)} runs, each in a file of its own in {output}",
+            "shared": f"{100 * solution.explained:.0f} % of what they are",
+            "least alike": f"{found[least].name}, {float(solution.agreement[least]):.2f} of 1",
+            "picture": str(output / "canonical.png"),
+            "next": typed("view", output / f"{found[0].name}.json"),
+        }
+        show(rows)
         return 0

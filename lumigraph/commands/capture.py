@@ -11,16 +11,10 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, between
-from .common import needed, option, say, scene_name, show, typed
+from .common import say, scene_name, show, typed
+from .options import needed, option
 
-GENERIC_FOLDERS = (
-    "images",
-    "photos",
-    "photographs",
-    "pictures",
-    "input",
-    "frames",
-)  # folders named after what is in them
+GENERIC_FOLDERS = "images", "photos", "photographs", "pictures", "input", "frames"  # named after their contents
 MAX_NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
 INDENT = " " * 13
 
@@ -60,30 +54,28 @@ class CaptureCommand:
         options = MotionOptions(self.frames, self.mapper, self.matching, self.camera, self.max_size)
         folder = self.output or scene_folder(self.what)
         onward = typed("train", "gaussian-splatting", folder)
-        tell(folder, find_cameras(self.what, folder, options), None if self.mask_object else onward)
+        show_result(folder, find_cameras(self.what, folder, options), None if self.mask_object else onward)
         if self.mask_object:
-            tell_masks(folder, onward)
+            show_masks(folder, onward)
         return 0
 
 
-def tell_masks(folder: Path, onward: str) -> None:
-    """Find the object of a scene, unless that was done before: what was written to stdout, doubts to stderr."""
+def show_masks(folder: Path, onward: str) -> None:
+    """Find the object of a scene, unless that was done before: results to stdout, doubts to stderr."""
     from ..capture import choose_reader
     from ..capture.masks import OBJECT_MASKS
     from ..capture.objects import mask_object
-    from ..system.progress import track
 
     if (folder / OBJECT_MASKS).exists():
         show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
         return
-    masked = mask_object(folder, choose_reader(folder).read(folder), track)
-    show(
-        {
-            "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",
-            "look at": f"{masked.sheet}: what is bright is learnt, what is dark is nothing",
-            "next": onward,
-        }
-    )
+    masked = mask_object(folder, choose_reader(folder).read(folder))
+    found = {
+        "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",
+        "look at": f"{masked.sheet}: bright is the object, dark is masked",
+        "next": onward,
+    }
+    show(found)
     for doubt in masked.doubts:
         say(f"warning: {doubt}; look at {masked.sheet}, and correct or delete {folder / OBJECT_MASKS}")
 
@@ -98,7 +90,7 @@ def posed(scene: str) -> str:
         return scene
     folder = scene_folder((path,))
     say(f"{scene} holds no poses; finding them, to {folder}")
-    tell(folder, find_cameras((path,), folder))
+    show_result(folder, find_cameras((path,), folder))
     return str(folder)
 
 
@@ -113,7 +105,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
 
 
 def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
-    """reconstruct(), with bars; Ctrl-C says how to go on."""
+    """reconstruct(), with bars; a message after Ctrl-C names the command to continue."""
     from ..capture.motion import reconstruct
     from ..system.progress import track
 
@@ -124,7 +116,7 @@ def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> d
         raise
 
 
-def tell(folder: Path, result: dict[str, Any], onward: str | None = None) -> None:
+def show_result(folder: Path, result: dict[str, Any], onward: str | None = None) -> None:
     """Print the result for the photographs and the next command: results to stdout, warnings to stderr."""
     show(rows(folder, result) | ({"next": onward} if onward else {}))
     for sentence in result["warnings"]:
@@ -149,7 +141,7 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
     if coverage := result["coverage"]:
         found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
         gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]
-        found["around"] += f"; nobody looked from {', '.join(gaps)}" if gaps else ""
+        found["around"] += f"; no photograph from {', '.join(gaps)}" if gaps else ""
     if result["gps"] and result["gps"]["used"]:
         found["place"] = result["gps"]["say"]
     found["time"] = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result["seconds"].items())

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional
 
 from ..files import claim
-from .common import Overwrite, choose_device, needed, option, show
-from .keeping import Keeping
+from .common import choose_device, show
+from .options import Keeping, Overwrite, needed, option
 
 SIZE = 400  # pixels of the longer side of the pictures that compare
 
@@ -26,7 +26,7 @@ class Clean:
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
-    output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
+    output: Annotated[Path, needed("NEW")]
     """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping(clean=True)
@@ -36,10 +36,10 @@ class Clean:
     def run(self) -> int:
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
-        from ..gaussians.cleaning import gone
+        from ..gaussians.cloud import gone
         from ..method.capabilities import HasGaussians, needs
         from ..run import open_any
-        from ..run.picking import check_output, save_picked
+        from ..run.derived import check_output, save_picked
 
         opened, device = open_any(self.source), choose_device(self.device)
         check_output(opened, self.output, self.overwrite, [self.source])
@@ -66,7 +66,7 @@ def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
     from ..camera import ring
     from ..composition import PickedCloud
     from ..figures import Row, contact_sheet
-    from ..geometry.choice import evenly
+    from ..geometry import evenly
     from ..system.progress import track
 
     clouds = [PickedCloud(opened.frame, some) for some in (gaussians, gaussians[~gone], gaussians[gone])]

@@ -1,24 +1,34 @@
 """The command line. Exit code 0: done. 2: a fault in the input; one sentence on stderr gives the fault and its remedy.
 130 and 143: Ctrl-C or SIGTERM ended the command.
 
+Ranges of numbers, annotations of the options and of the methods' Configs, are in --help beside the defaults, and typed
+values are checked against them.
+
 LUMIGRAPH_DEBUG=1 shows the traceback of a fault.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import operator
 import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import tyro
+from tyro.conf import arg
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
+from ..files.ranges import coherent, domain, outside, shown
 from ..system.allocation import settle_memory
 from ..system.signals import exit_code, listening, number_of
 from ..system.threads import considerate
@@ -37,12 +47,62 @@ from .export import Export
 from .infer import Infer
 from .info import Info
 from .methods import Methods
-from .options import RULES, held
 from .render import Render
 from .report import Report
 from .resume import Resume
 from .train import Train, with_options_of
 from .view import ViewCommand
+
+RULES = ConstructorRegistry()
+beneath = False  # True while tyro applies its own rules only
+
+
+@RULES.struct_rule
+def with_ranges(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """A dataclass for tyro, each number with its range behind its default: (default: 16; 1 to 32)."""
+    if beneath or not is_dataclass(info.type):
+        return None
+    with without_ranges():
+        spec = ConstructorRegistry.get_struct_spec(info)
+    if not isinstance(spec, StructConstructorSpec):
+        return None
+    return replace(spec, fields=tuple(replace(x, type=with_range(x.type)) for x in spec.fields))
+
+
+@contextmanager
+def without_ranges() -> Iterator[None]:
+    """A block in which tyro applies its own rules only."""
+    global beneath
+    beneath = True
+    try:
+        yield
+    finally:
+        beneath = False
+
+
+def with_range(kind: Any) -> Any:
+    """An option's annotation with its range beside the default in --help; itself where it has no range."""
+    if not (range := domain(kind)):
+        return kind
+    hints = [x.help_behavior_hint for x in get_args(kind)[1:] if getattr(x, "help_behavior_hint", None) is not None]
+
+    def hint(default: str) -> str:
+        said = hints[-1] if hints else f"(default: {default})"
+        return f"{said[:-1]}; {range})" if said else f"({range})"
+
+    return Annotated[kind, arg(help_behavior_hint=hint)]
+
+
+def held(command: Any) -> Any:
+    """A command as it was typed. Raises LumigraphError for a number beyond its range, and for those that disagree."""
+    for name, kind, value in outside(command):
+        called = next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), name).replace("_", "-")
+        typed = " ".join(map(shown, value)) if isinstance(value, tuple) else shown(value)
+        numbers = "numbers" if isinstance(value, tuple) else "a number"
+        raise LumigraphError(f"--{called} cannot be {typed}; give it {numbers} from {domain(kind)}")
+    coherent(command)
+    return command
+
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
@@ -81,15 +141,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     settle_memory()
     try:
-        with listening(), told_warnings(), considerate():
+        with listening(), printed_warnings(), considerate():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
     except KeyboardInterrupt as stopped:
         code = exit_code(number_of(stopped))
-        return refuse("Stopped", code) if code == 130 else code  # whoever sends SIGTERM does not wait for an answer
+        return refuse("Stopped", code) if code == 130 else code  # no message after SIGTERM
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read our output has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output has ended
         return 0
     except OSError as error:
         return refuse(refusal(Path(error.filename or "A file"), error))
@@ -102,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def told_warnings() -> Iterator[None]:
+def printed_warnings() -> Iterator[None]:
     """Print each of our own warnings on one line; suppress those of libraries."""
     debugging = bool(os.environ.get("LUMIGRAPH_DEBUG"))
     with warnings.catch_warnings():
@@ -122,29 +182,16 @@ def refuse(sentence: str, code: int = 2) -> int:
 
 def parse(arguments: list[str]) -> Any:
     """The command with its options. Leaves with code 2 if they cannot be understood."""
-    commands = dict(COMMANDS)
-    for name in ("train", "convert"):
-        if arguments[:1] == [name]:
-            commands[name] = with_method(commands[name], arguments[1:])
-    kinds = [
-        Annotated[kind, tyro.conf.subcommand(name, description=None if arguments[:1] == [name] else brief(kind))]
-        for name, kind in commands.items()
-    ]
-    union: Any = kinds[0]
-    for kind in kinds[1:]:
-        union |= kind
-    return held(
-        tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"], registry=RULES)
-    )
-
-
-def brief(kind: type) -> str:
-    """The first sentence of a command's help."""
-    return (kind.__doc__ or "").strip().partition("\n")[0]
-
-
-def with_method(command: type, arguments: list[str]) -> type:
-    """`train` or `convert` with the options of the method that the arguments name, if they name one."""
+    commands, first, rest = dict(COMMANDS), "".join(arguments[:1]), arguments[1:]
     there = methods.available()
-    named = [x for x in arguments if x.replace("_", "-") in there]
-    return with_options_of(named[0], arguments, command) if named else command
+    named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert") else []
+    if named:  # the options of the method too
+        commands[first] = with_options_of(named[0], rest, commands[first])
+    kinds = []
+    for name, kind in commands.items():
+        first_sentence = (kind.__doc__ or "").strip().partition("\n")[0]
+        about = tyro.conf.subcommand(name, description=None if name == first else first_sentence)
+        kinds.append(Annotated[kind, about])
+    union: Any = functools.reduce(operator.or_, kinds)
+    arguments = arguments or ["--help"]
+    return held(tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments, registry=RULES))

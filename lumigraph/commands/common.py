@@ -1,4 +1,4 @@
-"""Parts of several commands: the format of options, devices, scenes, output paths."""
+"""Parts of several commands: devices, budgets, output."""
 
 from __future__ import annotations
 
@@ -7,47 +7,14 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from typing import Any
 
 from .. import methods
 from ..budget import MEANS, Budget, Quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
-from ..files.readers import LISTED, NAMES
 from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
-
-if TYPE_CHECKING:
-    Reader = str
-else:
-    Reader = Literal[NAMES]
-
-
-def option(metavar: str, default: str | None = None, about: str | None = None) -> Any:
-    """An option in --help: its placeholder, its default in words, its description."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})", help=about)
-
-
-def needed(metavar: str) -> Any:
-    """An argument without a default in --help."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
-
-
-ReaderOption = Annotated[
-    Reader | None,
-    tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: detected)", help=f"Layout of the folder: {LISTED}."),
-]
-
-
-Overwrite = Annotated[
-    bool,
-    tyro.conf.arg(
-        help="Replace existing files of other origin too. Unchanged files that Lumigraph wrote are replaced "
-        "anyway; folders with other files in them never are."
-    ),
-]
 
 
 def choose_device(name: str) -> Any:
@@ -79,7 +46,7 @@ def method_config(command: Any, name: str) -> Any:
 
 
 def preset_device(device: str, preset: str) -> Any:
-    """The kind of machine whose defaults are wanted; it need not be here."""
+    """The kind of machine for the defaults of a method; this machine need not have it."""
     import torch
 
     return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
@@ -95,10 +62,10 @@ def value_of(name: str, arguments: Sequence[str], default: str) -> str:
     return default
 
 
-def told_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
+def given_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
     """The Budget of --steps or --seconds; `None` without them. Raises LumigraphError, before anything is opened, for an
     impossible value, and for more than one of these options."""
-    if sum(told is not None for told in (steps, seconds, quality)) > 1:
+    if sum(given is not None for given in (steps, seconds, quality)) > 1:
         raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
     return None if steps is None and seconds is None else Budget(steps, seconds)
 
@@ -110,8 +77,8 @@ def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
 
 def about_quality(kind: Any = None) -> str:
     """Help text of --quality; with the numbers of a kind of method, if given."""
-    told = "Choose the steps by method, number of photographs and their size. "
-    return told + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
+    about = "Choose the steps by method, number of photographs and their size. "
+    return about + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
 
 
 def numbers(kind: Any, quality: Quality) -> str:

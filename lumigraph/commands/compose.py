@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files import claim
 from ..files.ranges import Coordinate, Positive, between
-from .common import Overwrite, needed, option, show, typed
+from .common import show, typed
+from .options import Overwrite, needed, option
 
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 
@@ -31,22 +32,20 @@ class Compose:
     """Scene to place in it."""
     output: Annotated[Path, needed("FILE.json")]
     """The new file. It holds the paths of its parts relative to its own folder."""
-    at: Annotated[Triple | None, arg(metavar="X Y Z", help_behavior_hint="(default: the lead's lower side)")] = None
+    at: Annotated[Triple | None, option("X Y Z", "the lead's lower side")] = None
     """Position of the middle of the part's lower side, in the frame of the lead's photographs."""
     scale: Annotated[Positive | None, option("TIMES", "1")] = None
     """Scale of the part: units of the lead's photographs per unit of its own."""
     turn: Annotated[Annotated[float, between(-1e6, 1e6)] | None, option("DEGREES", "0")] = None
     """Rotation of the part about the vertical, counterclockwise from above."""
-    box: Annotated[
-        tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
-    ] = None
+    box: Annotated[tuple[Triple, Triple] | None, option("X Y Z X Y Z", "all of it")] = None
     """Crop the part to the box between two corners, in its scene's frame; `lumigraph info` shows its bounds."""
     overwrite: Overwrite = False
 
     def run(self) -> int:
         import torch
 
-        from ..camera.crop import Box
+        from ..camera.crop import CropBox
         from ..composition import standing
         from ..geometry import Similarity
         from ..run import open_any
@@ -59,19 +58,18 @@ class Compose:
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         lead, part = open_any(self.lead), open_any(self.part)
         place = Similarity.make(1.0)
-        if any(told is not None for told in (self.at, self.scale, self.turn)):
+        if any(given is not None for given in (self.at, self.scale, self.turn)):
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
             place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
         named = [CompositionPart(relative(self.lead, self.output), Similarity.make(1.0))]
-        named.append(CompositionPart(relative(self.part, self.output), place, self.box and Box(*self.box)))
+        named.append(CompositionPart(relative(self.part, self.output), place, self.box and CropBox(*self.box)))
         write_composition(self.output, named)
         opened = open_any(self.output)
         low, high = opened.frame.bounds
-        show(
-            {
-                "composition": str(self.output),
-                "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
-                "next": typed("view", self.output),
-            }
-        )
+        rows = {
+            "composition": str(self.output),
+            "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
+            "next": typed("view", self.output),
+        }
+        show(rows)
         return 0

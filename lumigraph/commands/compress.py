@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
 from ..system.console import console
-from .common import choose_device, needed, option, show, typed
+from .common import choose_device, show, typed
+from .options import DeviceOption, PhotographsOption, needed, option
 
 LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
 DEFAULT: Quality = "good"
@@ -35,7 +36,7 @@ class Compress:
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run, which does not change."""
-    output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
+    output: Annotated[Path, needed("NEW")]
     """New folder for the smaller run."""
     to: Annotated[str | None, option("SIZE", "as --quality")] = None
     """Upper limit of the model's size: 5MB, 800kB, 2MiB. A smaller one loses more PSNR."""
@@ -50,16 +51,14 @@ class Compress:
     """Tune for this number of steps instead."""
     views: Annotated[Count | None, option("N", "all")] = None
     """Compare only this number of held-out views, evenly spread."""
-    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
-    """Path of the photographs, if they were moved since training."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    scene: PhotographsOption = None
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..derive.compression import CompressionTarget, compress
         from ..run import Run
 
-        if sum(told is not None for told in (self.to, self.quality, self.max_loss)) > 1:
+        if sum(given is not None for given in (self.to, self.quality, self.max_loss)) > 1:
             raise LumigraphError("--to, --quality and --max-loss are ways to say how small; give one of them")
         if self.steps is not None and self.seconds is not None:
             raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")

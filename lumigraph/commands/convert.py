@@ -6,18 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..budget import Quality
 from ..errors import LumigraphError
-from ..files.ranges import Count, Seconds, Seed, Steps
+from ..files.ranges import Count, Seconds
 from ..system.console import console
-from .common import about_quality, choose_device, method_config, option, show, told_budget, typed
+from .common import about_quality, choose_device, given_budget, method_config, show, typed
 from .compress import size
+from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, needed, option
 
 DEFAULT_SECONDS = 30.0
 TABLE_WIDTH = 4096  # letters; a table cuts its lines where the console ends
-ABOUT = " A conversion from a field trains for half of these steps."
+ABOUT = about_quality() + " A conversion from a field trains for half of these steps."
+QUALITY = option("draft|good|best", "as long as --seconds", ABOUT)
 
 
 @dataclass(frozen=True)
@@ -30,31 +32,25 @@ class Convert:
     same command continues. `lumigraph convert RUN METHOD --help` adds the method's own options.
     """
 
-    source: Annotated[Positional[Path | None], arg(metavar="RUN_OR_FILE", help_behavior_hint="")] = None
+    source: Annotated[Positional[Path | None], needed("RUN_OR_FILE")] = None
     """Folder of a run, which does not change, or a splat file."""
-    method: Annotated[Positional[str | None], arg(metavar="METHOD", help_behavior_hint="")] = None
+    method: Annotated[Positional[str | None], needed("METHOD")] = None
     """Method to convert to, for example plenoxels."""
-    output: Annotated[Path | None, arg(metavar="NEW", help_behavior_hint="")] = None
+    output: Annotated[Path | None, needed("NEW")] = None
     """New folder for the run."""
     list: bool = False
     """Print the table of possible conversions, and exit."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
     """Training time in seconds after initialisation; longer improves the new method."""
-    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for this number of steps instead."""
-    quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality() + ABOUT)] = (
-        None
-    )
+    steps: StepsOption = None
+    quality: Annotated[Quality | None, QUALITY] = None
     distil: bool = False
     """Train on renderings of the old method, even if photographs are available."""
-    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
-    """Path of the photographs, if they were moved since training."""
+    scene: PhotographsOption = None
     views: Annotated[Count, option("N")] = 8
     """Compare at most this number of held-out views, evenly spread."""
-    seed: Annotated[Seed, option("N")] = 0
-    """Seed of all random choices."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
 
@@ -68,7 +64,7 @@ class Convert:
             return 0
         if self.source is None or self.method is None or self.output is None:
             raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")
-        told_budget(self.steps, self.seconds, self.quality)
+        given_budget(self.steps, self.seconds, self.quality)
         name, device = methods.check(self.method), choose_device(self.device)
         counted = self.steps is not None or self.quality is not None
         aim = ConversionTarget(

@@ -9,7 +9,8 @@ from typing import Annotated
 from ..budget import Budget
 from ..files.ranges import Count, Seconds
 from ..system.console import bold
-from .common import choose_device, exit_code, next_free, option, say, show, typed
+from .common import choose_device, exit_code, next_free, say, show, typed
+from .options import DeviceOption, option
 
 FRAMES = 90
 
@@ -31,8 +32,7 @@ class Demo:
     """Scene to train on."""
     frames: Annotated[Count, option("N")] = FRAMES
     """Number of frames of the film."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from .. import methods
@@ -63,12 +63,11 @@ class Demo:
         film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit)
         report = write_report(run)
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
-        show(
-            {
-                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
-                "film": str(orbit),
-                "report": str(report),
-                "run": str(run.folder),
-            }
-        )
+        rows = {
+            f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
+            "film": str(orbit),
+            "report": str(report),
+            "run": str(run.folder),
+        }
+        show(rows)
         return 0

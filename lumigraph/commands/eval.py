@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional
-
 from ..files.ranges import Count
 from ..system.console import bold
-from .common import Overwrite, choose_device, needed, option, show
-from .controls import Set, tell
+from .common import choose_device, show
+from .options import DeviceOption, Overwrite, RunOption, Set, controlled, option
 
-MEMORISED_DB = (
-    4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
-)
+MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
 
 
 @dataclass(frozen=True)
@@ -29,8 +24,7 @@ class Eval:
     v0.1/alex.pth. Shapes have IoU, chamfer distance and normal consistency instead.
     """
 
-    run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run."""
+    run_folder: RunOption
     split: Literal["test", "val", "train"] = "test"
     """Split of photographs, shapes or members of a collection to compare with."""
     views: Annotated[Count | None, option("N", "all")] = None
@@ -45,26 +39,27 @@ class Eval:
     scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
     """Path of the training data, if it was moved since training."""
     settings: Set = ()
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..evaluation import claim_evaluation, evaluate_run, stem
         from ..large import BlockRun
         from ..metrics import scores_of
+        from ..metrics.lpips import load_lpips, named_files
         from ..run import open_run
         from ..training.verdict import last_psnr
         from .outcome import next_commands
 
         run = open_run(self.run_folder)
         claim_evaluation(run, self.split, self.save_images, self.overwrite)
-        lpips = chosen_lpips(self.lpips)
+        weights = named_files(self.lpips)
+        lpips = load_lpips(weights) if weights else None
         device = choose_device(self.device)
         if isinstance(run, BlockRun):  # by the exposures of the photographs that it will be given
             data: Any = run.dataset(self.scene, self.split)
-            method = tell(run, run.method(device, data.about.get("exposure")), self.settings)
+            method = controlled(run, run.method(device, data.about.get("exposure")), self.settings)
         else:
-            method = tell(run, run.method(device), self.settings)
+            method = controlled(run, run.method(device), self.settings)
             data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
@@ -80,19 +75,11 @@ class Eval:
 
 
 def beside_training(learnt: float, psnr: float) -> str:
-    """The PSNR of the photographs learnt from, beside that of others, and what a gap means."""
-    told, better = f"{learnt:.2f} dB while training", learnt - psnr
+    """PSNR of the training photographs as text, and the meaning of a gap to held-out ones."""
+    text, better = f"{learnt:.2f} dB while training", learnt - psnr
     if better > MEMORISED_DB:
-        told += f", {better:.1f} dB better: it knows them by heart, so more photographs would help more than time"
-    return told
-
-
-def chosen_lpips(given: Sequence[Path]) -> Any:
-    """LPIPS with the weights that an option or the environment names; None if neither does."""
-    from ..metrics.lpips import load_lpips, named_files
-
-    paths = named_files(given)
-    return load_lpips(paths) if paths else None
+        text += f", {better:.1f} dB better: it has memorised them, so more photographs would help more than time"
+    return text
 
 
 def compared(result: dict[str, Any]) -> dict[str, str]:

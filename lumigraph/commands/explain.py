@@ -3,15 +3,174 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
-from .explains.activation import ExplainActivation
-from .explains.encodings import ExplainEncodings
-from .explains.ray import ExplainRay
+from ..errors import LumigraphError
+from ..files.ranges import Downscale, Steps, between
+from .common import choose_device, say, scene_name, show
+from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, controlled, needed, option
 
-# One line for each explanation; the files are in explains/.
+Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
+OCTAVES = tuple(2.0**octave for octave in range(8))  # scales of encodings, 1 to 128
+
+
+@dataclass(frozen=True)
+class ExplainActivation:
+    """Fit a sharp edge with a coarse grid in three orders: activation before, within and after interpolation.
+
+    One picture shows the result of each, with its PSNR.
+    """
+
+    output: Annotated[Path, option("FILE.png")] = Path("explained/activation.png")
+    """File of the picture."""
+    overwrite: Overwrite = False
+    cells: Annotated[int, between(2, 128), option("N")] = 10
+    """Cells of the grid along each axis; more reduce the differences."""
+    steps: Annotated[Steps, option("N")] = 1500
+    """Training steps for each order."""
+
+    def run(self) -> int:
+        from ..explain.activation import draw, fits
+        from ..files import claim
+        from ..system.progress import counting
+
+        claim(self.output, "figure", self.overwrite)
+        with counting("Fitting an edge in three orders"):
+            found = fits(self.cells, self.steps)
+        draw(self.output, found, self.cells)
+        show({fit.name: f"{fit.psnr:.2f} dB" for fit in found} | {"picture": str(self.output)})
+        return 0
+
+
+@dataclass(frozen=True)
+class ExplainEncodings:
+    """Fit a network to a picture with each encoding of its pixels, over a range of scales.
+
+    Half of the pixels are held out. One page, index.html, shows their PSNR against scale, the spectrum of the neural
+    tangent kernel, and the networks' pictures.
+    """
+
+    picture: Annotated[Positional[Path], needed("PICTURE")]
+    """An image file."""
+    output: Annotated[Path | None, option("FOLDER", "explained/PICTURE-encodings")] = None
+    """Folder of the page."""
+    overwrite: Overwrite = False
+    steps: Annotated[Steps, option("N")] = 500
+    """Training steps for each network."""
+    scales: Annotated[tuple[Annotated[float, between(1e-6, 1e6)], ...], option("S S ...")] = OCTAVES
+    """Scales to compare, in cycles across the picture: deviation of Gaussian, highest of positional frequencies."""
+    downscale: Annotated[Downscale | None, option("N", "to about 512 pixels")] = None
+    """Reduce the picture by this whole number; a larger one is faster."""
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        if len(set(self.scales)) < 2:
+            raise LumigraphError("A curve over scales needs two or more of them; for example --scales 1 10 100")
+        from dataclasses import replace
+
+        from ..capture import open_scene, single_image
+        from ..explain.encodings import compare
+        from ..explain.encodings_page import claim_page, write_page
+        from ..methods.fourier_features import FourierFeatures
+        from ..system.progress import counting
+
+        if not single_image.recognises(self.picture.expanduser()):
+            raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")
+        folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
+        claim_page(folder, self.overwrite, [self.picture.expanduser()])
+        device = choose_device(self.device)
+        scene = open_scene(self.picture, self.downscale)
+        config = replace(FourierFeatures.preset(device), seed=self.seed)
+        comparison = compare(scene, tuple(sorted(set(self.scales))), self.steps, device, config)
+        with counting("Drawing the page"):
+            write_page(folder, comparison)
+        show({fit.name: f"{fit.held_out:.2f} dB" for fit in comparison.leading} | {"page": str(folder / "index.html")})
+        return 0
+
+
+@dataclass(frozen=True)
+class ExplainRay:
+    """Draw density, transmittance, weights, samples and accumulated colour along the ray of a pixel.
+
+    One figure, which opens in a browser; its numbers are beside it as JSON. It includes the photograph's own colour if
+    the photographs are available.
+    """
+
+    run_folder: RunOption
+    pixel: Annotated[tuple[Place, Place] | None, option("X Y", "the middle of the picture")] = None
+    """Column and row of the pixel, from 0 0 at the upper left."""
+    view: Annotated[str, option("NAME_OR_NUMBER")] = "0"
+    """Photograph of the split: its name, or its number from 0."""
+    split: Literal["test", "val", "train"] = "test"
+    """Split of the photograph."""
+    output: Annotated[Path | None, option("FILE.svg", "RUN/rays/VIEW-X-Y.svg")] = None
+    """File of the figure."""
+    overwrite: Overwrite = False
+    scene: PhotographsOption = None
+    settings: Set = ()
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        if self.output and self.output.suffix != ".svg":
+            raise LumigraphError(f"{self.output} has no ending of a figure; give --output a name ending in .svg")
+        from ..evaluation import file_name
+        from ..explain.ray import along_ray
+        from ..explain.ray_figure import ray_figure
+        from ..figures.charts import standalone
+        from ..files import claim, write_bytes, write_json
+        from ..run import Run
+        from ..system.progress import counting
+
+        run = Run(self.run_folder)
+        name, camera = find_view(run, self.split, self.view)
+        x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
+        output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
+        for file in (output, output.with_suffix(".json")):
+            claim(file, "figure", self.overwrite)
+        method = controlled(run, run.method(choose_device(self.device)), self.settings)
+        camera = method.refined(camera)
+        with counting("Sampling the ray"):
+            sight = along_ray(method, camera, pixel)
+        sight = sight.beside(self._photograph(run, name))
+        title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
+        write_bytes(output, standalone(ray_figure(sight, title)), "figure")
+        about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
+        about |= {"controls": method.settings} if method.settings else {}
+        write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
+        show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
+        return 0
+
+    def _photograph(self, run: Any, name: str) -> Any:
+        """The photograph before the run's background, or None if it was moved and --scene is not given."""
+        try:
+            scene = run.scene(self.scene)
+            photograph = scene.photograph(scene.names.index(name))
+        except LumigraphError as error:
+            if self.scene:
+                raise
+            say(f"The figure does without the photograph: {error}")
+            return None
+        return photograph.before(run.frame.background)
+
+
+def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:
+    """Name and Camera of a photograph, by its name or number in a split of a Run. LumigraphError if there is none."""
+    names = run.view_names().get(split, [])
+    if not names:
+        raise LumigraphError(f"{run.folder} has no views in the split {split!r}; choose another --split")
+    number = names.index(view) if view in names else int(view) if view.isdecimal() else len(names)
+    if number >= len(names):
+        raise LumigraphError(
+            f"There is no view {view!r} in the split {split!r} of {run.folder}; give --view a number from 0 to "
+            f"{len(names) - 1}, or a name such as {names[0]}"
+        )
+    return names[number], run.cameras()[split][number]
+
+
 What = (
     Annotated[ExplainActivation, subcommand("activation")]
     | Annotated[ExplainEncodings, subcommand("encodings")]

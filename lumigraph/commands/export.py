@@ -2,21 +2,392 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from .exports.mesh import ExportMesh
-from .exports.octree import ExportOctree
-from .exports.panorama import ExportPanorama
-from .exports.points import ExportPoints
-from .exports.snerg import ExportSnerg
-from .exports.splats import ExportSplats
-from .exports.stereo import ExportStereo
-from .exports.web import ExportWeb
+from ..errors import LumigraphError, LumigraphWarning
+from ..files import claim
+from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Share, SphereSize, between
+from .common import show
+from .export_web import ExportWeb
+from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, controlled, needed, open_method, option
 
-# One line for each export; the files are in exports/.
+FOR_PHONES = 100_000  # triangles that a phone shows with ease
+
+
+@dataclass(frozen=True)
+class ExportMesh:
+    """Export a triangle mesh with vertex colours, in the frame of the photographs or upright.
+
+    The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
+    with density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene is meshed.
+    Unseen surface is closed (objects) or left out (rooms and open scenes).
+    """
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new file."""
+    extent: Annotated[
+        Annotated[float, between(0.001, 1000)] | None, option("TIMES", "1 for objects, 1.5 for the rest")
+    ] = None
+    """Size of the meshed region, times the box of interest in `lumigraph info`; or give --box or --sphere."""
+    cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
+    """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
+    way: Annotated[
+        Literal["auto", "density", "depth"],
+        arg(name="from", help_behavior_hint="(default: density where the method has one)"),
+    ] = "auto"
+    """Source of the surface: the density field, or rendered depth."""
+    level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
+    """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
+    smooth: Annotated[int, between(0, 1000), option("N")] = 10
+    """Rounds of smoothing; more round off detail, 0 is none."""
+    faces: Annotated[
+        Annotated[int, between(4, 1_000_000_000)] | None, option("N", f"all, for phones {FOR_PHONES:,}")
+    ] = None
+    """Number of triangles after simplification; fewer make a smaller file."""
+    keep: Annotated[Share, option("SHARE")] = 0.01
+    """Smallest piece to keep, as a share of the largest one's area; larger removes more fragments."""
+    unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
+    """Unseen surface: close it for a watertight mesh, or cut it."""
+    size: Annotated[Pixels, option("PIXELS")] = 400
+    """Longer side of the pictures for colours and depth, at most that of the photographs; larger is finer, slower."""
+    views: Annotated[Count, option("N")] = 64
+    """Largest number of these pictures."""
+    overwrite: Overwrite = False
+    part: OmitArgPrefixes[Keeping] = Keeping()
+    settings: Set = ()
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        from ..export.mesh import extract_mesh
+        from ..export.mesh_file import ending, write_mesh
+
+        for_phones = ending(self.output) == ".usdz"
+        claim(self.output, "mesh", self.overwrite, [self.source])
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        mesh = extract_mesh(
+            self.part.without_floaters(method),
+            opened.survey(cameras["train"]),
+            extent=self.extent,
+            crop=self.part.crop(opened.frame),
+            cell=None if self.cell_size is None else self.cell_size / opened.frame.to_source.scale,
+            level=self.level,
+            way=self.way,
+            smooth=self.smooth,
+            faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
+            keep=self.keep,
+            closed=None if self.unseen is None else self.unseen == "close",
+            size=self.size,
+            views=self.views,
+        ).in_source(opened.frame)
+        write_mesh(self.output, mesh, opened.frame.to_source.rotation[:, 2].numpy())
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        rows = {
+            "file": str(self.output),
+            "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
+            "extent": " x ".join(f"{x:.4g}" for x in high - low) + " in the frame of the photographs",
+            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+        }
+        show(rows)
+        return 0
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        if self.extent is not None and self.part.crops:
+            raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of detail for viewers that stream large scenes."""
+
+    lod: bool = False
+    """Write a folder of streamed SOG: FILE/lod-meta.json, and chunks at several levels of detail."""
+    levels: Annotated[Annotated[int, between(1, 10)] | None, option("N", "4")] = None
+    """With --lod: number of levels of detail, including the finest."""
+    ratio: Annotated[Annotated[float, between(1.5, 16)] | None, option("TIMES", "4")] = None
+    """With --lod: Gaussians of a level per Gaussian of the next; larger makes coarser levels."""
+    chunk: Annotated[Annotated[int, between(1024, 1 << 20)] | None, option("N", "65,536")] = None
+    """With --lod: largest number of Gaussians in a chunk; smaller makes more files."""
+
+    def output(self, path: Path) -> Path:
+        """Path of lod-meta.json, or the path itself. Raises LumigraphError for options that need --lod."""
+        if path.name == "lod-meta.json":
+            return path
+        if self.lod and path.suffix:
+            raise LumigraphError(f"--lod writes a folder, and {path} is named like a file; name one without an ending")
+        if self.given and not self.lod:
+            raise LumigraphError(f"--{next(iter(self.given))} is about levels of detail; give --lod as well")
+        return path / "lod-meta.json" if self.lod else path
+
+    @property
+    def given(self) -> dict[str, Any]:
+        values = {name: getattr(self, name) for name in ("levels", "ratio", "chunk")}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class ExportSplats:
+    """Export a trained cloud of Gaussians for splat viewers, or convert a splat file to another format.
+
+    The ending chooses the format: .ply (lossless), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no view-dependent
+    colour); NEW/meta.json is a folder of SOG, NEW/lod-meta.json (or NEW with --lod) one of streamed SOG. The export of
+    a run is in the frame of its photographs.
+    """
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new file."""
+    detail: OmitArgPrefixes[Levels] = Levels()
+    overwrite: Overwrite = False
+    part: OmitArgPrefixes[Keeping] = Keeping()
+    settings: Set = ()
+
+    def run(self) -> int:
+        from ..exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
+        from ..exchange.streamed_sog import Detail
+        from ..method.capabilities import HasGaussians, needs
+        from ..run import open_any
+        from ..run.opening import frame_of
+
+        output = self.detail.output(self.output)
+        check_ending(output)
+        claim_splats(output, self.overwrite, [self.source])
+        detail = Detail(**self.detail.given)
+        if is_splat_file(self.source):
+            if self.settings:
+                raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
+            written = read_gaussians(self.source)
+            if self.part.crops or self.part.floaters:
+                frame = frame_of(written)
+                crop = self.part.crop(frame)
+                written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source))
+        else:
+            opened = open_any(self.source)
+            method = controlled(opened, opened.method(), self.settings)
+            gaussians = needs(method, HasGaussians).gaussians()
+            gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
+            written = gaussians.transformed(method.frame.to_source.matrix)
+        write_gaussians(output, written, detail)
+        size = size_of(output)
+        rows = {
+            "file": str(output),
+            "Gaussians": f"{len(written):,}",
+            "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
+        }
+        show(rows)
+        return 0
+
+
+@dataclass(frozen=True)
+class ExportOctree:
+    """Export the octree of a plenoctrees run as one .npz, for volrend and svox.
+
+    It is in the frame of the photographs. If that is rotated against the scene's, it is in the scene's frame, because
+    the format has no rotation.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN")]
+    """Folder of a run."""
+    output: Annotated[Positional[Path], needed("FILE.npz")]
+    """The new file."""
+    depth: Annotated[Annotated[int, between(1, 10)] | None, option("N", "all there are")] = None
+    """Largest depth of the octree; deeper levels are averaged, for a smaller file."""
+    overwrite: Overwrite = False
+    settings: Set = ()
+
+    def run(self) -> int:
+        if self.output.suffix.lower() != ".npz":
+            raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
+        claim(self.output, "octree", self.overwrite, [self.source])
+        from ..exchange.baked import write_octree
+        from ..method.capabilities import HasOctree, needs
+        from ..run import open_any
+
+        opened = open_any(self.source)
+        octree = needs(controlled(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
+        in_source = write_octree(self.output, octree, opened.frame)
+        rows = {
+            "file": str(self.output),
+            "nodes": f"{len(octree.child):,}",
+            "frame": "of the photographs" if in_source else "of the scene, for the format has no rotation",
+            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+        }
+        show(rows)
+        return 0
+
+
+@dataclass(frozen=True)
+class ExportPoints:
+    """Export coloured points with normals, spread evenly over the surfaces that the photographs show.
+
+    They are in the frame of the photographs. Floaters are left out: several cameras must see each point.
+    """
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FILE.ply")]
+    """The new file."""
+    count: Annotated[CloudSize, option("N")] = 200_000
+    """Largest number of points."""
+    size: Annotated[Pixels, option("PIXELS")] = 400
+    """Longer side of the pictures that points are taken from, at most that of the photographs."""
+    views: Annotated[Count, option("N")] = 64
+    """Largest number of these pictures."""
+    overwrite: Overwrite = False
+    part: OmitArgPrefixes[Keeping] = Keeping()
+    settings: Set = ()
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        if self.output.suffix.lower() != ".ply":
+            raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
+        claim(self.output, "points", self.overwrite, [self.source])
+        from ..export.points import extract_points, write_points
+
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        seers = opened.survey(cameras["train"])
+        method, crop = self.part.without_floaters(method), self.part.crop(opened.frame)
+        points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
+        write_points(self.output, points)
+        rows = {
+            "file": str(self.output),
+            "points": f"{len(points.positions):,}",
+            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+        }
+        show(rows)
+        return 0
+
+
+Place = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate] | None, option("X Y Z", "the position of the middle camera", name="from")
+]
+
+
+@dataclass(frozen=True)
+class SphereExport:
+    """Base of exports of the whole sphere around a place."""
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new picture."""
+    place: Place = None
+    """Position of the camera, or of the middle between two eyes, in the frame of the photographs."""
+    size: Annotated[SphereSize, option("PIXELS")] = 2048
+    """Width in pixels; the height of each sphere is half of it."""
+    overwrite: Overwrite = False
+    part: OmitArgPrefixes[Keeping] = Keeping()
+    settings: Set = ()
+    device: DeviceOption = "auto"
+
+    def opened(self) -> tuple[Any, Any, Any, Any, str]:
+        """Open the source and find the standpoint: the source, its method, place and heading in the scene's frame, and
+        the place in words."""
+        from ..export.panorama import picture_format, sphere_size, standpoint
+
+        picture_format(self.output)
+        sphere_size(self.size)
+        claim(self.output, "panorama", self.overwrite, [self.source])
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        return opened, self.part.of_method(method), *standpoint(cameras["train"], opened.frame, self.place)
+
+
+@dataclass(frozen=True)
+class ExportPanorama(SphereExport):
+    """All that is seen from one place, as an equirectangular picture that viewers and headsets show as a sphere.
+
+    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
+    """
+
+    def run(self) -> int:
+        from ..export.panorama import panorama, save_sphere
+
+        _, method, place, heading, where = self.opened()
+        save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
+        show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})
+        return 0
+
+
+CONTRACTED = (
+    "This open capture was baked whole, in contracted coordinates, which Lumigraph opens again and SNeRG's viewer "
+    "shows out of shape; for that viewer train with --no-whole, which bakes the box of interest alone"
+)
+
+
+@dataclass(frozen=True)
+class ExportSnerg:
+    """Export a baked run as the folder of SNeRG's own viewer: scene_params.json and slices of its atlas as PNG.
+
+    It is in the scene's frame with +y up. Such a folder also opens like a run. A folder of an open capture is
+    contracted (docs/methods/snerg.md), which other viewers do not undo, unless trained with --no-whole.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]
+    """Folder of a baked run, or one that SNeRG's viewer opens."""
+    output: Annotated[Positional[Path], needed("FOLDER")]
+    """The new folder."""
+
+    def run(self) -> int:
+        from ..exchange import size_of, snerg
+        from ..files import claim_folder
+        from ..method.capabilities import HasAtlas, needs
+        from ..run import open_any
+
+        claim_folder(self.output, "atlas")
+        atlas = needs(open_any(self.source).method(), HasAtlas).atlas()
+        snerg.write(self.output, atlas)
+        if atlas.contracted:
+            warnings.warn(CONTRACTED, LumigraphWarning, stacklevel=2)
+        x, y, z = (n * atlas.block for n in atlas.index.shape)
+        rows = {
+            "folder": str(self.output),
+            "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks",
+            "size": f"{size_of(self.output) / 1e6:.1f} MB",
+        }
+        show(rows)
+        return 0
+
+
+@dataclass(frozen=True)
+class ExportStereo(SphereExport):
+    """An omnidirectional stereo pair on one square picture, the left eye on top.
+
+    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
+    Photographs seldom determine the scale of a scene. If yours is in metres (GPS, a measured model), real sizes need
+    the option --interpupillary 0.064.
+    """
+
+    interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
+    """Distance between the eyes, in units of the photographs' frame; larger makes the scene look smaller and deeper."""
+
+    def run(self) -> int:
+        from ..export.panorama import EYE_DISTANCE_SHARE, save_sphere, stereo_pair, surrounding_distances, top_bottom
+
+        opened, method, place, heading, where = self.opened()
+        unit = opened.frame.to_source.scale
+        near, middle = surrounding_distances(method, place, heading)
+        apart = EYE_DISTANCE_SHARE * middle if self.interpupillary is None else self.interpupillary / unit
+        if apart > near:
+            raise LumigraphError(
+                f"Eyes {apart * unit:.4g} apart do not fit where things are {near * unit:.4g} away; "
+                "give a smaller --interpupillary or another --from"
+            )
+        pair = stereo_pair(method, place, heading, self.size, apart, near)
+        save_sphere(self.output, top_bottom(*pair), whole=False)
+        rows = {
+            "stereo pair": f"{self.output}, the left eye on top",
+            "size": f"{self.size}x{self.size}",
+            "from": where,
+            "eyes": f"{apart * unit:.4g} apart; half of all is nearer than {middle * unit:.4g}",
+        }
+        show(rows)
+        return 0
+
+
 What = (
     Annotated[ExportMesh, subcommand("mesh")]
     | Annotated[ExportOctree, subcommand("octree")]

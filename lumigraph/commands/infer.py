@@ -10,7 +10,8 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Seed
-from .common import ReaderOption, choose_device, needed, next_free, option, scene_name, show
+from .common import choose_device, next_free, scene_name, show
+from .options import DeviceOption, ReaderOption, needed, option
 
 
 @dataclass(frozen=True)
@@ -37,17 +38,16 @@ class Infer:
     downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
     """Reduce photographs by this whole number; a larger one is faster and loses detail."""
     reader: ReaderOption = None
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..method.prior import Prior
         from ..run import Run, check_new
-        from ..run.inferred import draw
+        from ..run.derived import draw
         from .outcome import next_commands
 
         if (self.scene is None) == (self.seed is None):
-            raise LumigraphError("Name a scene, or give --seed for an object that nobody has photographed; one of them")
+            raise LumigraphError("Name a scene, or give --seed for a new object; one of them")
         made_by = Run(self.prior)
         prior = Prior.of(made_by.method(choose_device(self.device)), made_by.kind, self.prior)
         drawn_of = f"{scene_name(made_by.settings.scene.source)}-seed-{self.seed}"
@@ -63,25 +63,24 @@ class Infer:
         return 0
 
     def _inferred(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
-        """The run of a scene, and what to say of it."""
+        """The run of a scene, and rows about it to print."""
         from ..capture import PROCEDURAL, kind_of, open_dataset, single_image, sources_of
         from ..capture.assemble import HOLD_OUT
         from ..capture.photos import is_bare
         from ..datasets.collection import Collection
         from ..datasets.dataset import check_kind
         from ..datasets.scene import Scene
-        from ..run.inferred import infer
+        from ..run.derived import infer
 
         assert self.scene is not None
         name, path = made_by.method_name, Path(self.scene).expanduser()
         if not self.scene.startswith(PROCEDURAL) and (single_image.recognises(path) or is_bare(path)):
             raise LumigraphError(
-                f"{self.scene} holds no poses, and {name} must know where photographs were taken from; "
-                f"find them first: lumigraph capture {self.scene}"
+                f"{self.scene} holds no poses, which {name} needs; find them first: lumigraph capture {self.scene}"
             )
         if kind_of(self.scene, Scene) is Collection:
             raise LumigraphError(
-                f"{name} is told one scene, and {self.scene} is a collection; name one of its scenes: "
+                f"{name} takes one scene, and {self.scene} is a collection; name one of its scenes: "
                 f"lumigraph infer {self.prior} {next(iter(sources_of(self.scene).values()))}"
             )
         options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
@@ -101,5 +100,5 @@ class Infer:
         count = len(scene.splits["train"])
         rows = {"made of": f"{count} photograph{'' if count == 1 else 's'}"}
         if set(scene.splits["test"].tolist()) <= set(scene.splits["train"].tolist()):
-            rows["held out"] = "none, so scores of lumigraph eval are of photographs that it was told"
+            rows["held out"] = "none, so lumigraph eval scores the input photographs"
         return run, rows

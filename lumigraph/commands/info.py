@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from ..files.ranges import Downscale
 from ..system.console import console
-from .common import ReaderOption, needed, option
+from .options import ReaderOption, needed, option
 
 TREE_WIDTH = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
 
@@ -30,36 +30,29 @@ class Info:
         from ..exchange import is_splat_file, read_gaussians, snerg
         from ..large import BlockRun
         from ..run import is_block_run
-        from .info_tree import (
-            atlas_tree,
-            blocks_tree,
-            canonical_tree,
-            cloud_tree,
-            composition_tree,
-            dataset_tree,
-            run_tree,
-        )
+        from . import info_tree
 
         if is_block_run(Path(self.what)):
-            tree = blocks_tree(BlockRun(self.what))
+            tree = info_tree.blocks_tree(BlockRun(self.what))
         elif (Path(self.what) / "config.json").exists():
             from ..run import Run
 
-            tree = run_tree(Run(self.what))
+            tree = info_tree.run_tree(Run(self.what))
         elif is_splat_file(self.what):
-            tree = cloud_tree(self.what, read_gaussians(self.what))
+            tree = info_tree.cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and Path(self.what).is_file():
             from ..run import open_any
-            from ..run.canonicalised import Canonicalised
+            from ..run.composition import Canonicalised
 
             opened = open_any(self.what)
-            tree = canonical_tree(opened) if isinstance(opened, Canonicalised) else composition_tree(opened)
+            made = info_tree.canonical_tree if isinstance(opened, Canonicalised) else info_tree.composition_tree
+            tree = made(opened)
         elif snerg.recognises(Path(self.what)):
-            from ..run.snerg_folder import SnergFolder
+            from ..run.opening import SnergFolder
 
-            tree = atlas_tree(SnergFolder(self.what))
+            tree = info_tree.atlas_tree(SnergFolder(self.what))
         else:
-            told: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
-            tree = dataset_tree(open_dataset(self.what, **told))
+            options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
+            tree = info_tree.dataset_tree(open_dataset(self.what, **options))
         console(width=TREE_WIDTH, soft_wrap=True).print(tree)
         return 0

@@ -7,7 +7,6 @@ from typing import Any
 from rich.tree import Tree
 
 from ..budget import Budget
-from ..datasets.alignment import Moves
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..datasets.shapes import Shapes
@@ -15,25 +14,26 @@ from ..errors import LumigraphError
 from ..exchange import size_of
 from ..files.names import natural
 from ..gaussians import Gaussians
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
 from ..run import Run
-from ..run.compressed import Compressed
-from ..run.converted import Converted
-from ..run.inferred import Inferred
+from ..run.derived import Compressed, Converted, Inferred
 from ..system.console import bold, dim
 from ..training.verdict import cameras_moved
 
-MAX_MEMBERS = 12  # of many shapes, that are told of one by one
+MAX_MEMBERS = 12  # shapes that are listed
 
 
 def run_tree(run: Run) -> Tree:
-    said = run.settings
+    settings = run.settings
     tree = Tree(bold(run.folder) + f"  a run of {run.method_name}")
-    branch(tree, "scene", {"source": said.scene.source, **said.splits, **opened_with(said.scene.options)})
+    options = dict(settings.scene.options)
+    if (part := options.get("part")) is not None:  # of a block
+        options["part"] = f"{len(part['photographs'])} photographs of a larger scene"
+    branch(tree, "scene", {"source": settings.scene.source, **settings.splits, **options})
     branch(tree, "frame", frame_rows(run.frame))
-    branch(tree, "config", said.config)
+    branch(tree, "config", settings.config)
     if controls := control_rows(run):
         branch(tree, "controls, by --set", controls)
     if run.has_state:
@@ -42,24 +42,26 @@ def run_tree(run: Run) -> Tree:
         branch(
             tree,
             "trained",
-            rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
+            rows
+            | {
+                "budget": settings.budget and str(Budget.from_json(settings.budget)),
+                "seed": settings.seed,
+                "on": settings.device,
+            },
         )
-    if moved := moves_of(run):
-        branch(tree, "cameras", {"moved by": str(moved)})
+    if run.has_state and settings.config.get("refine_cameras"):
+        if moved := cameras_moved(run.method("cpu"), run.cameras()["train"]):
+            branch(tree, "cameras", {"moved by": str(moved)})
     if made := Compressed.read(run.folder):
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
-    if inferred := Inferred.of(said, run.folder / "config.json"):
+    if inferred := Inferred.of(settings, run.folder / "config.json"):
         seen = f"{inferred.views} photographs" if inferred.seed is None else f"seed {inferred.seed}"
         branch(tree, "inferred", {"by": inferred.prior, "of": seen})
     if converted := Converted.read(run.folder):
         like = f"{converted.psnr:.2f} dB, of {converted.views} held-out views against the source's"
-        told: dict[str, Any] = {
-            "from": f"{converted.source}, a {converted.teacher.method}",
-            "by": converted.how,
-            "alike": like,
-        }
-        branch(tree, "converted", told | {"then learnt from": converted.learnt_from})
+        origin: dict[str, Any] = {"from": f"{converted.source}, a {converted.teacher.method}", "by": converted.how}
+        branch(tree, "converted", origin | {"alike": like, "then learnt from": converted.learnt_from})
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")
@@ -95,19 +97,6 @@ def blocks_tree(run: BlockRun) -> Tree:
     return tree
 
 
-def opened_with(options: dict[str, Any]) -> dict[str, Any]:
-    """Options that photographs were opened with; for a block, the number of chosen photographs."""
-    part = options.get("part")
-    return options if part is None else options | {"part": f"{len(part['photographs'])} photographs of a larger scene"}
-
-
-def moves_of(run: Run) -> Moves | None:
-    """Movement of the refined cameras; `None` without pose refinement, or before training."""
-    if not (run.has_state and run.settings.config.get("refine_cameras")):
-        return None
-    return cameras_moved(run.method("cpu"), run.cameras()["train"])
-
-
 def control_rows(run: Run) -> dict[str, str]:
     """Ranges or choices of the method's controls, some of which depend on the weights; empty without controls, or if
     the method cannot be opened."""
@@ -122,7 +111,11 @@ def dataset_tree(data: Dataset) -> Tree:
     """A dataset of any kind."""
     if isinstance(data, Scene):
         return scene_tree(data)
-    return shapes_tree(data) if isinstance(data, Shapes) else collection_tree(data)
+    if isinstance(data, Shapes):
+        return shapes_tree(data)
+    tree = Tree(bold(data.source) + f"  a collection of {len(data.names)}")
+    branch(tree, "members", {name: ", ".join(data.names[i] for i in index) for name, index in data.splits.items()})
+    return tree
 
 
 def shapes_tree(shapes: Shapes) -> Tree:
@@ -133,12 +126,6 @@ def shapes_tree(shapes: Shapes) -> Tree:
         surface = "points alone" if shape.is_cloud else "closed" if shape.closed else "not closed"
         unit = f"{shape.frame.to_source.scale:.4g} of the source's"
         branch(tree, shape.name, {"size": count, "surface": surface, "one scene unit": unit})
-    return tree
-
-
-def collection_tree(data: Dataset) -> Tree:
-    tree = Tree(bold(data.source) + f"  a collection of {len(data.names)}")
-    branch(tree, "members", {name: ", ".join(data.names[i] for i in index) for name, index in data.splits.items()})
     return tree
 
 

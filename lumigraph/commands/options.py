@@ -1,67 +1,205 @@
-"""Ranges on the command line: --help shows them beside the defaults, and what was typed is held to them.
-
-Both are read from annotations (`ranges`), of the commands as of the methods' Configs.
-"""
+"""Options of several commands: their format in --help; controls of the method (--set, --animate); crops and removal of
+floaters (--box, --sphere, --clean)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import is_dataclass, replace
-from typing import Annotated, Any, get_args
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import arg
-from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
+from tyro.conf import Positional, UseAppendAction, arg
 
 from ..errors import LumigraphError
-from ..files.ranges import coherent, domain, outside, shown
+from ..files.ranges import Coordinate, Positive, Seed, Share, Steps
+from ..files.readers import LISTED, NAMES
 
-RULES = ConstructorRegistry()
-beneath = False  # whether tyro is asked for what it would do without our rule
-
-
-@RULES.struct_rule
-def with_ranges(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """A dataclass as tyro reads it, each number with its range behind its default: (default: 16; 1 to 32)."""
-    if beneath or not is_dataclass(info.type):
-        return None
-    with without_ranges():
-        spec = ConstructorRegistry.get_struct_spec(info)
-    if not isinstance(spec, StructConstructorSpec):
-        return None
-    return replace(spec, fields=tuple(replace(x, type=with_range(x.type)) for x in spec.fields))
+if TYPE_CHECKING:
+    Reader = str
+else:
+    Reader = Literal[NAMES]
 
 
-@contextmanager
-def without_ranges() -> Iterator[None]:
-    """A block in which tyro goes by its own rules."""
-    global beneath
-    beneath = True
-    try:
-        yield
-    finally:
-        beneath = False
+def option(metavar: str, default: str | None = None, about: str | None = None, name: str | None = None) -> Any:
+    """An option in --help: its placeholder, its default in words, its description, its name if not the field's."""
+    hint = default and f"(default: {default})"
+    return arg(metavar=metavar, help_behavior_hint=hint, help=about, name=name)
 
 
-def with_range(kind: Any) -> Any:
-    """An option's annotation with its range in what --help says of the default; itself where it has no range."""
-    if not (range := domain(kind)):
-        return kind
-    hints = [x.help_behavior_hint for x in get_args(kind)[1:] if getattr(x, "help_behavior_hint", None) is not None]
-
-    def hint(default: str) -> str:
-        said = hints[-1] if hints else f"(default: {default})"
-        return f"{said[:-1]}; {range})" if said else f"({range})"
-
-    return Annotated[kind, arg(help_behavior_hint=hint)]
+def needed(metavar: str, about: str | None = None, name: str | None = None) -> Any:
+    """An argument without a default in --help."""
+    return option(metavar, "", about, name)
 
 
-def held(command: Any) -> Any:
-    """A command as it was typed. Raises LumigraphError for a number beyond its range, and for those that disagree."""
-    for name, kind, value in outside(command):
-        called = next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), name).replace("_", "-")
-        typed = " ".join(map(shown, value)) if isinstance(value, tuple) else shown(value)
-        numbers = "numbers" if isinstance(value, tuple) else "a number"
-        raise LumigraphError(f"--{called} cannot be {typed}; give it {numbers} from {domain(kind)}")
-    coherent(command)
-    return command
+DEVICE = "Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."
+DeviceOption = Annotated[str, option("NAME", about=DEVICE)]
+OVERWRITE = (
+    "Replace existing files of other origin too. Unchanged files that Lumigraph wrote are replaced anyway; folders "
+    "with other files in them never are."
+)
+Overwrite = Annotated[bool, arg(help=OVERWRITE)]
+PHOTOGRAPHS = "Path of the photographs, if they were moved since training."
+PhotographsOption = Annotated[str | None, option("SCENE", "the path used in training", PHOTOGRAPHS)]
+ReaderOption = Annotated[Reader | None, option("NAME", "detected", f"Layout of the folder: {LISTED}.")]
+RunOption = Annotated[Positional[Path], needed("RUN", "Folder of the run.")]
+SeedOption = Annotated[Seed, option("N", about="Seed of all random choices.")]
+SOURCE = "Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."
+SourceOption = Annotated[Positional[Path], needed("RUN_OR_FILE", SOURCE)]
+INSTEAD = "Train for this number of steps instead."
+StepsOption = Annotated[Steps | None, option("N", "as long as --seconds", INSTEAD)]
+
+SET = "Set a control of the method; `lumigraph info RUN` lists them. Can be given several times."
+Set = UseAppendAction[Annotated[tuple[str, ...], needed("NAME=VALUE", SET, "set")]]
+ANIMATE = "Change a control from A to B over the film, or on to C with A:B:C. Can be given several times."
+Animate = UseAppendAction[Annotated[tuple[str, ...], needed("NAME=A:B", ANIMATE, "animate")]]
+
+
+def open_method(source: Any, device: str, settings: Iterable[str] = ()) -> tuple[Any, Any, Any]:
+    """The opened run or file, its method with the controls of --set, and the cameras of its photographs by split, as
+    the method has refined them."""
+    from ..run import open_any
+    from .common import choose_device
+
+    opened = open_any(source)
+    method = controlled(opened, opened.method(choose_device(device)), settings)
+    return opened, method, {split: method.refined(cameras) for split, cameras in opened.cameras().items()}
+
+
+def controlled(opened: Any, method: Any, settings: Iterable[str]) -> Any:
+    """The method with the controls of --set. Raises LumigraphError for controls that it does not have."""
+    values = dict(parted("--set", "NAME=VALUE", text) for text in settings)
+    return method.given(**{name: by_number(opened, method, name, value) for name, value in values.items()})
+
+
+def animate(opened: Any, method: Any, settings: Iterable[str], frames: int) -> Any:
+    """The method of each frame of a film by --animate; the method itself without --animate."""
+    from ..export.film import animated
+
+    stations = {}
+    for name, text in (parted("--animate", "NAME=A:B", text) for text in settings):
+        if name in method.settings:
+            raise LumigraphError(f"{name} is both set and animated; leave out --set {name} or --animate {name}")
+        if ":" not in text:
+            raise LumigraphError(f"--animate {name}={text} goes nowhere; write where it goes, as in {name}=A:B")
+        stations[name] = [by_number(opened, method, name, value) for value in text.split(":")]
+    return animated(method, stations, frames) if stations else method
+
+
+def parted(option: str, form: str, text: str) -> tuple[str, str]:
+    """The two sides of NAME=VALUE."""
+    name, equals, value = text.partition("=")
+    if not (name.strip() and equals and value.strip()):
+        raise LumigraphError(f"{option} {text} gives no value for a control; write {option} {form}")
+    return name.strip().replace("-", "_"), value.strip()
+
+
+def by_number(opened: Any, method: Any, name: str, value: str) -> str:
+    """The value, or the number of the photograph that it names if the control takes one; in a blend, A:B:0.5, the
+    numbers of both."""
+    control = next((control for control in method.controls if control.name == name), None)
+    if control is None or not control.of_photographs:
+        return value
+    by_name = numbers(opened)
+    if value in by_name or not control.blends:
+        return by_name.get(value, value)
+    return ":".join(by_name.get(part, part) for part in value.split(":"))
+
+
+def numbers(opened: Any) -> dict[str, str]:
+    """The number of each photograph, by its name."""
+    cameras = opened.cameras()
+    return {
+        name: str(number)
+        for split, names in opened.view_names().items()
+        for name, number in zip(names, cameras[split].image_index.tolist(), strict=True)
+    }
+
+
+Six = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
+Four = tuple[Coordinate, Coordinate, Coordinate, Positive]
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Crop the scene, and remove floaters from Gaussians."""
+
+    box: Annotated[Six | None, option("X0 Y0 Z0 X1 Y1 Z1", "everything")] = None
+    """Crop to the box between two corners."""
+    sphere: Annotated[Four | None, option("X Y Z RADIUS", "everything")] = None
+    """Crop to the inside of a sphere."""
+    units: Literal["scene", "source"] = "scene"
+    """Frame of --box and --sphere: scene, as in `lumigraph info` and the viewer, or source, as in the photographs and
+    exports."""
+    clean: bool = False
+    """Remove floaters from Gaussians: faint, huge or isolated ones, with limits that suit most scenes."""
+    min_opacity: Annotated[Share | None, option("SHARE", "0, with --clean 0.02")] = None
+    """Remove Gaussians with a lower opacity; a larger value removes more."""
+    max_scale: Annotated[Positive | None, option("SHARE", "any, with --clean 1")] = None
+    """Remove Gaussians with a larger standard deviation, in extents of the cloud; a smaller value removes more."""
+    isolation: Annotated[Positive | None, option("DEVIATIONS", "any, with --clean 3")] = None
+    """Remove Gaussians farther from neighbours than most, in standard deviations; a smaller value removes more."""
+
+    @property
+    def crops(self) -> bool:
+        return self.box is not None or self.sphere is not None
+
+    @property
+    def floaters(self) -> Mapping[str, float]:
+        """Arguments of `cleaned` for floaters: the given numbers, with --clean the defaults of the rest."""
+        from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
+
+        usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
+        given = {name: value for name in usual if (value := getattr(self, name)) is not None}
+        return usual | given if self.clean else given
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        if self.box is not None and self.sphere is not None:
+            raise LumigraphError("--box and --sphere are two ways to crop; give one of them")
+        if self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)):
+            raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
+
+    def crop(self, frame: Any) -> Any:
+        """The Crop, in the scene's frame; None where there is none."""
+        from ..camera.crop import Crop, CropBox, Sphere
+
+        crop: Crop
+        if self.box is not None:
+            crop = CropBox(self.box[:3], self.box[3:])
+        elif self.sphere is not None:
+            crop = Sphere(self.sphere[:3], self.sphere[3])
+        else:
+            return None
+        return crop if self.units == "scene" else crop.moved(frame.to_source.inverse)
+
+    def unwanted(self, gaussians: Any, crop: Any) -> Any:
+        """Masks of the Gaussians to remove, by reason. Raises LumigraphError if that is all of them."""
+        from ..gaussians.cloud import gone, unwanted
+
+        reasons = unwanted(gaussians, crop, **self.floaters)
+        if len(gaussians) and gone(reasons).all():
+            raise LumigraphError(
+                "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
+                "or clean less"
+            )
+        return reasons
+
+    def of_gaussians(self, gaussians: Any, crop: Any) -> Any:
+        """Gaussians to keep. Raises LumigraphError if that is none."""
+        from ..gaussians.cloud import gone
+
+        return gaussians[~gone(self.unwanted(gaussians, crop))]
+
+    def of_method(self, method: Any) -> Any:
+        """The cropped method without floaters, ready to render. Raises LumigraphError where it can have no floaters."""
+        from ..composition import PickedCloud, cropped
+        from ..method.capabilities import HasGaussians, can, needs
+
+        crop = self.crop(method.frame)
+        if self.floaters or (crop is not None and can(method, HasGaussians)):
+            return PickedCloud(method.frame, self.of_gaussians(needs(method, HasGaussians).gaussians(), crop))
+        return method if crop is None else cropped(method, crop)
+
+    def without_floaters(self, method: Any) -> Any:
+        """All of a method but its floaters, for what crops by itself."""
+        return replace(self, box=None, sphere=None).of_method(method)

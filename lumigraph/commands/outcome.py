@@ -12,14 +12,10 @@ from .common import say, show, typed
 
 SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
 MIN_GROWTH = 2.5  # times the budget so far that a suggestion has at least
-NEXT = {
-    "eval": "compare with what it has not seen",
-    "view": "look at it in the browser",
-    "export": "make a page to share",
-}
+NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "export": "make a page to share"}
 
 
-def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
+def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Print the state of a Run after an Outcome, and the next commands."""
     from ..training.verdict import cameras_moved, last_psnr, loss_trend
 
@@ -68,10 +64,9 @@ def advice(trend: Any, enough: bool, more: str, photographed: bool) -> str:
     if not enough:
         return f"it has had fewer steps than a draft needs, so more time will help: {more}"
     if trend is None:
-        return f"whether more time would help cannot be told; to try: {more}"
-    return "it has settled; " + (
-        "more photographs would help more than time" if photographed else "time changes little"
-    )
+        return f"it is unknown whether more time would help; to try: {more}"
+    settled = "more photographs would help more than time" if photographed else "time changes little"
+    return f"it has settled; {settled}"
 
 
 def photographed(run: Any, data: Any) -> bool:

@@ -10,15 +10,15 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, FramesPerSecond, Pixels
-from .common import Overwrite, needed, option, show
-from .controls import Animate, Set, animate, open_method
+from .common import show
+from .options import Animate, DeviceOption, Overwrite, Set, animate, needed, open_method, option
 
-# As in `paths.film`, which help must not import.
+# As in `paths`, which help must not import.
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 DEFAULT_SIZE, AUTO = 480, "auto"
 CHOSEN = {
     "orbit": "orbit, for the photographs go round",
-    "sweep": "sweep, for the photographs look the same way; --path orbit goes to and fro",
+    "sweep": "sweep, for all cameras have about the same direction; --path orbit goes to and fro",
 }
 
 
@@ -49,8 +49,7 @@ class Render:
     overwrite: Overwrite = False
     settings: Set = ()
     animated: Animate = ()
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..export.film import claim_film, film
@@ -72,20 +71,19 @@ class Render:
         shown = animate(opened, method, self.animated, len(cameras))
         about = film(shown, cameras, output, fps, light=self.format == "exr")
         width, height = about["size"]
-        show(
-            {
-                "film": str(output),
-                **({"path": CHOSEN[path]} if self.path == AUTO else {}),
-                "depth": str(output.with_stem(f"{output.stem}-depth")),
-                "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
-                "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
-            }
-        )
+        rows = {
+            "film": str(output),
+            **({"path": CHOSEN[path]} if self.path == AUTO else {}),
+            "depth": str(output.with_stem(f"{output.stem}-depth")),
+            "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
+            "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
+        }
+        show(rows)
         return 0
 
 
 def read_path(name: str, fps: float | None) -> Any:
-    """The CameraPath in a file, at another speed of frames if asked. Raises LumigraphError if it is none."""
+    """The CameraPath in a file, with other frames per second if given. Raises LumigraphError if it is none."""
     from ..paths.keyframes import CameraPath
 
     file = Path(name)

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional
-
-from .common import Overwrite, needed, show
+from .common import show
+from .options import Overwrite, RunOption
 
 
 @dataclass(frozen=True)
@@ -18,8 +15,7 @@ class Report:
     It always has curves, settings and timings; it has the contact sheet after `eval`, and a film after `render`.
     """
 
-    run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run."""
+    run_folder: RunOption
     overwrite: Overwrite = False
 
     def run(self) -> int:

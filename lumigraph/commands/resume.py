@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
-
-from tyro.conf import Positional
 
 from ..budget import Budget, Quality
 from ..errors import LumigraphError
 from ..files.ranges import Port, Seconds, Steps
-from .common import choose_device, exit_code, needed, option, quality_budget, told_budget, typed
+from .common import choose_device, exit_code, given_budget, quality_budget, typed
+from .options import RunOption, option
 
 
 @dataclass(frozen=True)
@@ -22,8 +20,7 @@ class Resume:
     decay again, and clouds may grow; coarse stages at the beginning of a run are not repeated.
     """
 
-    run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run."""
+    run_folder: RunOption
     seconds: Annotated[Seconds | None, option("S", "unchanged")] = None
     """New total training time in seconds, including the time already trained."""
     steps: Annotated[Steps | None, option("N", "unchanged")] = None
@@ -56,9 +53,9 @@ class Resume:
             return self._go_on(run)
 
     def _go_on(self, run: Any) -> int:
-        from ..run.inferred import Inferred
+        from ..run.derived import Inferred
         from ..training import fit
-        from .outcome import tell_outcome
+        from .outcome import show_outcome
         from .view import keep_showing, watching
 
         if run.compressed:
@@ -68,9 +65,9 @@ class Resume:
                 f"{run.folder} was made by a prior and learns nothing itself; go on with the prior: "
                 + typed("resume", made.prior)
             )
-        told = told_budget(self.steps, self.seconds, self.quality)
+        given = given_budget(self.steps, self.seconds, self.quality)
         if self.quality is None:
-            budget = budget_from_now(run, told)
+            budget = budget_from_now(run, given)
         device = choose_device(run.settings.device if self.device == "same" else self.device)
         method, data = run.new_method(device), run.dataset(self.scene)
         if self.quality is not None:
@@ -79,15 +76,15 @@ class Resume:
             run.set_budget(**budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as watch:
             outcome = fit(method, data, run, budget=budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
-            tell_outcome(run, outcome, method, data)
+            show_outcome(run, outcome, method, data)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
 
-def budget_from_now(run: Any, told: Budget | None) -> Budget:
+def budget_from_now(run: Any, given: Budget | None) -> Budget:
     """The run's own budget, or another given total. Raises LumigraphError if nothing is left of it."""
-    said = run.settings.budget
-    budget = told or Budget.from_json(said)
+    own = run.settings.budget
+    budget = given or Budget.from_json(own)
     if not run.has_state:
         return budget
     step, seconds = run.state.step, run.state.seconds
@@ -96,4 +93,4 @@ def budget_from_now(run: Any, told: Budget | None) -> Budget:
             f"{run.folder} has spent its budget at step {step}, {seconds:.0f} s; "
             f"give a larger total by --steps, --seconds or --quality"
         )
-    return Budget.from_json(said).extended(budget, step, seconds) if said else budget
+    return Budget.from_json(own).extended(budget, step, seconds) if own else budget

@@ -3,33 +3,188 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
+from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, arg
 
 from .. import methods
 from ..budget import Budget, Quality
-from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
+from ..errors import LumigraphError
+from ..files.names import counted
+from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Steps
 from .capture import posed
 from .common import (
-    ReaderOption,
     about_quality,
     choose_device,
     exit_code,
+    given_budget,
     method_config,
-    needed,
     next_free,
-    option,
     option_group,
     preset_device,
     quality_budget,
+    say,
     scene_name,
-    told_budget,
+    show,
+    typed,
     value_of,
 )
-from .train_blocks import Blocks
+from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, needed, option
+
+MEMORY_BYTES = 2 << 30  # bytes reserved for a block
+OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """A large scene is trained in blocks, each a run of its own; from few photographs one block, an ordinary run.
+
+    --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After
+    Ctrl-C, a crash or a lost machine the same command continues; finished blocks are kept. RUN/blocks.png shows the
+    plan. `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting,
+    trains each block with another method; for clouds, RUN/cloud.ply joins each block's own cell.
+    """
+
+    blocks: Annotated[str | None, option("auto|N|FILE", "auto from 200 photographs on, else one block")] = None
+    """Positions of blocks: auto (street crossings, or evenly spread), a number of evenly spread ones, or a JSON file in
+    the frame of the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
+    workers: Annotated[Count | None, option("N", "1, in this process")] = None
+    """Number of blocks to train at a time on this machine, with Ray."""
+    address: Annotated[str | None, option("HOST:PORT", "this machine")] = None
+    """Train blocks on an existing Ray cluster; --output must be on storage that all its machines share."""
+    into: Annotated[Path | None, option("RUN", "a new run")] = None
+    """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
+    field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
+
+    def run(self, train: Any) -> int | None:
+        """Train all blocks of a scene. Returns the exit code; None for a scene that `train` learns as a whole.
+
+        train: the command's other options, a `Train`
+        """
+        from ..capture import kind_of
+        from ..datasets.scene import Scene
+        from ..large.layout import MIN_LARGE_VIEWS
+        from ..large.planning import survey
+
+        if self.into is not None:
+            return self._again(train, self.into)
+        source, other = posed(train.scene), bool(self.field)
+        if kind_of(source, Scene) is not Scene or Path(source).is_file() or (self.blocks == "1" and not other):
+            return None  # a file is a single picture
+        places = survey(source, train.reader)
+        few = places.splits.count("train") < MIN_LARGE_VIEWS
+        if few and not other and (self.blocks, self.workers, self.address) == (None, None, None):
+            return None
+        for name in ("view", "pause_at", "views"):
+            if getattr(train, name):
+                raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
+        return self._all(train, source, places)
+
+    def _all(self, train: Any, source: str, places: Any) -> int:
+        import torch
+
+        from ..large.planning import BlockRecipe, begin, make_plan
+        from ..large.training import Workers, conduct, finish
+        from ..system.memory import free_memory
+
+        here = self.address is None
+        budget = given_budget(train.steps, train.seconds, train.quality)
+        if here or train.device == "auto":
+            device = choose_device(train.device)
+        else:  # of the cluster's machines
+            device = torch.device("cuda" if train.device == "gpu" else train.device)
+        method = methods.check(self.field or train.method)
+        config = method_config(train, method)
+        seed = getattr(config, "seed", train.seed)
+        options = {name: getattr(train, name) for name in OPTIONS}
+        recipe = BlockRecipe(method, config, options, budget, train.quality, seed, str(device), here)
+        plan = make_plan(source, places, self.blocks or "auto", recipe)
+        output = train.output or unfinished(f"runs/{scene_name(source)}-{methods.check(train.method)}", plan)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cpus = max(1, cores // self.workers) if self.workers else 1
+        plan = begin(output, plan, places, None if here and self.workers is None else cpus)
+        show_plan(output, plan, budget)
+        gpus = 1.0 if device.type == "cuda" else 0.0
+        memory = min(MEMORY_BYTES, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY_BYTES
+        found = conduct(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
+        if found.signal is not None:
+            say(f"Stopped and saved, {len(found.done)} of {len(plan.blocks)} blocks done; the same command goes on")
+            return exit_code(found.signal)
+        if found.failed:
+            first, why = next(iter(found.failed.items()))
+            raise LumigraphError(
+                f"{len(found.failed)} of {len(plan.blocks)} blocks of {output} could not be learnt; block {first}: "
+                f"{why}; the others are kept, and the same command tries again"
+            )
+        finish(output)
+        show_done(output, found)
+        return 0
+
+    def _again(self, train: Any, run: Path) -> int:
+        from ..large.planning import survey
+        from ..large.training import update
+
+        if self.blocks is None or not self.blocks.isdigit():
+            raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
+        source, budget = posed(train.scene), given_budget(train.steps, train.seconds, train.quality)
+        options = {name: getattr(train, name) for name in OPTIONS}
+        ended = update(run, self.blocks, source, survey(source, train.reader), options, budget)
+        if ended.done is None:
+            say("Stopped and saved; the same command goes on")
+            return exit_code(ended.signal)
+        took = f"{ended.done.steps} steps in {ended.done.seconds:.1f} s, from {ended.done.photographs} photographs"
+        show({"run": str(run), f"block {self.blocks}": took} | onward(run, source))
+        return 0
+
+
+def unfinished(prefix: str, plan: Any) -> Path:
+    """The latest run of this name, if it is the same and not done; else the next name that is free."""
+    from ..large.plan import DONE_FILE, PLAN_FILE, Plan
+    from ..large.planning import difference, place_of
+
+    free = next_free(prefix)
+    number = int(free.name.rpartition("-")[2])
+    latest = free.with_name(f"{free.name.rpartition('-')[0]}-{number - 1}")
+    if (latest / PLAN_FILE).is_file() and difference(known := Plan.read(latest / PLAN_FILE), plan) is None:
+        if not all((place_of(latest, block) / DONE_FILE).exists() for block in known.blocks):
+            return latest
+    return free
+
+
+def show_plan(output: Path, plan: Any, budget: Any) -> None:
+    """Print the plan before training."""
+    counts = [len(block.photographs) for block in plan.blocks]
+    each = " ".join(
+        f"{value:g} {name}" if name != "quality" else f"as {value} asks" for name, value in plan.budget.items()
+    )
+    least, most = min(counts), counted(max(counts), "photograph")
+    many = most if least == max(counts) else f"{least} to {most}"
+    total = f" of {budget}" if budget is not None else ""
+    say(f"{counted(len(counts), 'block')} of {many}, each learnt for {each}{total}; {output / 'blocks.png'} shows them")
+
+
+def show_done(output: Path, found: Any) -> None:
+    """Print the cost of all blocks."""
+    done = list(found.done.values())
+    rows = {"run": str(output), "blocks": f"{len(done)}, {sum(x.bytes for x in done) / 1e6:.1f} MB of weights"}
+    steps, seconds = sum(x.steps for x in done), sum(x.seconds for x in done)
+    rows["training"] = f"{steps:,} steps in {seconds:.1f} s, all blocks together"
+    if memory := max(x.peak_memory for x in done):
+        rows["memory"] = f"{memory / 1e9:.2f} GB at most in one process"
+    show(rows | onward(output))
+
+
+def onward(run: Path, source: str | None = None) -> dict[str, str]:
+    """Command to type next."""
+    from .outcome import NEXT
+
+    again = ["--scene", source] if source else []
+    return {NEXT["eval"]: typed("eval", run, *again), NEXT["view"]: typed("view", run)}
+
 
 DEFAULT_SECONDS = 60.0
 
@@ -52,8 +207,7 @@ class Train:
     """New folder for the run."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
     """Training time in seconds; longer gives a higher PSNR. Compiling kernels on first use is not counted."""
-    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for this number of steps instead."""
+    steps: StepsOption = None
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
     downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
     """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
@@ -62,10 +216,8 @@ class Train:
     """Train on only this number of photographs, spread evenly over the cameras."""
     scales: Annotated[Scales, option("N")] = 1
     """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
-    seed: Annotated[Seed, option("N")] = 0
-    """Seed of all random choices."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
@@ -82,13 +234,13 @@ class Train:
         from ..datasets.dataset import check_kind
         from ..run import Run, build, check_new
         from ..training import fit
-        from .outcome import tell_outcome
+        from .outcome import show_outcome
         from .view import keep_showing, watching
 
-        blocks: Blocks | None = getattr(self, "blocks", None)
+        blocks: BlockOptions | None = getattr(self, "blocks", None)
         if blocks is not None and (code := blocks.run(self)) is not None:
             return code
-        budget = told_budget(self.steps, self.seconds, self.quality)
+        budget = given_budget(self.steps, self.seconds, self.quality)
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
             check_new(self.output)
@@ -111,14 +263,14 @@ class Train:
         with watching(self.view, method, data, run, self.host, self.port) as watch:
             with run.kept_if_learnt():
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
-            tell_outcome(run, outcome, method, data)
+            show_outcome(run, outcome, method, data)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
 
 def with_options_of(name: str, arguments: Sequence[str], command: type = Train) -> type[Any]:
     """A command, `train` or one like it, with a method's own numbers among its options. Where the method is trained in
-    blocks, `train` has the options of `Blocks` too, and the numbers of the method that --field names for each block."""
+    blocks, `train` also has `BlockOptions`, and the numbers of the method that --field names for each block."""
     in_blocks = command is Train and methods.find(name).in_blocks
     if in_blocks and (field := value_of("--field", arguments, "").replace("_", "-")) in methods.available():
         name = field
@@ -127,7 +279,7 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
     extra: dict[str, tuple[Any, Any]] = {"quality": (Annotated[Quality | None, asked], None)}
     if in_blocks:
-        blocks = derived(Blocks, kind.Config, {})
+        blocks = derived(BlockOptions, kind.Config, {})
         extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
     extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], kind.preset(preset_device(device, preset))
     return derived(command, kind.Config, extra)
@@ -135,7 +287,7 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
 
 def derived(base: type, config: type, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
     """A dataclass of options with further ones, annotation and default by name. Options that a method's Config has too
-    are hidden, for the Config's are asked for."""
+    are hidden in favour of the Config's."""
     names = {x.name for x in dataclasses.fields(config) if not dataclasses.is_dataclass(x.default)}  # --steps stays
     hidden = {x.name: (Annotated[Any, Fixed, Suppress], x.default) for x in dataclasses.fields(base) if x.name in names}
     options = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in (hidden | extra).items()]

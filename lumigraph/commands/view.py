@@ -14,8 +14,8 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
-from .common import needed, option, show
-from .controls import Set, open_method
+from .common import show
+from .options import DeviceOption, Set, needed, open_method, option
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,7 @@ class ViewCommand:
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port to listen at."""
     settings: Set = ()
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..viewer import Viewer, choose_address
@@ -43,14 +42,14 @@ class ViewCommand:
         subject = subject_of(opened, cameras, page=page_of(opened, method, cameras))
         address = choose_address(self.host, self.port)
         with until_interrupted(), Viewer(method, subject, address) as viewer:
-            tell(viewer)
+            show_address(viewer)
             viewer.serve()
         return 0
 
 
 def page_of(opened: Any, method: Any, cameras: Any) -> Any:
     """A function that makes the page of a baked method; `None` for any other method, and before it is baked."""
-    from .exports.volumes import browsable, is_baked
+    from .export_web import browsable, is_baked
 
     if not is_baked(method):
         return None
@@ -93,9 +92,9 @@ def saver(opened: Any) -> Any:
     """A function that saves a part of a cloud of Gaussians, as `lumigraph clean` does: a splat file or a new run."""
 
     def save(name: str, crop: Any, floaters: Mapping[str, float]) -> str:
-        from ..gaussians.cleaning import gone, unwanted
+        from ..gaussians.cloud import gone, unwanted
         from ..method.capabilities import HasGaussians, needs
-        from ..run.picking import save_picked
+        from ..run.derived import save_picked
 
         output = opened.path.parent / name
         if os.path.lexists(output):
@@ -124,7 +123,7 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
     if run.photographed:
         subject = dataclasses.replace(subject, open_scene=lambda: data)
     with Viewer(method, subject, choose_address(host, port), training=True) as viewer:
-        tell(viewer)
+        show_address(viewer)
         yield viewer
 
 
@@ -136,5 +135,5 @@ def keep_showing(viewer: Any, signal: int | None) -> None:
             viewer.serve()
 
 
-def tell(viewer: Any) -> None:
+def show_address(viewer: Any) -> None:
     show({"view": f"{viewer.address.url} (Ctrl-C ends it)"})

@@ -1,8 +1,8 @@
 """Composition: several methods in one picture with mutual occlusion, and parts of one method."""
 
+from .composed import PickedCloud as PickedCloud
 from .composed import compose as compose
-from .picked import PickedCloud as PickedCloud
-from .picked import cropped as cropped
+from .composed import cropped as cropped
 from .placed import Placed as Placed
-from .standing import frame_around as frame_around
-from .standing import standing as standing
+from .placed import frame_around as frame_around
+from .placed import standing as standing

@@ -1,4 +1,4 @@
-"""Composed: several placed methods as one, which offers what all of them offer.
+"""Composed: several placed methods as one, which offers what all of them offer; and parts of one method.
 
 Parts that march give their samples, and `union` puts all samples along a ray in order. Clouds become one cloud, whose
 Gaussians the rasteriser puts in order. Where both meet, and for methods that do neither, a part is rendered first and
@@ -10,23 +10,25 @@ far side is hidden by all or by none of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any, NoReturn
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..camera.crop import Crop
 from ..camera.rays import Look, Rays, Rendering, Samples
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined, splatting
+from ..geometry import Similarity
 from ..method import Method, RayMethod
 from ..method.capabilities import HasDensity, HasGaussians, HasLooks, can
 from ..method.controls import Control, Value
 from ..volume import composite, packed
 from .placed import Placed
-from .union import union
 
 NEAR_PLANE_SCALE = 0.1  # of the frame's near distance: how near to a camera Gaussians are still drawn
 THICKNESS_SHARE = 1e-3  # of its distance: how thick a surface is that a rendered part stands as
@@ -45,6 +47,15 @@ def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
     if not all(can(method, HasLooks) for method in methods):
         return ComposedMixture(frame, parts)
     return (ComposedField if all(can(method, HasDensity) for method in methods) else ComposedRays)(frame, parts)
+
+
+def cropped(method: Method, crop: Crop) -> Method:
+    """Method restricted to a crop in its frame, for rendering only.
+
+    Along rays its samples end where the crop does; Gaussians are picked by their centres; of methods with neither,
+    pixels are by their depth.
+    """
+    return compose(method.frame, [Placed(method, Similarity.make(1.0), crop, leads=True)]).to(method.device)
 
 
 class Composed(Method):
@@ -148,3 +159,86 @@ def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: 
     samples = Samples(depth - half, depth + half, packed(hit.long()))
     density = -torch.log1p(-opacity.clamp_max(OPAQUE_THRESHOLD)) / samples.length
     return Look("surface", samples, density, rgb / opacity[:, None])
+
+
+class PickedCloud(Method):
+    """A cloud as it is: it renders, and does not learn."""
+
+    def __init__(self, frame: Frame, gaussians: Gaussians):
+        super().__init__(frame, None)
+        self._antialiased = gaussians.antialiased
+        self._names = [field.name for field in fields(gaussians) if field.name != "antialiased"]
+        for name in self._names:
+            self.register_buffer(name, getattr(gaussians, name).detach())
+        self.to(gaussians.means.device).eval()
+
+    def gaussians(self) -> Gaussians:
+        """The cloud, in the scene's frame."""
+        return Gaussians(**{name: getattr(self, name) for name in self._names}, antialiased=self._antialiased)
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        near = NEAR_PLANE_SCALE * self.frame.near
+        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
+
+    def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
+        raise LumigraphError("Gaussians that were picked from a cloud do not learn; resume the run they came from")
+
+
+def union(looks: Sequence[Look]) -> Look:
+    """All that lies along rays: densities add up where samples of several looks overlap, and colours mix by density.
+
+    Exact: every sample is cut where another look's sample begins or ends, so that density and colour stay constant over
+    each piece, as they were over the samples. Light that one look emits passes through the other's haze.
+    """
+    if len(looks) == 1:
+        return looks[0]
+    rays = len(looks[0].samples.ray_starts) - 1
+    counts = torch.stack([look.samples.ray_starts.diff() for look in looks])
+    shared = (counts > 0).sum(0) > 1  # rays on which there is anything to cut
+    alone = [kept(look, ~shared[look.samples.ray_index]) for look in looks]
+    parts = [*alone, cut([kept(look, shared[look.samples.ray_index]) for look in looks])]
+    ray = torch.cat([part.samples.ray_index for part in parts])
+    order = ray.argsort(stable=True)
+    columns = zip(*((x.samples.t_start, x.samples.t_end, x.density, x.rgb) for x in parts), strict=True)
+    begin, end, density, rgb = (torch.cat(column)[order] for column in columns)
+    return Look("union", Samples(begin, end, packed(torch.bincount(ray, minlength=rays))), density, rgb)
+
+
+def kept(look: Look, mask: Tensor) -> Look:
+    return Look(look.name, look.samples.keep(mask), look.density[mask], look.rgb[mask])
+
+
+def cut(looks: Sequence[Look]) -> Look:
+    """The pieces between all beginnings and ends of samples, where there is anything."""
+    rays = len(looks[0].samples.ray_starts) - 1
+    t, ray, begins = edges(looks)
+    begin, end, on = t[:-1], t[1:], ray[:-1]
+    piece = (end > begin) & (ray[1:] == on)
+    density, colour = begin.new_zeros(len(begin)), begin.new_zeros(len(begin), 3)
+    inside = torch.zeros_like(piece)
+    for number, look in enumerate(looks):
+        if not len(look.samples):
+            continue
+        latest = ((begins == number).cumsum(0) - 1)[:-1]  # the look's sample that began last, as edges are in order
+        there = latest.clamp_min(0)
+        holds = piece & (latest >= 0) & (look.samples.ray_index[there] == on) & (look.samples.t_end[there] > begin)
+        mine = torch.where(holds, look.density[there], 0.0)
+        density, colour, inside = density + mine, colour + mine[:, None] * look.rgb[there], inside | holds
+    rgb = colour / density.clamp_min(torch.finfo(density.dtype).tiny)[:, None]
+    starts = packed(torch.bincount(on[inside], minlength=rays))
+    return Look("union", Samples(begin[inside], end[inside], starts), density[inside], rgb[inside])
+
+
+def edges(looks: Sequence[Look]) -> tuple[Float[Tensor, " edge"], Int[Tensor, " edge"], Int[Tensor, " edge"]]:
+    """Edges of samples: distance, ray, and the number of the look whose sample begins there, -1 for ends.
+
+    By ray, then by distance.
+    """
+    parts = [(look.samples.t_start, look.samples.t_end, look.samples.ray_index) for look in looks]
+    t = torch.cat([x for begin, end, _ in parts for x in (begin, end)])
+    ray = torch.cat([index for _, _, index in parts for _ in range(2)])
+    names = [torch.full_like(index, x) for number, (*_, index) in enumerate(parts) for x in (number, -1)]
+    order = t.argsort(stable=True)
+    order = order[ray[order].argsort(stable=True)]
+    return t[order], ray[order], torch.cat(names)[order]

@@ -67,7 +67,7 @@ class Moves:
 
 def moves(source: Camera, target: Camera, frame: Frame) -> Moves:
     """Distances between two lists of cameras in the same order, after alignment: what they share is the scene's frame,
-    which nobody can tell from photographs."""
+    which photographs do not determine."""
     there = source.to("cpu").transformed(aligning(source.to("cpu"), target.to("cpu")).matrix)
     low, high = torch.tensor(frame.bounds)
     apart = (there.position - target.position.cpu()).norm(dim=-1)

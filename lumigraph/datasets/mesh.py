@@ -14,7 +14,7 @@ from .scene import Frame
 class Mesh:
     """Triangles with a colour at each vertex, anticlockwise seen from outside.
 
-    vertices: in the frame that whoever made it says
+    vertices: in the frame that its maker states
     colours:  sRGB-encoded
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -75,12 +75,7 @@ class Frame:
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     has_alpha: bool = False
     image_count: Annotated[int, between(0, 10**6)] = 0
-    source_from_scene: tuple[Row, ...] = (
-        (1.0, 0.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0, 0.0),
-        (0.0, 0.0, 1.0, 0.0),
-        (0.0, 0.0, 0.0, 1.0),
-    )
+    source_from_scene: tuple[Row, ...] = Similarity.make(1.0).rows
     forward: Forward | None = None
     times: tuple[Coordinate, Coordinate] | None = None
 
@@ -194,13 +189,11 @@ class Photograph:
         else:
             rgb = mean(rgb)
         mask = None if mask is None else mean(mask.float()) == 1
-        lens = self.camera.lens.resized(torch.full((1, 2), 1 / factor, device=self.rgb.device))
-        size = self.camera.size.new_tensor([[width // factor, height // factor]])
         extra = {
             name: smaller(values[:height, :width], factor, AVERAGED.get(name, "plain"))
             for name, values in self.extra.items()
         }
-        return Photograph(replace(self.camera, lens=lens, size=size), rgb, alpha, mask, extra)
+        return Photograph(self.camera.reduced(factor), rgb, alpha, mask, extra)
 
 
 def smaller(values: Shaped[Tensor, "height width *channels"], factor: int, encoding: str) -> Tensor:

@@ -1,27 +1,37 @@
-"""DepthMap: the distance to the first surface at every pixel of one camera."""
+"""DepthMap: the distance to the first surface at every pixel of a camera; of several: free space, TSDF, colours."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..datasets.images import cosines
-from ..geometry import Vector, normals_from_depth
+from ..errors import LumigraphError
+from ..geometry import Vector, evenly, normals_from_depth, unit
+from ..system.progress import track
+from ..system.threads import processors
 from . import loops
 
 SURFACE_OPACITY = 0.5  # a pixel above it shows a surface
 CLEAR_OPACITY = 0.02  # a pixel up to it shows nothing
 FAR_DEPTH = 1e6  # scene units: stands for infinity and NaN where neighbouring pixels are subtracted
 FREE_SPACE_WINDOW = 3  # pixels a side, whose nearest surface bounds free space, so that thin things are kept
+POINTS_PER_TASK = 10_000  # PyTorch shares out no operation on so few, and they stay in the nearest cache
+MIN_FACING = 0.3  # cosine that weights a pixel at least: one without a surface shows that nothing is there
+MIN_COSINE = 0.05  # between a surface's normal and the way to a camera whose colour counts
+MIN_FREE_VIEWS = 2  # cameras that must see past a point for it to lie in free space
+CAMERAS_PER_VIEW = 16  # one camera in so many must see a point, and at least one: single depths err at edges
 
 
 @dataclass(frozen=True)
@@ -39,11 +49,11 @@ VISIBLE_TOLERANCE = Tolerance(per_distance=0.02)  # behind a rendered surface, w
 DEPTH_EDGE = Tolerance(per_distance=0.1)  # between neighbouring pixels, where one surface ends before another
 
 
-class Comparison(NamedTuple):
+class SurfaceComparison(NamedTuple):
     """Points compared with the surface that one camera sees.
 
     ahead:    how far the surface lies behind each point along its ray, scene units: negative for hidden points,
-              infinity where the ray meets nothing, NaN for points outside the picture or where nobody measured
+              infinity where the ray meets nothing, NaN for points outside the picture or where nothing was measured
     smooth:   whether the surface is one there, rather than an edge in front of something else
     pixels:   where the points lie in the picture (x, y)
     distance: from the camera, scene units
@@ -89,7 +99,6 @@ class SurfacePoints:
 
     @staticmethod
     def cat(parts: Sequence[SurfacePoints]) -> SurfacePoints:
-        """One set from several."""
         names = ("points", "normals", "colours", "origins")
         return SurfacePoints(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
@@ -99,10 +108,10 @@ class DepthMap:
     """One camera and the first surface along each pixel's ray. Rows of pixels, on the CPU.
 
     camera:  a batch of one, of this size
-    depth:   distance along the ray, scene units; infinity where nothing is, NaN where nobody measured
+    depth:   distance along the ray, scene units; infinity where nothing is, NaN where nothing was measured
     opacity: share of light that is stopped, in [0, 1]; a pixel shows a surface above SURFACE_OPACITY
     rgb:     sRGB-encoded, in [0, 1], without the background
-    normals: of the surface, unit length, where whoever made the map knows them; else they follow from the depth
+    normals: of the surface, unit length, where known; else they follow from the depth
     """
 
     camera: Camera
@@ -129,7 +138,7 @@ class DepthMap:
         """Depth map of a sensor, a depth file or a plane sweep. Opacity is 1 where something was measured, else 0.
 
         depth: along rays, scene units, as a photograph's layer has it (`Photograph.extra["depth"]`); infinity where
-               nothing is, NaN where nobody measured
+               nothing is, NaN where nothing was measured
         """
         return DepthMap(camera, depth, depth.isfinite().float(), rgb)
 
@@ -140,7 +149,7 @@ class DepthMap:
 
     @cached_property
     def surface_depth(self) -> Float[Tensor, "height width"]:
-        """Depth of pixels that show a surface; infinity for others, NaN where nobody measured."""
+        """Depth of pixels that show a surface; infinity for others, NaN where nothing was measured."""
         return torch.where(self.solid | self.depth.isnan(), self.depth, torch.inf)
 
     @property
@@ -183,7 +192,7 @@ class DepthMap:
         pixels, valid = self.camera.project(points)
         return pixels, valid, (points - self.camera.position).norm(dim=-1)
 
-    def compare(self, points: Float[Tensor, "point 3"], edge: Tolerance = DEPTH_EDGE) -> Comparison:
+    def compare(self, points: Float[Tensor, "point 3"], edge: Tolerance = DEPTH_EDGE) -> SurfaceComparison:
         """Points beside the surface that the camera sees, whose depth is interpolated between pixels.
 
         edge: difference in depth between neighbouring pixels from which on there is an edge. There a point counts as
@@ -194,7 +203,7 @@ class DepthMap:
         given = pixels, valid, away, self.surface_depth
         spans = edge.constant, edge.per_distance
         loops.compare(*(x.numpy() for x in given), *spans, ahead.numpy(), smooth.numpy())
-        return Comparison(ahead, smooth, pixels, away)
+        return SurfaceComparison(ahead, smooth, pixels, away)
 
     def sees(
         self,
@@ -236,3 +245,142 @@ class DepthMap:
         """Depth of the nearest of the pixels around each that are not clear; NaN where one of them is NaN."""
         there = torch.where((self.opacity > CLEAR_OPACITY) | self.depth.isnan(), self.depth, torch.inf)
         return -max_pool2d(-there[None], FREE_SPACE_WINDOW, 1, FREE_SPACE_WINDOW // 2)[0]
+
+
+class SignedDistance(NamedTuple):
+    """Fused distances at points.
+
+    distance:   over the truncation, in [-1, 1]: positive in front of the surface, NaN where no camera knows
+    truncation: weighted mean of the cameras', scene units; NaN where no camera knows
+    pictured:   whether any map measured along the ray through the point, be it hidden or not
+    """
+
+    distance: Float[Tensor, " point"]
+    truncation: Float[Tensor, " point"]
+    pictured: Bool[Tensor, " point"]
+
+
+@dataclass(frozen=True)
+class TSDF:
+    """Truncated signed distance D, a function of points (Curless and Levoy 1996, eq. 1 and 2).
+
+        D(x) = sum w d / sum w,    d = min((depth - |x - o|) / t, 1),    w = cos / |x - o|^2
+
+    over cameras at o, each with the depth that it sees in the direction of x and the truncation t. Its weight is the
+    cosine at which it sees the surface over the area of its pixel there (section 4). A camera with d < -1 is left out:
+    what lies deeper behind its surface is unknown to it. Distances are along rays, in scene units.
+    edge: difference in depth between neighbouring pixels from which on they show two surfaces; None for the truncation
+    """
+
+    depth_maps: Sequence[DepthMap]
+    truncation: Tolerance
+    edge: Tolerance | None = None
+
+    def __call__(self, points: Float[Tensor, "point 3"]) -> SignedDistance:
+        # Each thread takes whole pieces: beside other programs dozens of shared operations for each camera would wait,
+        # every time, for the thread that was held up.
+        with ThreadPoolExecutor(processors()) as pool:
+            found = list(pool.map(self._fused, points.split(POINTS_PER_TASK)))
+        return SignedDistance(*(torch.cat(column) for column in zip(*found, strict=True)))
+
+    @torch.no_grad()  # which holds for one thread
+    def _fused(self, points: Float[Tensor, "point 3"]) -> SignedDistance:
+        total, weight, truncation = (torch.zeros(len(points)) for _ in range(3))
+        pictured = torch.zeros(len(points), dtype=torch.bool)
+        edge = self.edge or self.truncation
+        spans = (edge.constant, edge.per_distance), (self.truncation.constant, self.truncation.per_distance)
+        for seen in self.depth_maps:
+            given = *seen.project(points), seen.surface_depth, seen.facing
+            sums = total, weight, truncation, pictured
+            loops.fuse(*(x.numpy() for x in given), MIN_FACING, *spans, *(x.numpy() for x in sums))
+        return SignedDistance(total / weight, truncation / weight, pictured)  # 0 / 0 is NaN
+
+
+def fused_colours(
+    points: Float[Tensor, "point 3"],
+    normals: Float[Tensor, "point 3"],
+    depth_maps: Sequence[DepthMap],
+    tolerance: Tolerance,
+) -> Float[Tensor, "point 3"]:
+    """Colours of points of a surface, sRGB-encoded: the mean over cameras that see them.
+
+    A camera counts with the square of the cosine at which it looks, over the area that its pixel covers there. A point
+    that no camera sees takes the colour of the nearest one that some camera does.
+    tolerance: how far from a camera's own surface a point may lie to be seen by it
+    """
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    for depth_map in track(depth_maps, "Colouring", len(depth_maps)):
+        seen = depth_map.compare(points, tolerance)
+        cosine = (normals * unit(depth_map.camera.position - points)).sum(-1)
+        good = seen.smooth & (seen.ahead.abs() < tolerance(seen.distance)) & (cosine > MIN_COSINE)
+        share = torch.where(good, (cosine / seen.distance).square(), 0.0)
+        total += share[:, None] * depth_map.at_pixels(depth_map.rgb, seen.pixels)
+        weight += share
+    known = weight > 0
+    if not known.any():
+        return torch.full_like(total, 0.5)
+    found = total / weight.clamp_min(1e-12)[:, None]
+    if not known.all():
+        nearest = cKDTree(points[known].numpy()).query(points[~known].numpy())[1]
+        found[~known] = found[known][torch.from_numpy(nearest)]
+    return found
+
+
+@torch.no_grad()
+def render_depth_maps(
+    render: Callable[[Camera], Rendering], cameras: Camera, background: Vector, views: int = 64, size: int = 400
+) -> list[DepthMap]:
+    """Depth maps of evenly chosen cameras. Raises LumigraphError where none of them shows a surface.
+
+    render:     what one camera sees, such as `Method.render`
+    background: sRGB-encoded colour behind the renderings
+    views:      cameras at most
+    size:       longer side of the maps at most, pixels
+    """
+    chosen = evenly(range(len(cameras)), views)
+    maps = []
+    for i in track(chosen, "Rendering depth maps", len(chosen)):
+        camera = cameras[i].to("cpu")
+        camera = camera.resized(min(1.0, size / int(camera.size.max())))
+        maps.append(DepthMap.of_rendering(camera, render(camera), background))
+    if not any(seen.solid.any() for seen in maps):
+        raise LumigraphError("No camera sees anything solid, so there is no surface; train for longer and try again")
+    return maps
+
+
+def surface_points(depth_maps: Sequence[DepthMap]) -> SurfacePoints:
+    """Points of all pixels that show a surface, less those that other cameras see past; maybe none."""
+    every = SurfacePoints.cat([seen.points() for seen in depth_maps])
+    return every[~free(every.points, depth_maps)]
+
+
+def free(points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap]) -> Bool[Tensor, " point"]:
+    """Mask of points in free space: at least two cameras (or the only one) see past them."""
+    needed = min(MIN_FREE_VIEWS, len(depth_maps))
+    return _confirmed(points, depth_maps, needed, lambda seen, some: seen.sees_past(some))
+
+
+def hidden(
+    points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap], tolerance: Tolerance
+) -> Bool[Tensor, " point"]:
+    """Mask of points that are hidden from all cameras but a few, or lie outside all pictures.
+
+    tolerance: how far behind a surface a point still counts as seen
+    """
+    needed = 1 + len(depth_maps) // CAMERAS_PER_VIEW
+    tracked = track(depth_maps, "Looking for what no camera sees", len(depth_maps))
+    return ~_confirmed(points, tracked, needed, lambda seen, some: seen.sees(some, tolerance, tolerance))
+
+
+def _confirmed(
+    points: Float[Tensor, "point 3"],
+    depth_maps: Iterable[DepthMap],
+    needed: int,
+    test: Callable[[DepthMap, Tensor], Tensor],
+) -> Bool[Tensor, " point"]:
+    """Mask of points that pass a test in so many maps; each is tested no further than that."""
+    left, count = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.int64)
+    for depth_map in depth_maps:
+        count[left] += test(depth_map, points[left])
+        left = left[count[left] < needed]
+    return count >= needed

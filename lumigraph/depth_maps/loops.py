@@ -2,7 +2,7 @@
 
 pixels, valid: where points lie in the picture (x, y), and whether the lens sees them
 away:          distances of the points from the camera
-depth:         distances of the surface along the pixels' rays; infinity where nothing is, NaN where nobody measured
+depth:         distances of the surface along the pixels' rays; infinity where nothing is, NaN where not measured
 """
 
 from __future__ import annotations

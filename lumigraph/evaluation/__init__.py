@@ -1,7 +1,7 @@
 """Evaluate trained methods, under a stated protocol for each kind of dataset."""
 
-from .collection import evaluate_collection as evaluate_collection
 from .run import claim_evaluation as claim_evaluation
+from .run import evaluate_collection as evaluate_collection
 from .run import evaluate_on as evaluate_on
 from .run import evaluate_run as evaluate_run
 from .run import stem as stem

@@ -1,7 +1,7 @@
 """Held-out photographs for a method that learnt poses: moved into the frame that it learnt, then found on themselves.
 
 The protocol of Lin 2021 (BARF), section 5.1. What is learnt from photographs and poses together has a frame of its own,
-so cameras that nobody learnt from stand elsewhere in it, and a picture that is off by a pixel would be scored as wrong.
+so held-out cameras have other poses in it, and a picture that is off by a pixel would be scored as wrong.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 
 from ..camera import Camera
 from ..components.training.pose_refinement import PoseRefinement
-from ..datasets.alignment import Moves, aligning, moves
+from ..datasets.alignment import aligning, moves
 from ..datasets.scene import Scene
 from ..geometry import Similarity
 from ..method import Method
@@ -55,7 +55,7 @@ class HeldOutPoses:
         poses = PoseRefinement(self.scene.frame.image_count, LEARNING_RATE).to(self.method.device)
         poses.choose_axes(self.scene.cameras[index], self.scene.frame)
         self.frozen.poses = poses
-        optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)
+        (optimizer,), generator = poses.optimizers(), torch.Generator().manual_seed(index)
         with torch.enable_grad():
             for step in range(STEPS):
                 optimizer.param_groups[0]["lr"] = poses.rate(step / STEPS)
@@ -71,24 +71,16 @@ def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
     return HeldOutPoses(method, scene) if can(method, RefinesPoses) else None
 
 
-def against_truth(method: Method, scene: Scene) -> Moves | None:
-    """Errors of the method's training poses against true ones, aligned; None if these are unknown."""
+def pose_scores(method: Method, scene: Scene) -> list[Score]:
+    """Errors of rotation (degrees) and position (percent of the box of interest) against true poses, aligned; medians
+    over training photographs. Empty where the true poses are unknown."""
     if TRUE_POSE not in scene.about:
-        return None
+        return []
     learnt = scene.splits["train"]
     cameras = scene.cameras[learnt].to("cpu")
     to_scene = Similarity.of(scene.frame.source_from_scene).inverse
     truth = replace(cameras, pose=scene.about[TRUE_POSE][learnt]).transformed(to_scene.matrix)
-    return moves(method.refined(cameras), truth, scene.frame)
-
-
-def pose_scores(method: Method, scene: Scene) -> list[Score]:
-    """Errors of rotation (degrees) and position (percent of the box of interest), medians over training photographs;
-    none where nobody knows the true poses."""
-    found = against_truth(method, scene)
-    if found is None:
-        return []
-    turned, shifted = found.median
+    turned, shifted = moves(method.refined(cameras), truth, scene.frame).median
     return [
         Score("rotation error", turned, "degrees", "lower", 3),
         Score("position error", shifted, "% of the extent", "lower", 3),

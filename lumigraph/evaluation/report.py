@@ -32,18 +32,11 @@ def write_report(run: Run) -> Path:
     """Write RUN/report.html from what the run's folder holds: the more commands have run, the more it shows."""
     path = claim_report(run)
     evaluation = run.evaluation()
-    title = f"{run.title} · {run.method_name}"
-    sections = [
-        header(run, evaluation),
-        films(run),
-        previews(run),
-        curves(run),
-        views(run, evaluation),
-        cameras(run),
-        contact_sheet(run),
-        settings(run, evaluation),
-    ]
-    write_bytes(path, page(title, "".join(sections), str(run.folder)), "report")
+    body = header(run, evaluation) + films(run) + previews(run) + curves(run) + views(run, evaluation) + cameras(run)
+    if (sheet := run.folder / "eval.png").exists():
+        body += section("Contact sheet", f"<img class='sheet' src='{jpeg(sheet)}' alt=''>")
+    body += settings(run, evaluation)
+    write_bytes(path, page(f"{run.title} · {run.method_name}", body, str(run.folder)), "report")
     return path
 
 
@@ -74,9 +67,8 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
             split, what = "", "shape"
         for i, score in enumerate(scores_of(evaluation)):
             value = f"{score.value:.{min(score.digits, 3)}f}"
-            figures.append(
-                (value, score.unit, score.name if i else f"{score.name}, {count} {split} {what}".replace("  ", " "))
-            )
+            compared = "" if i else f", {count} {split} {what}".replace("  ", " ")
+            figures.append((value, score.unit, score.name + compared))
     if run.has_state:
         state = run.state
         figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))
@@ -109,8 +101,8 @@ def films(run: Run) -> str:
     if not found:
         return ""
     players = "".join(
-        f"<figure><video src='{data_uri(path, 'video/mp4')}' autoplay loop muted playsinline controls></video>"
-        f"<figcaption>{name}</figcaption></figure>"
+        f"<figure><video src='{data_uri(path.read_bytes(), 'video/mp4')}' autoplay loop muted playsinline controls>"
+        f"</video><figcaption>{name}</figcaption></figure>"
         for path, name in ((found[0], "colour"), (found[0].with_stem(f"{found[0].stem}-depth"), "depth"))
         if path.exists() and path.stat().st_size < MAX_FILM_BYTES
     )
@@ -138,10 +130,8 @@ def curves(run: Run) -> str:
     charts, own = [], methods.colour(run.method_name)
     if any("psnr" in row for row in rows):
         psnr = [row.get("psnr", math.nan) for row in rows]
-        charts += [
-            line_chart([Series("PSNR", seconds, psnr, own)], "seconds of training", "PSNR of training batches, dB"),
-            line_chart([Series("PSNR", steps, psnr, own)], "step", "PSNR of training batches, dB"),
-        ]
+        for x, label in ((seconds, "seconds of training"), (steps, "step")):
+            charts.append(line_chart([Series("PSNR", x, psnr, own)], label, "PSNR of training batches, dB"))
     names = dict.fromkeys(name for row in rows for name in row["terms"])
     losses = [
         Series(name, steps, [row["terms"].get(name, math.nan) for row in rows], own + i) for i, name in enumerate(names)
@@ -153,12 +143,13 @@ def curves(run: Run) -> str:
             (b["step"] - a["step"]) * b["statistics"]["samples"] / max(b["seconds"] - a["seconds"], 1e-9)
             for a, b in zip(rows, rows[1:], strict=False)
         ]
-        charts.append(
-            line_chart([Series("samples/s", seconds[1:], speed, own)], "seconds of training", "samples per second")
-        )
-    if not charts:
-        return ""
-    return section("Curves", f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>")
+        series = Series("samples/s", seconds[1:], speed, own)
+        charts.append(line_chart([series], "seconds of training", "samples per second"))
+    return section("Curves", side_by_side(charts)) if charts else ""
+
+
+def side_by_side(charts: Sequence[str]) -> str:
+    return f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>"
 
 
 def views(run: Run, evaluation: dict[str, Any] | None) -> str:
@@ -187,22 +178,16 @@ def cameras(run: Run) -> str:
         bar_chart(names, moved.turned.tolist(), "turned, degrees", own, "degrees"),
         bar_chart(names, moved.shifted.tolist(), "shifted, % of the extent", own, "%"),
     )
-    body = f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>"
-    return section("How far cameras moved", body, f"Against all of them together: {moved}. The lines are means.")
-
-
-def contact_sheet(run: Run) -> str:
-    path = run.folder / "eval.png"
-    return section("Contact sheet", f"<img class='sheet' src='{jpeg(path)}' alt=''>") if path.exists() else ""
+    note = f"Against all of them together: {moved}. The lines are means."
+    return section("How far cameras moved", side_by_side(charts), note)
 
 
 def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
     said, frame = run.settings, run.frame
+    inputs = {"shapes": "shapes", "a collection": "members"}.get(run.kind, "photographs")
     about = {
         "scene": said.scene.source,
-        "shapes" if run.kind == "shapes" else "members" if run.kind == "a collection" else "photographs": ", ".join(
-            f"{count} {name}" for name, count in said.splits.items()
-        ),
+        inputs: ", ".join(f"{count} {name}" for name, count in said.splits.items()),
         **{name: value for name, value in said.scene.options.items() if value is not None},
         "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame.bounds),
         "half-extent": f"{frame.reach:g} scene units",
@@ -257,8 +242,8 @@ def jpeg(path: Path) -> str:
     file = io.BytesIO()
     with readable(path), Image.open(path) as image:
         image.convert("RGB").save(file, "JPEG", quality=90, optimize=True)
-    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+    return data_uri(file.getvalue(), "image/jpeg")
 
 
-def data_uri(path: Path, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+def data_uri(data: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

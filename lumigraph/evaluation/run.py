@@ -1,8 +1,9 @@
-"""A run is evaluated: the protocol that suits what it learnt from, and the files that say what came of it."""
+"""Evaluate a run or a collection under the protocol for its kind of dataset, and write the files of the outcome."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ from ..datasets.collection import Collection
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
+from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files import claim, scene_name, write_json
 from ..method import Method
@@ -20,9 +22,10 @@ from ..metrics import Score
 from ..metrics.lpips import Lpips
 from ..run import Trained
 from ..system.progress import counting
-from .collection import evaluate_collection
-from .shapes import evaluate_shapes
-from .views import evaluate, file_name
+from .shapes import ShapesEvaluation, evaluate_shapes
+from .views import Evaluation, evaluate, file_name, reveal
+
+Keep = Callable[[str, Rendering], object]
 
 
 @runtime_checkable
@@ -48,14 +51,14 @@ def evaluate_on(
     method: Method,
     data: Dataset,
     split: str = "test",
-    keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
+    keep: Keep = lambda name, rendering: None,
     most: int | None = None,
     lpips: Lpips | None = None,
     right_halves: bool = False,
 ) -> Evaluated:
     """A method on a dataset, under the protocol for its kind.
 
-    keep: told each view's name and rendering, where views are compared
+    keep: receives each view's name and rendering, where views are compared
     most: so many views or shapes at most, evenly spread; None means all
     right_halves: of a Scene, compare those alone, whatever the method
     """
@@ -120,3 +123,51 @@ def image_of(run: Trained, name: str) -> Path:
 def stem(split: str) -> str:
     """Stem of the file names of a split."""
     return "eval" if split == "test" else f"eval-{split}"
+
+
+def evaluate_collection(
+    method: Method,
+    data: Collection,
+    split: str = "test",
+    keep: Keep = lambda name, rendering: None,
+    views: int | None = None,
+    lpips: Lpips | None = None,
+) -> Evaluation | ShapesEvaluation:
+    """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
+
+    keep:  receives each view's name and rendering; names begin with the member's
+    views: of each member at most
+    """
+    scenes: dict[str, Evaluation] = {}
+    shapes: dict[str, ShapesEvaluation] = {}
+    for name, member in data.members(split):
+        told = reveal(method, member)
+        if isinstance(member, Scene):
+
+            def keep_of(view: str, seen: Rendering, name: str = name) -> object:
+                return keep(f"{name}/{view}", seen)
+
+            scenes[name] = evaluate(told, member, "test", keep_of, views, lpips)
+        elif isinstance(member, Shapes):
+            shapes[name] = evaluate_shapes(told, member, "test", views)
+    if scenes and shapes:
+        raise LumigraphError(f"{data.source} holds scenes and shapes, whose scores have no mean; name one kind")
+    members = {"split": split, "members": len(scenes or shapes)}
+    return joined_views(scenes, members) if scenes else joined_shapes(shapes, members)
+
+
+def joined_views(parts: dict[str, Evaluation], members: dict[str, Any]) -> Evaluation:
+    views = [replace(view, name=f"{name}/{view.name}") for name, part in parts.items() for view in part.views]
+    shown = {f"{name}/{view}": seen for name, part in parts.items() for view, seen in list(part.shown.items())[:2]}
+    sizes = list(dict.fromkeys(view.resolution for view in views))
+    counts = {key: sum(part.protocol[key] for part in parts.values()) for key in ("views", "of")}
+    about = next(iter(parts.values())).protocol | members | counts
+    about["resolution"] = sizes[0] if len(sizes) == 1 else sizes
+    return Evaluation(views, about, sum(part.compile_seconds for part in parts.values()), shown)
+
+
+def joined_shapes(parts: dict[str, ShapesEvaluation], members: dict[str, Any]) -> ShapesEvaluation:
+    shapes = [replace(shape, name=f"{name}/{shape.name}") for name, part in parts.items() for shape in part.shapes]
+    shown = {f"{name}/{shape}": seen for name, part in parts.items() for shape, seen in list(part.shown.items())[:2]}
+    counts = {key: sum(part.protocol[key] for part in parts.values()) for key in ("shapes", "of")}
+    return ShapesEvaluation(shapes, next(iter(parts.values())).protocol | members | counts, shown)

@@ -12,29 +12,25 @@ from PIL import Image
 from torch import Tensor
 
 from ..camera import Camera, dome, ring
-from ..camera.crop import Box
+from ..camera.crop import CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
 from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find_surface, make_grid
 from ..figures import Row, contact_sheet
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasDistance, HasMesh, can
-from ..metrics import Score
-from ..metrics.surfaces import chamfer_distance, intersection_over_union, normal_consistency
+from ..metrics import Score, chamfer_distance, intersection_over_union, normal_consistency
 from ..system.progress import track
-from .reveal import reveal
+from .views import reveal
 
 POINTS = 100_000  # in the volume, and on each surface (Mescheder 2019)
 CELLS = 128  # along the longest side, of the grid that the surface is found with
 SHEET_SHAPES, PICTURE_SIZE = 8, 256  # shapes of the contact sheet, and pixels of their pictures
-STEPS, TOUCHING_DISTANCE, MAX_OVERSHOOT = (
-    200,
-    2e-3,
-    6.0,
-)  # of a ray towards a surface; how near is there; how far is nowhere, scene units
+# Steps of a ray towards a surface; distances in scene units at which it meets the surface, and beyond which it misses.
+STEPS, TOUCHING_DISTANCE, MAX_OVERSHOOT = 200, 2e-3, 6.0
 
 
 @dataclass(frozen=True)
@@ -161,7 +157,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     Raises LumigraphError where there is none."""
     if isinstance(method, HasMesh):
         return method.mesh()
-    box = Box(*frame.bounds)
+    box = CropBox(*frame.bounds)
     cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):
         return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
@@ -188,7 +184,7 @@ def portrait(shape: Shape, camera: Camera) -> Float[Tensor, "height width 3"]:
         away = shape.distance(rays[walking].at(depth[walking])).abs()
         depth[walking] += away
         walking = walking[(away > TOUCHING_DISTANCE) & (depth[walking] < MAX_OVERSHOOT)]
-    depth[walking] = MAX_OVERSHOOT  # along the surface for so long that nobody knows
+    depth[walking] = MAX_OVERSHOOT  # rays along the surface, undecided
     rgb, hit = torch.ones(len(rays), 3), (depth < MAX_OVERSHOOT).nonzero()[:, 0]
     rgb[hit] = 0.5 + 0.5 * shape.normals_near(rays[hit].at(depth[hit]))
     return rgb.reshape(height, width, 3)

@@ -1,4 +1,9 @@
-"""Evaluate a trained method on held-out views, under a stated protocol."""
+"""Evaluate a trained method on held-out views, under a stated protocol.
+
+Halves: a method with a code for each photograph is given the left half of a held-out one and compared on the right. The
+code of a photograph outside the training set is unknown, and one fitted to all of it would include the answer
+(Martin-Brualla et al. 2021, section 5). Raw photographs are compared as light without noise (Mildenhall 2022, 5.1).
+"""
 
 from __future__ import annotations
 
@@ -15,22 +20,31 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
+from ..capture.views import with_fewer_views
+from ..components.fields.development import decoded, encoded
+from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
 from ..errors import LumigraphError
 from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
-from . import halves
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
-from .light import LIGHT_LAYER, in_light
-from .light import PROTOCOL as LIGHT_PROTOCOL
 
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
-CLEAN_LAYER = "clean"  # the layer of photographs in their own light without whoever passes by
-WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
+CLEAN_LAYER = "clean"  # the layer of photographs in their own light without passers-by
+WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is no time of the view
+LEFT_HALVES = "each photograph's code is found on its left half, and its right half is compared"
+RIGHT_HALVES = "right halves are compared; nothing is told of left ones"
+LIGHT_LAYER = "radiance"  # the layer that holds it, 1 for white
+LIGHT_PROTOCOL = (
+    "sRGB of light without noise, clipped at white; each rendering's linear light is aligned with it by a factor and "
+    "an offset per colour, least squares, before both are encoded"
+)
+
+Picture = Float[Tensor, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -132,13 +146,12 @@ def evaluate(
 ) -> Evaluation:
     """Render the views of a split and compare them with their photographs.
 
-    keep:  told each view's name and rendering
+    keep:  receives each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
-    right_halves: compare those alone also where a method is told nothing of left ones
+    right_halves: compare those alone also where a method is given nothing of left ones
     Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
     photograph's mask rules out do not count, nor does a photograph that it rules out altogether. A method that
-    photographs can be given to is judged by halves (see `evaluate.halves`). Raises LumigraphError if the split has no
-    view.
+    photographs can be given to is judged by halves. Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
@@ -150,7 +163,7 @@ def evaluate(
     method.eval()
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
-    spread, by_halves = set(evenly(compared, SHEET_VIEWS)), halves.judged_by_halves(method)
+    spread, by_halves = set(evenly(compared, SHEET_VIEWS)), judged_by_halves(method)
     found = held_out_poses(method, scene)
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
@@ -158,11 +171,11 @@ def evaluate(
     for index in track(compared, "Comparing views", len(compared)):
         shot = scene.photograph(index, [name for name in (CLEAN_LAYER, LIGHT_LAYER) if name in scene.layers])
         camera = found.camera(index) if found else method.refined(shot.camera)
-        columns = halves.right_half(shot) if by_halves or right_halves else slice(None)
+        columns = right_half(shot) if by_halves or right_halves else slice(None)
         if shot.mask is not None and not shot.mask[:, columns].any():
             continue
         photograph = shot.before(scene.frame.background)
-        told = method.given(halves.left_half(shot)) if by_halves else method
+        told = method.given(left_half(shot)) if by_halves else method
         begin = time.perf_counter()
         seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
@@ -239,7 +252,7 @@ def protocol(
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
         "poses": "as the method refined them" if refined else "as captured",
         "controls": dict(method.settings),
-        "halves": halves.definition(method, right_halves),
+        "halves": LEFT_HALVES if judged_by_halves(method) else RIGHT_HALVES if right_halves else None,
         "masked": any(scene.images.mask(i) is not None for i in compared),
         "colours": LIGHT_PROTOCOL if LIGHT_LAYER in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",
@@ -266,3 +279,54 @@ def mean_known(values: Iterable[float | None]) -> float | None:
     """The mean of those that are known; None if none is."""
     found = [value for value in values if value is not None]
     return mean(found) if found else None
+
+
+def judged_by_halves(method: Method) -> bool:
+    """True if a method of Scenes accepts single photographs as evidence, and no control already selects a photograph's
+    appearance."""
+    takes = issubclass(method.learns_from, Scene) and Photograph in method.takes
+    return takes and not any(control.of_photographs and control.name in method.settings for control in method.controls)
+
+
+def left_half(photograph: Photograph) -> Photograph:
+    """The same photograph, of which only pixels left of the middle are to be trusted."""
+    mask = photograph.mask
+    trusted = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
+    trusted[:, right_half(photograph)] = False
+    return replace(photograph, mask=trusted)
+
+
+def right_half(photograph: Photograph) -> slice:
+    """The columns from the middle on."""
+    return slice(photograph.rgb.shape[1] // 2, None)
+
+
+def in_light(seen: Rendering, truth: Picture) -> tuple[Picture, Picture]:
+    """A rendering and the truth as pictures that can be compared, encoded in [0, 1].
+
+    Where the rendering holds no light of its own (`radiance`), its picture is decoded.
+    """
+    light = seen.extra[LIGHT_LAYER] if LIGHT_LAYER in seen.extra else decoded(seen.rgb.clamp(0, 1))
+    truth = truth.clamp(0, 1)
+    return encoded(aligned(light.clamp(0, 1), truth).clamp(0, 1)), encoded(truth)
+
+
+def aligned(light: Picture, truth: Picture) -> Picture:
+    """a · light + b of each colour, with a and b that bring it nearest to the truth."""
+    x, y = light.double(), truth.double()
+    mean_x, mean_y = x.mean((0, 1)), y.mean((0, 1))
+    variance = (x - mean_x).square().mean((0, 1))
+    slope = ((x - mean_x) * (y - mean_y)).mean((0, 1)) / variance.clamp_min(1e-12)
+    return torch.addcmul(mean_y, slope, x - mean_x).float()
+
+
+def reveal(method: Method, data: Dataset) -> Method:
+    """The method, told of a dataset if it accepts that kind: of photographs those to learn from, none held out,
+    and no more than `Method.evidence_views`."""
+    if not isinstance(data, method.takes):
+        return method
+    if isinstance(data, Scene):
+        there = len(data.splits["train"])
+        fewer = with_fewer_views(data, min(method.evidence_views or there, there))
+        return method.given(replace(fewer, splits={"train": fewer.splits["train"]}))
+    return method.given(data)

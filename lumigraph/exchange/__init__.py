@@ -12,7 +12,7 @@ from ..system.memory import free_memory
 from ..system.progress import counting
 from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
 from .checks import checked
-from .ply_header import read_header
+from .ply import read_header
 
 WRITERS = {
     ".compressed.ply": compressed_ply.write,
@@ -24,7 +24,7 @@ WRITERS = {
 }
 READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
 SUFFIXES = tuple(WRITERS)
-FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of the file that says what is in them
+FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
 
@@ -32,7 +32,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     """The Gaussians in a file of one of SUFFIXES, or in one of FOLDERS, on the CPU, in the axes that PLY files keep; of
     a streamed SOG the finest level.
 
-    Which of its two layouts a PLY file has, its header says. Infinite logits of opacity become ±20, rotations of
+    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20, rotations of
     length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
     """
     path = place_of(expanded(path))
@@ -42,15 +42,21 @@ def read_gaussians(path: Path | str) -> Gaussians:
         if not layout:
             _check_file(path)
         with counting(f"Reading {path.name}"):
-            gaussians = FOLDERS[layout].read(path) if layout else _read(path, suffix)
+            if layout:
+                gaussians = FOLDERS[layout].read(path)
+            elif suffix in READERS:
+                gaussians = READERS[suffix](path)
+            else:
+                header = read_header(path)
+                gaussians = (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
     return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
     """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG; to
-    FOLDER/lod-meta.json, a streamed one, with levels as `detail` says.
+    FOLDER/lod-meta.json, a streamed one, with the levels of `detail`.
 
-    `.ply` keeps every number as it is; what the others round is said in their files. Those of REORDERED keep the set of
+    `.ply` keeps every number as it is; docstrings of the others give their rounding. Those of REORDERED keep the set of
     Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
     LumigraphError where the ending is none of SUFFIXES, the cloud is not sound or the disk refuses.
     """
@@ -118,13 +124,6 @@ def check_ending(path: Path) -> str:
         if path.name.lower().endswith(suffix):
             return suffix
     raise LumigraphError(f"{path} does not end like a file of Gaussians; name one that ends in {', '.join(SUFFIXES)}")
-
-
-def _read(path: Path, suffix: str) -> Gaussians:
-    if suffix in READERS:
-        return READERS[suffix](path)
-    header = read_header(path)
-    return (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
 
 
 def _check_file(path: Path) -> None:

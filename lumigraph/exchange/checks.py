@@ -1,25 +1,25 @@
-"""A cloud is sound before it leaves this room, in either direction: all of its numbers are finite."""
+"""Checks of clouds (all numbers are finite) and of files: sizes that a file declares are compared with its bytes and
+with free memory; a Bundle reads files of a folder or a .zip within these limits."""
 
 from __future__ import annotations
 
+import io
+import zipfile
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from ..errors import LumigraphError
+from ..files.ranges import shown
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
 
 DISPLAY_NAMES = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
 MAX_LOGIT = 20.0  # a logit whose sigmoid is 1 in float32
-BYTES_PER_NUMBER = (
-    28  # bytes that each number of a Gaussian takes while its file is read: itself, and what it is made from
-)
-MAX_RATIO, SMALL_BYTES = (
-    100,
-    1 << 26,
-)  # times that clouds can be packed, and unpacked bytes up to which any share is believed
+BYTES_PER_NUMBER = 28  # bytes of memory for each number of a Gaussian while its file is read
+MAX_RATIO, SMALL_BYTES = 100, 1 << 26  # largest compression of a cloud; unpacked bytes below which it is not checked
 
 
 def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = None, unpacked: int = 0) -> None:
@@ -63,3 +63,50 @@ def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
         quaternions=torch.where(nowhere, gaussians.quaternions.new_tensor([1, 0, 0, 0]), gaussians.quaternions),
         opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT),
     )
+
+
+DATE = (1980, 1, 1, 0, 0, 0)  # the earliest of the format, constant so that equal files have equal bytes
+
+
+class Bundle:
+    """Files by name, and the bytes that they take together. Raises LumigraphError for what is no archive."""
+
+    def __init__(self, path: Path):
+        self.path, self._archive = path, None
+        if path.is_dir():
+            self.size = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
+            return
+        data = path.read_bytes()
+        self.size = len(data)
+        try:
+            self._archive = zipfile.ZipFile(io.BytesIO(data))
+        except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as fault:
+            raise LumigraphError(f"{path} is no archive, or a part of one ({fault}); copy it again") from fault
+
+    def read(self, name: str) -> bytes:
+        """A file at the top. Raises LumigraphError if it is not there, is damaged or unpacks beyond belief."""
+        if self._archive is None:
+            file = self.path / name
+            if Path(name).name != name or file.is_symlink() or not file.is_file():
+                raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy the whole folder again")
+            return file.read_bytes()
+        try:
+            about = self._archive.getinfo(name)
+            if about.file_size > max(SMALL_BYTES, MAX_RATIO * self.size):
+                size = f"{about.file_size:,} bytes"
+                raise LumigraphError(f"{self.path}: {shown(name)} would unpack to {size}; download it again")
+            with self._archive.open(about) as stream:
+                return stream.read(about.file_size)  # no more, whatever is there
+        except KeyError as fault:
+            raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again") from fault
+        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError) as fault:
+            raise LumigraphError(f"{self.path}: {shown(name)} is damaged ({fault}); download it again") from fault
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    """An archive of files that are packed already, the same for the same files."""
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in files.items():
+            archive.writestr(zipfile.ZipInfo(name, DATE), data)
+    return held.getvalue()

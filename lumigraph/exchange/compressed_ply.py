@@ -1,13 +1,13 @@
 """PlayCanvas's compressed PLY, as SuperSplat and splat-transform write it: 16 bytes per Gaussian, and 0.3 of its chunk.
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply. Each 256 Gaussians make a chunk, which
-notes the least and the greatest position, scale and colour, and a Gaussian says in a few bits where between them it
-lies: positions and logarithms of scales in 11, 10 and 11 bits, colours in 8 each, so that half a step is 1/4094, 1/2046
+notes the least and the greatest position, scale and colour, and a Gaussian has its place between them in a few
+bits: positions and logarithms of scales in 11, 10 and 11 bits, colours in 8 each, so that half a step is 1/4094, 1/2046
 and 1/510 of the chunk's range. Opacities are within 1/510; components of a rotation other than the largest have 10 bits
 and are within 0.0007. Harmonics take 1 byte each, within 1/64 from -3.97 to 3.97, and 0 itself becomes 1/64. Scales are
 cut to exp(±20).
 
-Chunks are small where neighbours stand together, so the Gaussians are written along Morton's curve: the set of them
+Chunks are small where neighbours are together, so the Gaussians are written along Morton's curve: the set of them
 is kept, and not their order.
 """
 
@@ -19,16 +19,26 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
 from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
-from .morton import morton_order
-from .ply import by_channel, by_coefficient, rest_names, save
-from .ply_header import Header, columns, read_header, read_rows
+from .codes import (
+    LOGITS,
+    Integers,
+    Quaternions,
+    Vectors,
+    alpha_to_byte,
+    array,
+    cloud,
+    morton_order,
+    to_byte,
+    with_largest,
+    without_largest,
+)
+from .ply import Header, by_channel, by_coefficient, columns, read_header, read_rows, rest_names, save
 
 CHUNK = 256
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -115,29 +125,27 @@ def write(path: Path, gaussians: Gaussians) -> None:
     save(path, elements, gaussians.antialiased)
 
 
-def _between(
-    share: Float[np.ndarray, "gaussian 3"], low: Float[np.ndarray, "gaussian 3"], high: Float[np.ndarray, "gaussian 3"]
-) -> Float[np.ndarray, "gaussian 3"]:
+def _between(share: Vectors, low: Vectors, high: Vectors) -> Vectors:
     return low * (1 - share) + high * share
 
 
-def _pack(share: Float[np.ndarray, "gaussian 3"]) -> Int[np.ndarray, " gaussian"]:
+def _pack(share: Vectors) -> Integers:
     """Shares of [0, 1] in 11, 10 and 11 bits."""
     return (np.rint(share * STEPS).astype(np.int64) << SHIFTS).sum(-1)
 
 
-def _unpack(code: Int[np.ndarray, " gaussian"]) -> Float[np.ndarray, "gaussian 3"]:
+def _unpack(code: Integers) -> Vectors:
     return (code[:, None] >> SHIFTS & STEPS) / STEPS
 
 
-def _smallest_three(quaternions: Float[np.ndarray, "gaussian 4"]) -> Int[np.ndarray, " gaussian"]:
+def _smallest_three(quaternions: Quaternions) -> Integers:
     """2 bits name the largest of w, x, y, z; the others, within ±sqrt(1/2), have 10 bits each."""
     largest, rest = without_largest(quaternions)
     parts = np.rint(1023 * (rest * math.sqrt(0.5) + 0.5)).clip(0, 1023).astype(np.int64)
     return largest << 30 | (parts << np.array([20, 10, 0])).sum(-1)
 
 
-def _from_smallest_three(code: Int[np.ndarray, " gaussian"]) -> Float[np.ndarray, "gaussian 4"]:
+def _from_smallest_three(code: Integers) -> Quaternions:
     parts = code[:, None] >> np.array([20, 10, 0]) & 1023
     return with_largest(code >> 30, (parts / 1023 - 0.5) / math.sqrt(0.5))
 

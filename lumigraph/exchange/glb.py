@@ -2,7 +2,7 @@
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting. A primitive of points has
 an attribute for each quantity, float32: POSITION, ROTATION (x, y, z, w), SCALE (no logarithm), OPACITY (after the
-sigmoid) and SH_DEGREE_l_COEF_n. COLOR_0, in linear light, is for programs that know points and not the extension.
+sigmoid) and SH_DEGREE_l_COEF_n. COLOR_0, in linear light, is for programs that draw points and lack the extension.
 glTF has y up and z back, so all is turned half around x.
 
 Nothing is rounded but by float32, so opacities beyond 1 - 2^-24 become 1. `antialiased`, for which the extension has no
@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,9 +27,8 @@ from ..gaussians import Gaussians
 from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
 from . import gltf
-from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
-from .codes import array, cloud, from_scales, to_scales, unit
+from .codes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION, array, cloud, from_scales, to_scales, unit
 
 EXTENSION = "KHR_gaussian_splatting"
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
@@ -46,11 +44,10 @@ def recognises(path: Path) -> bool:
     """True if a .glb file has Gaussians, not meshes: its JSON names the extension."""
     with open(path, "rb") as file:
         head = file.read(gltf.HEADER.size + gltf.CHUNK.size)
-        return head[:4] == gltf.MAGIC and f'"{EXTENSION}"'.encode() in file.read(min(MAX_JSON_BYTES, _length(head)))
-
-
-def _length(head: bytes) -> int:
-    return gltf.CHUNK.unpack_from(head, gltf.HEADER.size)[0] if len(head) >= gltf.HEADER.size + gltf.CHUNK.size else 0
+        if head[:4] != gltf.MAGIC or len(head) < gltf.HEADER.size + gltf.CHUNK.size:
+            return False
+        length, _ = gltf.CHUNK.unpack_from(head, gltf.HEADER.size)
+        return f'"{EXTENSION}"'.encode() in file.read(min(MAX_JSON_BYTES, length))
 
 
 def read(path: Path) -> Gaussians:
@@ -72,7 +69,9 @@ def read(path: Path) -> Gaussians:
     most = max(_bands(file, primitive) for primitive, _ in placed)
     check_room(path, sum(_count(file, primitive) for primitive, _ in placed), most**2)
     parts = [_cloud(file, primitive, most, matrix) for primitive, matrix in placed]
-    return parts[0] if len(parts) == 1 else _joined(parts)
+    names = "means", "quaternions", "log_scales", "opacities", "harmonics"
+    whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return Gaussians(**whole, antialiased=all(part.antialiased for part in parts))
 
 
 def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
@@ -112,15 +111,15 @@ def _matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
 def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
     """Number of bands of harmonics of a primitive. Raises LumigraphError if the primitive is of another kind,
     compressed or incomplete."""
-    said = primitive.extensions[EXTENSION]
-    said = said if isinstance(said, dict) else {}
-    if primitive.mode != POINTS or any(said.get(name) != value for name, value in KERNEL_PROPERTIES.items()):
-        found = f"mode {primitive.mode}, kernel {shown(said.get('kernel'))}, colours {shown(said.get('colorSpace'))}"
+    about = primitive.extensions[EXTENSION]
+    about = about if isinstance(about, dict) else {}
+    if primitive.mode != POINTS or any(about.get(name) != value for name, value in KERNEL_PROPERTIES.items()):
+        found = f"mode {primitive.mode}, kernel {shown(about.get('kernel'))}, colours {shown(about.get('colorSpace'))}"
         raise LumigraphError(
             f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are "
             "read; export it as those"
         )
-    if inner := said.get("extensions"):
+    if inner := about.get("extensions"):
         by = ", ".join(inner) if isinstance(inner, dict) else inner
         raise LumigraphError(f"{file.path} packs its Gaussians by {shown(by)}; export it without compression")
     bands = 1 + math.isqrt(max((i for i, name in enumerate(HARMONICS) if name in primitive.attributes), default=0))
@@ -135,9 +134,7 @@ def _count(file: gltf.File, primitive: gltf.Primitive) -> int:
     names = ["POSITION", ROTATION, SCALE, OPACITY, *(name for name in HARMONICS if name in primitive.attributes)]
     counts = {file.accessor(primitive.attributes[name]).count for name in names}
     if len(counts) > 1:
-        raise LumigraphError(
-            f"{file.path} has attributes of {sorted(counts)} rows where all are alike; export it again"
-        )
+        raise LumigraphError(f"{file.path} has attributes of {sorted(counts)} rows, not equally many; export it again")
     return counts.pop()
 
 
@@ -170,14 +167,6 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
         array(found.harmonics) * TURN_HARMONICS[: most**2],
         found.antialiased,
     )
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    def of(name: str) -> Any:
-        return torch.cat([getattr(part, name) for part in parts])
-
-    alike = all(part.antialiased for part in parts)
-    return Gaussians(of("means"), of("quaternions"), of("log_scales"), of("opacities"), of("harmonics"), alike)
 
 
 def write(path: Path, gaussians: Gaussians) -> None:

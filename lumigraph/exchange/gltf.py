@@ -1,7 +1,7 @@
-"""Binary glTF 2.0: JSON that says what there is, and one buffer that holds its numbers, in one .glb file.
+"""Binary glTF 2.0: JSON and one buffer of numbers, in one .glb file.
 
-https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Whatever the JSON says of sizes is held against the bytes
-that are there before any of them is touched.
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Sizes in the JSON are compared with the
+bytes of the file before any number is read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Index = Annotated[int, between(0, 1 << 32)]
 Matrix = tuple[Coordinate, ...]  # of 16, column after column
 
 
-class View(msgspec.Struct, rename="camel"):
+class BufferView(msgspec.Struct, rename="camel"):
     """A part of the buffer."""
 
     buffer: Index
@@ -64,7 +64,7 @@ class Primitive(msgspec.Struct, rename="camel"):
     extras: Any = None
 
 
-class Mesh(msgspec.Struct, rename="camel"):
+class GltfMesh(msgspec.Struct, rename="camel"):
     primitives: list[Primitive]
 
 
@@ -79,7 +79,7 @@ class Node(msgspec.Struct, rename="camel"):
     translation: tuple[Coordinate, ...] = (0.0, 0.0, 0.0)
 
 
-class Scene(msgspec.Struct, rename="camel"):
+class GltfScene(msgspec.Struct, rename="camel"):
     nodes: list[Index] = []
 
 
@@ -87,11 +87,11 @@ class About(msgspec.Struct, rename="camel"):
     """The used parts of the JSON chunk."""
 
     accessors: list[Accessor] = []
-    buffer_views: list[View] = []
+    buffer_views: list[BufferView] = []
     buffers: list[Buffer] = []
-    meshes: list[Mesh] = []
+    meshes: list[GltfMesh] = []
     nodes: list[Node] = []
-    scenes: list[Scene] = []
+    scenes: list[GltfScene] = []
     scene: Index = 0
     extensions_used: list[str] = []
     extensions_required: list[str] = []
@@ -102,7 +102,7 @@ class Column:
     """Numbers to be written, [row] or [row, component].
 
     normalised: whether whole numbers stand for [0, 1] or [-1, 1]
-    bounded:    whether the least and the greatest are said, as positions need
+    bounded:    whether the least and the greatest are fields, as positions need
     """
 
     numbers: np.ndarray
@@ -131,16 +131,16 @@ def encoded(about: dict[str, Any], columns: list[Column]) -> bytes:
 def _accessor(view: int, column: Column) -> dict[str, Any]:
     numbers = column.numbers
     shape = NAMES[numbers.shape[1] if numbers.ndim > 1 else 1]
-    said = {"bufferView": view, "componentType": NUMBERS[numbers.dtype], "type": shape, "count": len(numbers)}
+    fields = {"bufferView": view, "componentType": NUMBERS[numbers.dtype], "type": shape, "count": len(numbers)}
     if column.normalised:
-        said["normalized"] = True
+        fields["normalized"] = True
     if column.bounded:
-        said |= {"min": numbers.min(0).tolist(), "max": numbers.max(0).tolist()}
-    return said
+        fields |= {"min": numbers.min(0).tolist(), "max": numbers.max(0).tolist()}
+    return fields
 
 
 class File:
-    """A .glb file that was opened: `about` it, and the numbers of its accessors when asked for.
+    """A .glb file that was opened: `about` it, and the numbers of its accessors.
 
     Raises LumigraphError if it is none, is cut, or leads to other files.
     """

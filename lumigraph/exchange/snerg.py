@@ -1,16 +1,16 @@
 """The folder that SNeRG's viewer opens: scene_params.json, slices of the atlas as PNG, and where its blocks are.
 
 https://github.com/google-research/google-research/tree/master/snerg. Four layers of the atlas lie in a picture, one
-below another: rgba_000.png holds colours and alpha, feature_000.png the features. atlas_indices.png says for each block
-of the grid where in the atlas it is, 255 where nothing is. Without a network there are neither features nor weights.
+below another: rgba_000.png holds colours and alpha, feature_000.png the features. atlas_indices.png has the place in
+the atlas of each block of the grid, 255 for empty ones. Without a network there are neither features nor weights.
 
-An open capture's atlas lies in contracted coordinates, of which the format knows nothing: "contracted" in
-scene_params.json is our own word for it, and other viewers show it out of shape.
+An open capture's atlas lies in contracted coordinates, which the format does not have: "contracted" in
+scene_params.json is our extension, and other viewers show such an atlas distorted.
 
 The viewer's world has +y up, so x, y, z of the scene are -x, z, y there, and worldspace_T_opengl leads back.
 
-What a pixel is differs in one point: the viewer adds what the network says wherever a ray met anything, before white,
-and shows it the colours with that white behind; ours adds it by opacity, and shows it the colours alone. They agree
+Pixels differ in one point: the viewer adds the network's output wherever a ray met anything, before white, and its
+input is the colours with that white behind; ours adds it by opacity, and its input is the colours alone. They agree
 where a ray ends at something, which is all but the outermost pixels of an object.
 """
 
@@ -37,7 +37,7 @@ from ..files.ranges import Coordinate, Positive, Row, between, typed
 from ..system.memory import free_memory, gigabytes
 from ..system.progress import track
 from .baked import Atlas, ViewNetwork
-from .bundle import Bundle
+from .checks import Bundle
 
 META, INDICES = "scene_params.json", "atlas_indices.png"
 EMPTY_INDEX = 255  # in atlas_indices.png
@@ -105,7 +105,7 @@ class Params:
             or to_scene[:3, 3].any()
         ):
             raise LumigraphError(
-                "What is contracted fills the cube of [-2, 2]^3, and its grid does not; export it anew"
+                "A contracted scene fills the cube of [-2, 2]^3, and its grid does not; export it anew"
             )
         turn = to_scene[:3, :3]
         if sorted(np.abs(turn).ravel()) != [0] * 6 + [1] * 3 or np.linalg.det(turn) < 0:
@@ -125,9 +125,9 @@ class Params:
         """Raises LumigraphError for layers that do not fit."""
         if self.bias_0 is None:
             return None
-        said = (self.weights_0, self.bias_0), (self.weights_1, self.bias_1), (self.weights_2, self.bias_2)
+        layers = (self.weights_0, self.bias_0), (self.weights_1, self.bias_1), (self.weights_2, self.bias_2)
         weights, biases, inputs = [], [], NETWORK_INPUTS
-        for number, (rows, bias) in enumerate(said):
+        for number, (rows, bias) in enumerate(layers):
             widths = {len(row) for row in rows or ()}
             if bias is None or len(rows or ()) != inputs or widths != {len(bias)} or (number == 2 and len(bias) != 3):
                 raise LumigraphError(f"Layer {number} of its network does not fit the one before; write it anew")
@@ -165,8 +165,8 @@ def write(folder: Path, atlas: Atlas) -> None:
             for kind, channels in kinds.items():
                 Image.fromarray(np.ascontiguousarray(layers[..., channels])).save(new / f"{kind}_{number:03d}.png")
         Image.fromarray(indices(atlas.index.numpy(), blocks)).save(new / INDICES)
-        said = params(atlas, blocks)
-        (new / META).write_text(json.dumps(said, allow_nan=False), "utf-8")
+        fields = params(atlas, blocks)
+        (new / META).write_text(json.dumps(fields, allow_nan=False), "utf-8")
 
 
 def arranged(
@@ -195,21 +195,21 @@ def indices(index: np.ndarray, blocks: tuple[int, int, int]) -> UInt8[np.ndarray
 def params(atlas: Atlas, blocks: tuple[int, int, int]) -> dict[str, Any]:
     """scene_params.json of an atlas that is turned already."""
     side = atlas.block + 2
-    said: dict[str, Any] = {"voxel_size": atlas.voxel, "block_size": atlas.block}
+    fields: dict[str, Any] = {"voxel_size": atlas.voxel, "block_size": atlas.block}
     names = "width", "height", "depth"
-    said |= {f"grid_{name}": n * atlas.block for name, n in zip(names, atlas.index.shape, strict=True)}
-    said |= {f"atlas_{name}": n * side for name, n in zip(names, blocks, strict=True)}
-    said |= {"num_slices": blocks[2] * side // LAYERS}
-    said |= {f"min_{axis}": low for axis, low in zip("xyz", atlas.low.tolist(), strict=True)}
-    said |= {f"atlas_blocks_{axis}": n for axis, n in zip("xyz", blocks, strict=True)}
-    said |= {"input_height": 800.0, "input_width": 800.0, "input_focal": 1111.0}  # of cameras, asked for ndc alone
-    said |= {"worldspace_T_opengl": AXES, "ndc": False, "format": "png"}
+    fields |= {f"grid_{name}": n * atlas.block for name, n in zip(names, atlas.index.shape, strict=True)}
+    fields |= {f"atlas_{name}": n * side for name, n in zip(names, blocks, strict=True)}
+    fields |= {"num_slices": blocks[2] * side // LAYERS}
+    fields |= {f"min_{axis}": low for axis, low in zip("xyz", atlas.low.tolist(), strict=True)}
+    fields |= {f"atlas_blocks_{axis}": n for axis, n in zip("xyz", blocks, strict=True)}
+    fields |= {"input_height": 800.0, "input_width": 800.0, "input_focal": 1111.0}  # of cameras, used for ndc only
+    fields |= {"worldspace_T_opengl": AXES, "ndc": False, "format": "png"}
     if atlas.contracted:
-        said |= {"contracted": True}
+        fields |= {"contracted": True}
     if atlas.network:
         for number, (weight, bias) in enumerate(zip(atlas.network.weights, atlas.network.biases, strict=True)):
-            said |= {f"{number}_weights": weight.tolist(), f"{number}_bias": bias.tolist()}
-    return said
+            fields |= {f"{number}_weights": weight.tolist(), f"{number}_bias": bias.tolist()}
+    return fields
 
 
 # Reading
@@ -219,10 +219,10 @@ def read(folder: Path) -> Atlas:
     """The atlas that such a folder holds, its axes those of the scene. Raises LumigraphError, in one sentence, where a
     slice is missing, cut or of another size, and for numbers that contradict each other."""
     bundle = Bundle(folder)
-    said = from_json(bundle.read(META), f"{META} of {folder}")
-    if isinstance(said, dict):
-        said = {re.sub(r"^([012])_(weights|bias)$", r"\2_\1", name): value for name, value in said.items()}
-    about: Params = typed(Params, said, f"{META} of {folder}")
+    fields = from_json(bundle.read(META), f"{META} of {folder}")
+    if isinstance(fields, dict):
+        fields = {re.sub(r"^([012])_(weights|bias)$", r"\2_\1", name): value for name, value in fields.items()}
+    about: Params = typed(Params, fields, f"{META} of {folder}")
     try:
         network = about.network
     except LumigraphError as fault:
@@ -262,9 +262,8 @@ def read(folder: Path) -> Atlas:
 def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
     """Each block's number in the atlas, -1 where nothing is."""
     gx, gy, gz = about.grid_blocks
-    places = (
-        picture(bundle, INDICES, (gx, gz * gy), "RGB").reshape(gz, gy, gx, 3).transpose(2, 1, 0, 3).astype(np.int64)
-    )
+    places = picture(bundle, INDICES, (gx, gz * gy), "RGB").reshape(gz, gy, gx, 3)
+    places = places.transpose(2, 1, 0, 3).astype(np.int64)
     there = (places != EMPTY_INDEX).all(-1)
     if (places[there] >= np.array(about.atlas_blocks)).any():
         raise LumigraphError(f"{INDICES} of {bundle.path} names blocks beyond the atlas; copy the whole folder again")

@@ -33,18 +33,26 @@ from ..errors import LumigraphError
 from ..files import from_json, replacing_folder, write_bytes
 from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
 from ..gaussians import Gaussians
-from .bundle import Bundle, zipped
-from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
-from .levels import levels, nearest_level
-from .morton import morton_order
-from .packing.clusters import clustered
+from .checks import Bundle, check_room, zipped
+from .codes import (
+    LOGITS,
+    Quaternions,
+    Vectors,
+    alpha_to_byte,
+    array,
+    cloud,
+    levels,
+    morton_order,
+    nearest_level,
+    to_byte,
+    with_largest,
+    without_largest,
+)
+from .packing.forms import clustered
 
 VERSION = 2
 META = "meta.json"
-LARGEST_COMPONENT_ALPHA = (
-    252  # alpha of a rotation's pixel, and one more for each of w, x, y, z that is the largest component
-)
+LARGEST_COMPONENT_ALPHA = 252  # alpha of a rotation's pixel if w is the largest component; 253 to 255 for x, y, z
 PALETTE_ROW = 64  # palette entries side by side
 WIDTHS = 3, 8, 15  # coefficients of one, for degrees 1, 2 and 3
 MIN_ENTRIES, MAX_ENTRIES = 1024, 65536  # palette entries
@@ -74,7 +82,7 @@ class Quats:
 
 
 @dataclass(frozen=True)
-class Coded:
+class CodebookImage:
     codebook: Book
     files: One
 
@@ -95,20 +103,17 @@ class Meta:
 
     count: Tally
     means: Means
-    scales: Coded
+    scales: CodebookImage
     quats: Quats
-    sh0: Coded
+    sh0: CodebookImage
     shN: Palette | None = None  # noqa: N815
     model: str | None = None
     antialias: bool = False
 
 
 @dataclass(frozen=True)
-class OldMeans:
+class OldMeans(Means):
     shape: tuple[Tally, ...]
-    mins: Ends
-    maxs: Ends
-    files: Two
 
 
 @dataclass(frozen=True)
@@ -156,17 +161,17 @@ def recognises(folder: Path) -> bool:
 def read(path: Path) -> Gaussians:
     """A .sog file or a folder. Raises LumigraphError where pictures are missing, cut, too small or too large."""
     bundle = Bundle(path)
-    said = from_json(bundle.read(META), f"{META} of {path}")
-    version = said.get("version", 1) if isinstance(said, dict) else None
+    fields = from_json(bundle.read(META), f"{META} of {path}")
+    version = fields.get("version", 1) if isinstance(fields, dict) else None
     if version not in (1, VERSION):
         raise LumigraphError(
             f"{path} is of version {shown(version)} of SOG, of which 1 and {VERSION} are read; save it as {VERSION}"
         )
-    return _read(bundle, said) if version == VERSION else _read_old(bundle, said)
+    return _read(bundle, fields) if version == VERSION else _read_old(bundle, fields)
 
 
-def _read(bundle: Bundle, said: Any) -> Gaussians:
-    meta = typed(Meta, said, f"{META} of {bundle.path}")
+def _read(bundle: Bundle, fields: Any) -> Gaussians:
+    meta = typed(Meta, fields, f"{META} of {bundle.path}")
     count, palette = meta.count, meta.shN
     pictures = _Pictures(bundle, count, (palette.bands + 1) ** 2 if palette else 1)
     sh0 = pictures.of(meta.sh0.files[0])
@@ -184,9 +189,9 @@ def _read(bundle: Bundle, said: Any) -> Gaussians:
     )
 
 
-def _read_old(bundle: Bundle, said: Any) -> Gaussians:
+def _read_old(bundle: Bundle, fields: Any) -> Gaussians:
     """Version 1, where a byte is a share of a range, and opacities are logits."""
-    meta = typed(OldMeta, said, f"{META} of {bundle.path}")
+    meta = typed(OldMeta, fields, f"{META} of {bundle.path}")
     count, palette = meta.means.shape[0] if meta.means.shape else 0, meta.shN
     pictures = _Pictures(bundle, count, 16 if palette else 1)
     colours = _between(pictures.of(meta.sh0.files[0]), meta.sh0.mins, meta.sh0.maxs)
@@ -212,9 +217,7 @@ class _Pictures:
 
     def __init__(self, bundle: Bundle, count: int, harmonics: int):
         if not count:
-            raise LumigraphError(
-                f"{bundle.path} says that it holds no Gaussians, as no such file does; export it again"
-            )
+            raise LumigraphError(f"{bundle.path} declares that it holds no Gaussians; export it again")
         self.bundle, self.count, self.harmonics = bundle, count, harmonics
         check_room(bundle.path, count, harmonics, bundle.size, 20 * count)
 
@@ -229,27 +232,27 @@ class _Pictures:
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 pixels = image.width * image.height
                 if pixels < least:
-                    raise LumigraphError(
-                        f"{path}: {shown(name)} has {pixels:,} pixels where {least:,} are needed; get it again"
-                    )
+                    found = f"{shown(name)} has {pixels:,} pixels where {least:,} are needed"
+                    raise LumigraphError(f"{path}: {found}; get it again")
                 check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
                 return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as fault:
             why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
             raise LumigraphError(f"{path}: {shown(name)} cannot be read as a picture ({why}); get it again") from fault
 
-    def means(self, about: Means | OldMeans) -> Float[np.ndarray, "gaussian 3"]:
+    def means(self, about: Means) -> Vectors:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)
         shares = (high << 8 | low) / 65535
-        return _unfolded(np.array(about.mins) + shares * (np.array(about.maxs) - np.array(about.mins)))
+        folded = np.array(about.mins) + shares * (np.array(about.maxs) - np.array(about.mins))
+        with np.errstate(over="ignore"):  # infinite positions are found later
+            return np.sign(folded) * np.expm1(np.abs(folded))
 
-    def rotations(self, name: str) -> Float[np.ndarray, "gaussian 4"]:
+    def rotations(self, name: str) -> Quaternions:
         pixels = self.of(name)
         if (pixels[:, 3] < LARGEST_COMPONENT_ALPHA).any():
             raise LumigraphError(f"{self.bundle.path}: {shown(name)} has pixels that are no rotations; export it again")
-        return with_largest(
-            pixels[:, 3].astype(np.int64) - LARGEST_COMPONENT_ALPHA, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2)
-        )
+        largest = pixels[:, 3].astype(np.int64) - LARGEST_COMPONENT_ALPHA
+        return with_largest(largest, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2))
 
     def palette(
         self, files: tuple[str, str], count: int | None = None, width: int | None = None
@@ -281,14 +284,14 @@ def write(path: Path, gaussians: Gaussians) -> None:
 
 
 def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
-    """The files of version 2 by name, meta.json first. ordered: keep the order, which somebody has chosen well."""
+    """The files of version 2 by name, meta.json first. ordered: keep the order of the cloud."""
     gaussians = gaussians.to("cpu")
     if not ordered:
         gaussians = gaussians[torch.from_numpy(morton_order(array(gaussians.means)))]
     count, files = len(gaussians), dict[str, bytes]()
 
     def picture(name: str, *channels: np.ndarray, width: int = 4 * math.ceil(math.sqrt(count) / 4)) -> str:
-        """Note a lossless WebP of pixels in a multiple of four rows; what nobody says of them is 255."""
+        """Note a lossless WebP of pixels in a multiple of four rows; other values are 255."""
         pixels = np.concatenate([part.reshape(len(part), -1) for part in channels], 1)
         rgba = np.full((4 * math.ceil(len(pixels) / width / 4) * width, 4), 255, np.uint8)
         rgba[: len(pixels), : pixels.shape[1]] = pixels
@@ -297,10 +300,12 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
         files[name] = held.getvalue()
         return name
 
-    folded = _folded(array(gaussians.means))
+    means = array(gaussians.means)
+    folded = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = folded.min(0), folded.max(0)
     steps = np.rint(65535 * (folded - low) / np.where(high > low, high - low, 1)).astype(np.int64)
     largest, rest = without_largest(array(gaussians.quaternions))
+    components, alphas = to_byte(255 * (rest / math.sqrt(2) + 0.5)), alpha_to_byte(array(gaussians.opacities))
     scales, colours = array(gaussians.log_scales), array(gaussians.harmonics[:, 0])
     scale_book, colour_book = levels(scales), levels(colours)
     meta: dict[str, Any] = {
@@ -316,16 +321,10 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
             "codebook": scale_book.tolist(),
             "files": [picture("scales.webp", nearest_level(scales, scale_book))],
         },
-        "quats": {
-            "files": [
-                picture("quats.webp", to_byte(255 * (rest / math.sqrt(2) + 0.5)), LARGEST_COMPONENT_ALPHA + largest)
-            ],
-        },
+        "quats": {"files": [picture("quats.webp", components, LARGEST_COMPONENT_ALPHA + largest)]},
         "sh0": {
             "codebook": colour_book.tolist(),
-            "files": [
-                picture("sh0.webp", nearest_level(colours, colour_book), alpha_to_byte(array(gaussians.opacities)))
-            ],
+            "files": [picture("sh0.webp", nearest_level(colours, colour_book), alphas)],
         },
     }
     if gaussians.antialiased:
@@ -347,9 +346,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
     return {META: json.dumps(meta, allow_nan=False).encode(), **files}
 
 
-def _palette(
-    harmonics: Float[np.ndarray, "gaussian rest"],
-) -> tuple[Float[np.ndarray, "entry rest"], np.ndarray]:
+def _palette(harmonics: Float[np.ndarray, "gaussian rest"]) -> tuple[Float[np.ndarray, "entry rest"], np.ndarray]:
     """Entries, and which of them each Gaussian has: all that there are if they are few, else of k-means."""
     size = max(MIN_ENTRIES, min(MAX_ENTRIES, 2 ** int(math.log2(max(len(harmonics) / GAUSSIANS_PER_ENTRY, 1)))))
     kinds, labels = np.unique(harmonics, axis=0, return_inverse=True)
@@ -358,14 +355,3 @@ def _palette(
     rows = torch.from_numpy(np.ascontiguousarray(harmonics))
     entries, codes = clustered(rows, torch.ones(len(rows)), size, torch.Generator().manual_seed(0))
     return entries.numpy(), codes.numpy()
-
-
-def _folded(x: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
-    """sign(x) log(1 + |x|)"""
-    return np.sign(x) * np.log1p(np.abs(x.astype(np.float64)))
-
-
-def _unfolded(v: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
-    """The inverse."""
-    with np.errstate(over="ignore"):  # what becomes infinite is found later
-        return np.sign(v) * np.expm1(np.abs(v))

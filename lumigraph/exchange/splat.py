@@ -21,9 +21,8 @@ from ..kernels.spherical_harmonics import K00
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, from_scales, to_byte, to_scales, unit
 
-RECORD = np.dtype(
-    [("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1"), ("rotation", "u1", 4)]
-)
+FIELDS = [("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1"), ("rotation", "u1", 4)]
+RECORD = np.dtype(FIELDS)
 
 
 def read(path: Path) -> Gaussians:
@@ -48,7 +47,7 @@ def read(path: Path) -> Gaussians:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Raises LumigraphError for a cloud of none, which nobody could tell from a file that was lost."""
+    """Raises LumigraphError for a cloud of none, whose file would be empty."""
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     records = np.empty(len(gaussians), RECORD)

@@ -1,11 +1,11 @@
 """Niantic's compact format, https://github.com/nianticlabs/spz: a header and one stream of bytes per quantity.
 
 Versions 1 to 3 have gzip around all of it, version 4 a table of streams, each packed by zstd. All four are read, and 4,
-the current one, is written; pages hold 3, which unpacks where there is no zstd and says the same. Both give a rotation
+the current one, is written; pages hold 3, which unpacks where there is no zstd and is the same. Both give a rotation
 three components of 10 bits. Version 2 is within 1/255 a component, so that a half turn, whose w is near 0, can come
 back turned by 13 degrees.
 
-Axes are x right, y up, z back: see `axes`.
+Axes are x right, y up, z back: see `codes.TURN_MEAN`.
 
 What is lost: positions are fixed-point numbers of 24 bits, within 2^-17 while all lie inside ±128, coarser for wider
 clouds. Scales are within 1/32 (3%) of their logarithm from -10 to 5.9. Opacities are within 1/510, plain colours within
@@ -32,9 +32,21 @@ from jaxtyping import Float, UInt8
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
-from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
+from .codes import (
+    LOGITS,
+    TURN_HARMONICS,
+    TURN_MEAN,
+    TURN_ROTATION,
+    Quaternions,
+    Vectors,
+    alpha_to_byte,
+    array,
+    cloud,
+    to_byte,
+    with_largest,
+    without_largest,
+)
 from .packing.streams import MAX_ZSTD_RATIO, take
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
@@ -57,7 +69,7 @@ def read(path: Path) -> Gaussians:
     data = path.read_bytes()
     stream: io.BufferedIOBase
     if data[:8] == MAGIC + struct.pack("<I", NEWEST_VERSION):
-        with _told(path):
+        with _damage_reported(path):
             return _decode_tabled(path, data)
     if data[:4] == MAGIC:  # earlier ones, before gzip
         stream = io.BytesIO(data)
@@ -65,12 +77,12 @@ def read(path: Path) -> Gaussians:
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
     else:
         raise LumigraphError(f"{path} is no .spz file, for it does not begin like one; name another one")
-    with _told(path):
+    with _damage_reported(path):
         return _decode(path, stream, MAX_DEFLATE_RATIO * len(data))
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _damage_reported(path: Path) -> Iterator[None]:
     """Raise faults of unpacking as a LumigraphError of one sentence."""
     try:
         yield
@@ -79,7 +91,7 @@ def _told(path: Path) -> Iterator[None]:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Version 4. Raises LumigraphError if the cloud is wider than 24 bits can say."""
+    """Version 4. Raises LumigraphError if the cloud is too wide for 24 bits."""
     (bits, flags), streams = _streams(gaussians, str(path), HARMONICS_STEPS)
     raw = [stream.tobytes() for stream in streams if stream.shape[1]]
     packed = [zstandard.ZstdCompressor(ZSTD_LEVEL).compress(stream) for stream in raw]
@@ -101,9 +113,7 @@ def _streams(
     """Bits behind the point and flags, and the bytes of each quantity."""
     extent = float(np.abs(array(gaussians.means)).max()) if len(gaussians) else 0.0
     if extent > MAX_FIXED:
-        raise LumigraphError(
-            f"{name} cannot hold positions beyond {MAX_FIXED}; scale the cloud down or write it as .ply"
-        )
+        raise LumigraphError(f"{name} cannot hold positions beyond {MAX_FIXED}; scale the cloud down or write a .ply")
     bits = min(MAX_BITS, math.floor(math.log2(MAX_FIXED / extent))) if extent > MAX_FIXED / 2**MAX_BITS else MAX_BITS
     flags = ANTIALIASED if gaussians.antialiased else 0
     fixed = np.rint(array(gaussians.means).astype(np.float64) * TURN_MEAN * 2**bits).clip(-MAX_FIXED, MAX_FIXED)
@@ -175,13 +185,16 @@ def _widths(path: Path, version: int, degree: int) -> list[int]:
 def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Gaussians:
     positions, alphas, colours, scales, rotations, rest = columns
     means = positions.view("<f2").astype(np.float64) if version == 1 else _fixed_point(positions) / 2.0**bits
+    if version >= 3:
+        quaternions = _from_smallest_three(rotations)
+    else:  # x, y, z, and w not negative
+        quaternions = with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
     plain = (colours / 255 - 0.5) / COLOUR_SCALE
-    harmonics = np.concatenate(
-        [plain[:, None], (rest.reshape(*rest.shape[:1], rest.shape[1] // 3, 3) - 128.0) / 128], 1
-    )
+    rest = (rest.reshape(len(rest), rest.shape[1] // 3, 3) - 128.0) / 128
+    harmonics = np.concatenate([plain[:, None], rest], 1)
     return cloud(
         means * TURN_MEAN,
-        (_from_smallest_three(rotations) if version >= 3 else _from_first_three(rotations)) * TURN_ROTATION,
+        quaternions * TURN_ROTATION,
         scales / 16 - 10,
         LOGITS[alphas[:, 0]],
         harmonics * TURN_HARMONICS[: harmonics.shape[1]],
@@ -189,19 +202,14 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
     )
 
 
-def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Float[np.ndarray, "gaussian 3"]:
+def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Vectors:
     """Signed integers of 24 bits, read as the upper ones of 32."""
     wide = np.zeros((3 * len(positions), 4), np.uint8)
     wide[:, 1:] = positions.reshape(-1, 3)
     return (wide.view("<i4").reshape(-1, 3) >> 8).astype(np.float64)
 
 
-def _from_first_three(rotations: UInt8[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 4"]:
-    """Versions 1 and 2: x, y, z, and w not negative."""
-    return with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
-
-
-def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:
+def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Quaternions:
     """Version 3: 2 bits name the largest of x, y, z, w; each of the others has a sign and 9 bits of sqrt(1/2)."""
     code = rotations.view("<u4").astype(np.int64)
     parts = code >> np.array([20, 10, 0])
@@ -209,7 +217,7 @@ def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Float[np
     return np.roll(with_largest((code >> 30)[:, 0], rest), 1, -1)
 
 
-def _smallest_three(quaternions: Float[np.ndarray, "gaussian 4"]) -> UInt8[np.ndarray, "gaussian 4"]:
+def _smallest_three(quaternions: Quaternions) -> UInt8[np.ndarray, "gaussian 4"]:
     largest, rest = without_largest(np.roll(quaternions, -1, -1))
     sizes = np.rint(np.abs(rest) * (511 / math.sqrt(0.5))).clip(0, 511).astype(np.int64)
     parts = (np.where(rest < 0, 512, 0) | sizes) << np.array([20, 10, 0])

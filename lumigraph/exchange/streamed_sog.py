@@ -31,13 +31,12 @@ from ..geometry import to_matrix
 from ..system.progress import track
 from . import sog
 from .checks import check_room
-from .codes import array
-from .morton import morton_order
+from .codes import array, morton_order
 
 VERSION = 1
 META = "lod-meta.json"
 MIN_LEAVES_PER_FILE = 4  # leaves in a file of the finest level, at least
-EXTENT_QUANTILE = 0.9  # of Gaussians tell how long a side is; the rest may be far out
+EXTENT_QUANTILE = 0.9  # of Gaussians determine the length of a side; the rest may be far out
 MAX_LEVELS = 64
 
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
@@ -164,7 +163,8 @@ def write(path: Path, gaussians: Gaussians, detail: Detail | None = None) -> Non
         bounds = [bound(clouds) for clouds in levels]
         rows, files = packed([[len(cloud) for cloud in clouds] for clouds in levels], detail.chunk)
         for name, level, members in track(files, "Packing chunks", len(files)):
-            chunk = joined([along_curve(levels[leaf][level]) for leaf in members])
+            clouds = [levels[leaf][level] for leaf in members]
+            chunk = joined([x[torch.from_numpy(morton_order(array(x.means)))] for x in clouds])
             (folder / name).parent.mkdir()
             for part, data in sog.encode(chunk, ordered=True).items():
                 (folder / name).with_name(part).write_bytes(data)
@@ -242,10 +242,6 @@ def bound(clouds: list[Gaussians]) -> Bounds:
         lows.append(array(cloud.means - reach).min(0))
         highs.append(array(cloud.means + reach).max(0))
     return np.min(lows, 0), np.max(highs, 0)
-
-
-def along_curve(cloud: Gaussians) -> Gaussians:
-    return cloud[torch.from_numpy(morton_order(array(cloud.means)))]
 
 
 def plain(number: np.floating[Any]) -> float:

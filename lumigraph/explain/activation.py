@@ -40,7 +40,7 @@ ORDERS: dict[str, Callable[[Grid], Picture]] = {
 
 
 @dataclass(frozen=True)
-class Fit:
+class ActivationFit:
     """Fitted picture of the edge with one order, and its PSNR in dB."""
 
     name: str
@@ -54,7 +54,7 @@ def edge() -> Float[Tensor, "height width"]:
     return (((x - 0.35).hypot(y - 0.2) < 0.95) & ((x + 0.35).hypot(y + 0.2) < 0.95)).float()
 
 
-def fits(cells: int, steps: int) -> list[Fit]:
+def fits(cells: int, steps: int) -> list[ActivationFit]:
     """The leaf as learnt by grids of so many cells along an axis, which differ in nothing but the order."""
     target, found = edge(), []
     for name, order in ORDERS.items():
@@ -65,11 +65,11 @@ def fits(cells: int, steps: int) -> list[Fit]:
             (order(grid)[0, 0] - target).square().mean().backward()
             adam.step()
         picture = order(grid.detach())[0, 0]
-        found.append(Fit(name, picture, float(psnr(picture, target))))
+        found.append(ActivationFit(name, picture, float(psnr(picture, target))))
     return found
 
 
-def draw(path: Path, found: list[Fit], cells: int) -> None:
+def draw(path: Path, found: list[ActivationFit], cells: int) -> None:
     """Write the leaf and what each order made of it side by side."""
     pictures = [edge(), *(fit.picture for fit in found)]
     columns = ["the edge", *(f"{fit.name} · {fit.psnr:.1f} dB" for fit in found)]

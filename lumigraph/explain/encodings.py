@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
+from ..components.fields.layers import Dense
 from ..datasets.scene import Scene
 from ..methods.fourier_features import Config, Encoding, FourierFeatures
 from ..metrics import psnr
@@ -17,7 +18,6 @@ from ..run import build
 from ..system.progress import track
 from ..system.signals import go_on_unless
 from ..training import fit
-from .tangent_kernel import spectrum, tangent_kernel
 
 UNSCALED_ENCODINGS: tuple[Encoding, ...] = ("none", "basic")
 SCALED_ENCODINGS: tuple[Encoding, ...] = ("positional", "gaussian")
@@ -25,7 +25,7 @@ GRID_POINTS = 24  # points along each side, at which the tangent kernel is taken
 
 
 @dataclass(frozen=True)
-class Fit:
+class EncodingFit:
     """One trained network.
 
     scale:       cycles across the picture; None for encodings without one
@@ -47,25 +47,25 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class EncodingComparison:
     """All fits, and what they were made of."""
 
     source: str
     picture: Float[Tensor, "height width 3"]
     steps: int
     config: Config
-    fits: list[Fit]
+    fits: list[EncodingFit]
 
-    def of(self, encoding: Encoding) -> list[Fit]:
+    def of(self, encoding: Encoding) -> list[EncodingFit]:
         """Fits of one encoding, by scale."""
         return [one for one in self.fits if one.encoding == encoding]
 
-    def best(self, encoding: Encoding) -> Fit:
+    def best(self, encoding: Encoding) -> EncodingFit:
         """The fit that shows held-out pixels best."""
         return max(self.of(encoding), key=lambda one: one.held_out)
 
     @property
-    def leading(self) -> list[Fit]:
+    def leading(self) -> list[EncodingFit]:
         """The best of each encoding."""
         return [self.best(encoding) for encoding in UNSCALED_ENCODINGS + SCALED_ENCODINGS]
 
@@ -106,7 +106,7 @@ class Comparison:
 
 def compare(
     scene: Scene, scales: tuple[float, ...], steps: int, device: torch.device, config: Config | None = None
-) -> Comparison:
+) -> EncodingComparison:
     """Train one network for every encoding, and those with a scale once for each.
 
     scene:  of a single picture (`capture.picture`)
@@ -117,10 +117,10 @@ def compare(
     todo = [replace(config, encoding=encoding) for encoding in UNSCALED_ENCODINGS]
     todo += [replace(config, encoding=encoding, scale=scale) for encoding in SCALED_ENCODINGS for scale in scales]
     fits = [learn(scene, one, steps, device) for one in track(todo, "Fitting the picture", len(todo))]
-    return Comparison(scene.source, truth(scene), steps, config, fits)
+    return EncodingComparison(scene.source, truth(scene), steps, config, fits)
 
 
-def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Fit:
+def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> EncodingFit:
     """Train one network and score it."""
     method = build(FourierFeatures, scene.frame, config, device, config.seed)
     assert isinstance(method, FourierFeatures)
@@ -132,7 +132,7 @@ def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Fit
     masks = [scene.images.mask(int(scene.splits[split][0])) for split in ("train", "test")]
     learnt, held_out = (psnr(rgb[mask], picture[mask]) for mask in masks)
     scale = None if config.encoding in UNSCALED_ENCODINGS else config.scale
-    return Fit(config.encoding, scale, learnt, held_out, seconds, rgb, eigenvalues)
+    return EncodingFit(config.encoding, scale, learnt, held_out, seconds, rgb, eigenvalues)
 
 
 def truth(scene: Scene) -> Float[Tensor, "height width 3"]:
@@ -145,3 +145,43 @@ def kernel_at_start(method: FourierFeatures) -> Float[Tensor, "point point"]:
     side = (torch.arange(GRID_POINTS, device=method.device) + 0.5) / GRID_POINTS
     places = torch.cartesian_prod(side, side)
     return tangent_kernel(method.layers, method.encoding(places)).cpu()
+
+
+@torch.no_grad()
+def tangent_kernel(network: nn.Sequential, features: Float[Tensor, "point feature"]) -> Float[Tensor, "point point"]:
+    """Theta(x, x') = df(x)/dtheta . df(x')/dtheta, exact for these very weights, averaged over the outputs of f.
+
+    network:  f, layers that are all Dense
+    features: what it is given at each point
+
+    With h_l what layer l is given, z_l = W_l h_l + b_l, and delta_l = df/dz_l, the gradient of W_l is delta_l h_l^T and
+    that of b_l is delta_l, so that all of them together give
+
+        Theta(x, x') = sum_l (delta_l . delta_l') (h_l . h_l' + 1)
+
+    In float64: eigenvalues span more than single precision can.
+    """
+    layers = [layer for layer in network if isinstance(layer, Dense)]
+    given = [features.double()]
+    for layer in layers:
+        z = given[-1] @ layer.weight.double().t() + layer.bias.double()
+        given.append(z.relu() if layer.relu else z)
+    answers = given.pop()
+    alike = [h @ h.t() + 1 for h in given]
+    kernel = torch.zeros_like(alike[0])
+    for unit in torch.eye(answers.shape[1]).to(answers):
+        delta = unit.expand_as(answers)
+        for layer, h, products in reversed(list(zip(layers, given, alike, strict=True))):
+            kernel += delta @ delta.t() * products
+            delta = delta @ layer.weight.double() * (h > 0)
+    return kernel / answers.shape[1]
+
+
+def spectrum(kernel: Float[Tensor, "point point"]) -> Float[Tensor, " point"]:
+    """Eigenvalues of the kernel, largest first, as shares of its trace.
+
+    Gradient descent on squared error shrinks what is wrong along the i-th eigenvector as exp(-eta lambda_i t): what
+    lies along small eigenvalues is not learnt in any time that one would wait.
+    """
+    values = torch.linalg.eigvalsh(kernel).flip(0)
+    return values / values.sum()

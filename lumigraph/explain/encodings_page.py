@@ -1,4 +1,4 @@
-"""The page of `lumigraph explain encodings`: two charts, a sheet of pictures, and what they say."""
+"""The page of `lumigraph explain encodings`: two charts, a sheet of pictures, and their explanation."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ..evaluation.report import heading, jpeg, page, section
 from ..figures import Row, contact_sheet, save_picture
 from ..figures.charts import Series, line_chart, standalone
 from ..files import claim, write_bytes, write_json
-from .encodings import SCALED_ENCODINGS, Comparison, Fit
+from .encodings import SCALED_ENCODINGS, EncodingComparison, EncodingFit
 
 CROP, ENLARGEMENT = 96, 3  # pixels a side of the picture's middle, and how many times larger the sheet shows them
 CELL = CROP * ENLARGEMENT
 MIN_EIGENVALUE = 1e-10  # eigenvalue that is drawn, as a share of the trace
 
 
-def write_page(folder: Path, comparison: Comparison) -> None:
+def write_page(folder: Path, comparison: EncodingComparison) -> None:
     """Write index.html, which holds everything; and by themselves scales.svg, spectrum.svg, comparison.png and
     figures.json."""
     scales, spectrum, sheet = scale_chart(comparison), spectrum_chart(comparison), folder / "comparison.png"
@@ -43,7 +43,7 @@ def claim_page(folder: Path, overwrite: bool | None = None, reads: Iterable[Path
         claim(folder / name, "figure", overwrite, reads)
 
 
-def header(name: str, comparison: Comparison) -> str:
+def header(name: str, comparison: EncodingComparison) -> str:
     height, width = comparison.picture.shape[:2]
     sentence = (
         f"One network behind four encodings of where a pixel is: {comparison.steps} steps on half of "
@@ -53,12 +53,12 @@ def header(name: str, comparison: Comparison) -> str:
 
 
 def side_by_side(*charts: tuple[str, str]) -> str:
-    """Charts, each with what it says below."""
+    """Charts, each with a caption below."""
     figures = (f"<figure>{chart}<figcaption>{caption}</figcaption></figure>" for chart, caption in charts)
     return f"<div class='charts'>{''.join(figures)}</div>"
 
 
-def scale_chart(comparison: Comparison) -> str:
+def scale_chart(comparison: EncodingComparison) -> str:
     """PSNR over scales; an encoding without one is a level line."""
     scales = [fit.scale for fit in comparison.of("gaussian") if fit.scale is not None]
     series = []
@@ -71,7 +71,7 @@ def scale_chart(comparison: Comparison) -> str:
     return line_chart(series, "scale, cycles across the picture", "PSNR, dB", log_x=True, marks=True, smoothed=False)
 
 
-def spectrum_chart(comparison: Comparison) -> str:
+def spectrum_chart(comparison: EncodingComparison) -> str:
     """Eigenvalues in falling order, those that are not lost in rounding."""
     series = []
     for fit in shown(comparison):
@@ -82,7 +82,7 @@ def spectrum_chart(comparison: Comparison) -> str:
     )
 
 
-def comparison_sheet(comparison: Comparison):
+def comparison_sheet(comparison: EncodingComparison):
     """The picture and what networks make of it: all of it, and its middle pixel by pixel."""
     fits = shown(comparison)
     pictures = [comparison.picture, *(fit.rgb.clamp(0, 1) for fit in fits)]
@@ -93,7 +93,7 @@ def comparison_sheet(comparison: Comparison):
     return contact_sheet(title, columns, rows, CELL)
 
 
-def shown(comparison: Comparison) -> list[Fit]:
+def shown(comparison: EncodingComparison) -> list[EncodingFit]:
     """The best of each encoding, and Gaussian ones of the smallest and the largest scale."""
     smallest, *_, largest = comparison.of("gaussian")
     *others, best = comparison.leading
@@ -110,7 +110,7 @@ def middle(picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "tall wide
     return torch.repeat_interleave(torch.repeat_interleave(crop, ENLARGEMENT, 0), ENLARGEMENT, 1)
 
 
-def about_scales(comparison: Comparison) -> str:
+def about_scales(comparison: EncodingComparison) -> str:
     best = comparison.best("gaussian")
     where = "inside of the range" if comparison.peak_inside else "at the end of the range; give other --scales"
     return (

@@ -21,7 +21,7 @@ INSET_PIXELS = 400  # pixels of the small picture's longer side, at most
 
 
 @dataclass(frozen=True)
-class Pass:
+class RayPass:
     """One look along the ray, in the notation of Mildenhall 2020, eq. 3.
 
     start, end:    of each sample, in scene units from the camera
@@ -43,12 +43,12 @@ class Pass:
     so_far: Float[Tensor, "sample_plus_one 3"]
 
     @staticmethod
-    def of(look: Look, background: Float[Tensor, "1 3"]) -> Pass:
+    def of(look: Look, background: Float[Tensor, "1 3"]) -> RayPass:
         tau, weight = look.density * look.samples.length, weights_of(look.samples, look.density)
         T = torch.exp(-torch.nn.functional.pad(tau.cumsum(0), (1, 0)))
         colour = torch.nn.functional.pad((weight[:, None] * look.rgb).cumsum(0), (0, 0, 1, 0))
         columns = look.samples.t_start, look.samples.t_end, look.density, look.rgb, weight, T
-        return Pass(look.name, *(x.cpu() for x in (*columns, colour + T[:, None] * background)))
+        return RayPass(look.name, *(x.cpu() for x in (*columns, colour + T[:, None] * background)))
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -72,7 +72,7 @@ class Sight:
 
     camera: Camera
     pixel: tuple[int, int]
-    passes: list[Pass]
+    passes: list[RayPass]
     rgb: Float[Tensor, " 3"]
     depth: float
     opacity: float
@@ -128,9 +128,8 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
     width, height = camera.size[0].tolist()
     x, y = pixel
     if not (0 <= x < width and 0 <= y < height):
-        raise LumigraphError(
-            f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {width - 1} {height - 1}"
-        )
+        last = f"{width - 1} {height - 1}"
+        raise LumigraphError(f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {last}")
     rays = camera.rays(torch.tensor([[x + 0.5, y + 0.5]])).to(method.device)
     looks = needs(method, HasLooks).looks(rays)
     last = looks[-1]
@@ -143,7 +142,7 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
     return Sight(
         camera,
         pixel,
-        [Pass.of(look, method.background) for look in looks if len(look.samples)],
+        [RayPass.of(look, method.background) for look in looks if len(look.samples)],
         seen.rgb[0].cpu(),
         float(seen.depth),
         float(seen.opacity),

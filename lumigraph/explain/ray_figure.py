@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..figures import to_image
 from ..figures.charts import Axis, numbers, svg
-from .ray import Pass, Sight, triple
+from .ray import RayPass, Sight, triple
 
 WIDTH, LEFT, RIGHT = 988, 64, 700  # of the whole, and where the axis of distance begins and ends
 SIDE, RIGHT_EDGE = 730, 970  # of the column beside it
@@ -101,7 +101,7 @@ def density_axis(sight: Sight, bottom: float, top: float) -> Axis:
     return Axis(min(low, high - 1), high, bottom, top, log=True)
 
 
-def falling_light(each: Pass, x: Axis) -> list[tuple[float, float]]:
+def falling_light(each: RayPass, x: Axis) -> list[tuple[float, float]]:
     """Points of the transmittance's curve, which falls exponentially within each sample and nowhere else."""
     points = [(x.low, 1.0)]
     for i, (a, b, sigma) in enumerate(columns(each, "density")):
@@ -113,18 +113,18 @@ def falling_light(each: Pass, x: Axis) -> list[tuple[float, float]]:
     return [*points, (x.high, float(each.transmittance[-1]))]
 
 
-def columns(each: Pass, name: str) -> list[tuple[float, float, float]]:
+def columns(each: RayPass, name: str) -> list[tuple[float, float, float]]:
     """Beginning, end and a quantity of every sample."""
     return list(zip(each.start.tolist(), each.end.tolist(), getattr(each, name).tolist(), strict=True))
 
 
-def coloured(sight: Sight) -> list[tuple[Pass, str]]:
+def coloured(sight: Sight) -> list[tuple[RayPass, str]]:
     """Passes, and how their lines look: the last always in the first colour, and bold."""
     last = len(sight.passes) - 1
     return [(each, f"{'bold' if i == last else 'thin'} c{last - i}") for i, each in enumerate(sight.passes)]
 
 
-def called(each: Pass, sight: Sight) -> str:
+def called(each: RayPass, sight: Sight) -> str:
     return f"{each.name} sample" if len(sight.passes) > 1 else "sample"
 
 
@@ -151,7 +151,7 @@ def scale(y: Axis) -> str:
     return "".join(lines)
 
 
-def skyline(each: Pass, x: Axis, y: Axis, kind: str) -> str:
+def skyline(each: RayPass, x: Axis, y: Axis, kind: str) -> str:
     """Density, which is constant over each sample; down to the ground where there is none, or no sample."""
     d, before = "", None
     for a, b, value in columns(each, "density"):
@@ -167,8 +167,8 @@ def curve(points: list[tuple[float, float]], x: Axis, y: Axis, kind: str) -> str
     return f"<path class='{kind}' d='M{'L'.join(f'{x(a):.2f} {y(b):.2f}' for a, b in points)}'/>"
 
 
-def bar(x: Axis, y: Axis, i: int, each: Pass) -> str:
-    """A weight, which tells its numbers on hovering."""
+def bar(x: Axis, y: Axis, i: int, each: RayPass) -> str:
+    """A weight, with its numbers on hovering."""
     a, b, weight = columns(each, "weight")[i]
     return (
         f"<rect class='edge' x='{x(a):.2f}' y='{y(weight):.1f}' width='{x(b) - x(a):.2f}' "
@@ -182,7 +182,7 @@ def patch(x: Axis, top: float, begin: Tensor | float, end: Tensor | float, rgb: 
     return f"<rect class='patch' x='{a:.2f}' y='{top}' width='{b - a:.2f}' height='{STRIP}' fill='{hex_of(rgb)}'/>"
 
 
-def lane(each: Pass, x: Axis, top: float, kind: str) -> str:
+def lane(each: RayPass, x: Axis, top: float, kind: str) -> str:
     """A tick in the middle of each sample."""
     ticks = "".join(f"M{x((a + b) / 2):.2f} {top}v10" for a, b, _ in columns(each, "weight"))
     colour = kind.split()[-1]
@@ -196,10 +196,10 @@ def expected_depth(sight: Sight, x: Axis, spans: list[tuple[float, float]]) -> s
     if not math.isfinite(sight.depth):
         return ""
     at = x(sight.depth)
-    said = min(max(at, LEFT + 260), RIGHT - 70)
+    label = min(max(at, LEFT + 260), RIGHT - 70)
     return (
         f"<path class='depth' d='{''.join(f'M{at:.1f} {top - 4}V{bottom + 4}' for top, bottom in spans)}'/>"
-        f"<text class='label' x='{said:.1f}' y='{spans[0][0] - 9}' text-anchor='middle'>"
+        f"<text class='label' x='{label:.1f}' y='{spans[0][0] - 9}' text-anchor='middle'>"
         f"expected depth {sight.depth:.4g}</text>"
     )
 

@@ -5,24 +5,30 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Collection, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
+import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
 from ..camera import Camera
+from ..camera.rays import Rendering
+from ..components.fields.development import decoded
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..method.controls import Value
 from ..system.memory import ask_for_picture
 from ..system.progress import track
-from .exr import exr, light_of
 from .video import open_video
 
-PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, that tell the depths to expect
+PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, for the range of depth
 
 
 def film(
@@ -34,7 +40,7 @@ def film(
     light:  write the pictures' linear light as well, path/orbit/0000.exr
     For path/orbit.mp4 also writes path/orbit-depth.mp4, the pictures path/orbit/0000.png and 0000-depth.png, and
     path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads back to the capture's) and
-    what the method was told. Raises LumigraphError, before anything is rendered, if something else lies there.
+    the controls of the method. Raises LumigraphError, before anything is rendered, if something else lies there.
     """
     claim_film(path)
     shown = [method] * len(cameras) if isinstance(method, Method) else list(method)
@@ -70,8 +76,10 @@ def film(
         "lens": cameras.lens.to_json(),
         "poses": cameras.pose.tolist(),
         **({} if cameras.time is None else {"times": cameras.time.tolist()}),
-        **({"controls": told} if (told := what_was_told(shown)) else {}),
     }
+    controls = {name: [one.control(name) for one in shown] for name in shown[0].settings}
+    if controls:  # one value for all frames, or one for each where they differ
+        about["controls"] = {name: x[0] if len(set(x)) == 1 else x for name, x in controls.items()}
     write_json(path.with_suffix(".json"), about, "cameras of a film")
     return about
 
@@ -100,17 +108,30 @@ def animated(method: Method, stations: Mapping[str, Sequence[Value]], frames: in
     return [method.given(**{name: value[i] for name, value in values.items()}) for i in range(frames)]
 
 
-def what_was_told(methods: Sequence[Method]) -> dict[str, Value | list[Value]]:
-    """The values of controls that were told: one for all frames, or one for each where they differ."""
-    told = {name: [method.control(name) for method in methods] for name in methods[0].settings}
-    return {name: values[0] if len(set(values)) == 1 else values for name, values in told.items()}
-
-
 def film_depth_range(methods: Sequence[Method], cameras: Camera) -> Range:
     """One range for all frames, found from a few small ones, so that colours do not flicker."""
     probes = evenly(range(len(cameras)), PROBES)
     chosen = cameras[torch.tensor(probes)]
     small = chosen.resized(min(1.0, PROBE_SIZE / int(chosen.size.max())))
-    told = track(enumerate(probes), "Looking at depths", len(probes))
-    seen = [methods[frame].render(small[i]).cpu() for i, frame in told]
+    frames = track(enumerate(probes), "Measuring depths", len(probes))
+    seen = [methods[frame].render(small[i]).cpu() for i, frame in frames]
     return depth_range(torch.cat([x.depth.flatten() for x in seen]), torch.cat([x.opacity.flatten() for x in seen]))
+
+
+PIXEL_FORMAT = "gbrpf32le"  # planes of 32-bit floats
+
+
+def light_of(seen: Rendering) -> Float[Tensor, "height width 3"]:
+    """The linear light of a rendering, 1 for white: its own `radiance` where it has that, else its colours decoded."""
+    return seen.extra["radiance"] if "radiance" in seen.extra else decoded(seen.rgb.clamp(0, 1))
+
+
+def exr(light: Float[Tensor, "height width 3"]) -> bytes:
+    """The bytes of an OpenEXR file of linear sRGB as 32-bit floats, compressed without loss, by FFmpeg."""
+    pixels = np.ascontiguousarray(light.detach().cpu().numpy(), np.float32)
+    codec = av.CodecContext.create("exr", "w")
+    assert isinstance(codec, av.VideoCodecContext)
+    codec.height, codec.width = pixels.shape[:2]
+    codec.pix_fmt, codec.time_base, codec.options = PIXEL_FORMAT, Fraction(1), {"compression": "zip16"}
+    frame = av.VideoFrame.from_ndarray(pixels, format=PIXEL_FORMAT)
+    return b"".join(bytes(packet) for packet in [*codec.encode(frame), *codec.encode(None)])

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..camera import Camera
-from ..camera.crop import Box, Crop
+from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..depth_maps import TSDF, DepthMap, Tolerance, fused_colours, hidden, render_depth_maps
@@ -22,17 +22,16 @@ from ..errors import LumigraphError
 from ..method import Method
 from ..method.capabilities import HasDensity, can, needs
 from ..system.progress import counting, track
-from .polygons import BLOCK, Grid, zero_level
-from .surface import larger_pieces, simplified, smoothed, vertex_normals
+from .surface import BLOCK, Faces, Grid, Vertices, larger_pieces, simplified, smoothed, vertex_normals, zero_level
 
-DEFAULT_CELLS = 256  # along the longest side of what is meshed, if nobody asks for more
-OPEN_BOX = 1.5  # times the box of interest, which holds the middle of what is looked at in a room or the open
+DEFAULT_CELLS = 256  # default, along the longest side of the box
+OPEN_BOX = 1.5  # times the box of interest, for rooms and open scenes
 MIN_CELLS, MAX_CELLS = 8, 2048  # cells along it that make sense
-PROBE_CELLS = 160  # looks along it that tell where the surface may be
+PROBE_CELLS = 160  # probes along it that locate the surface
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
 TRUNCATION_CELLS = 5  # cells from the surface that depth maps are fused over
 INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
-ONSET_SHARE = 0.2  # share of a ray's light that is spent where the surface is said to be
+ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
 
 Way = Literal["auto", "density", "depth"]
@@ -104,7 +103,7 @@ def extract_mesh(
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
 
 
-def meshed_box(frame: Frame, times: float | None) -> Box:
+def meshed_box(frame: Frame, times: float | None) -> CropBox:
     """The frame's box of interest, larger or smaller about its middle, within the cube that holds everything."""
     low, high = torch.tensor(frame.bounds)
     half = 0.5 * (high - low) * ((1.0 if not frame.is_open else OPEN_BOX) if times is None else times)
@@ -112,22 +111,22 @@ def meshed_box(frame: Frame, times: float | None) -> Box:
     return upright(torch.stack([middle - half, middle + half]).clamp(-frame.reach, frame.reach))
 
 
-def within_reach(frame: Frame, crop: Crop) -> Box:
+def within_reach(frame: Frame, crop: Crop) -> CropBox:
     """The upright box around a crop, within the cube that holds everything. Raises LumigraphError for one outside."""
     corners = torch.tensor(crop.bounds).clamp(-frame.reach, frame.reach)
     if not (corners[1] > corners[0]).all():
         raise LumigraphError(
-            "The crop lies outside the scene, so there is nothing to mesh; `lumigraph info` tells the scene's bounds"
+            "The crop lies outside the scene, so there is nothing to mesh; `lumigraph info` shows the scene's bounds"
         )
     return upright(corners)
 
 
-def upright(corners: Float[Tensor, "2 3"]) -> Box:
+def upright(corners: Float[Tensor, "2 3"]) -> CropBox:
     (a, b, c), (d, e, f) = corners.tolist()
-    return Box((a, b, c), (d, e, f))
+    return CropBox((a, b, c), (d, e, f))
 
 
-def make_grid(box: Box, cell: float | None) -> Grid:
+def make_grid(box: CropBox, cell: float | None) -> Grid:
     """Cubes over a box and a little around it. Raises LumigraphError for cubes too small or too large."""
     longest = max(b - a for a, b in zip(box.lower, box.upper, strict=True))
     if cell is None:
@@ -162,8 +161,8 @@ def from_density(method: Method, level: float, depth: Value) -> Value:
     """A function of points: 0 where the density is at its level, 1 well inside, -1 well outside.
 
     It is the logarithm that counts, for it changes evenly where the density itself grows by orders of magnitude within
-    a cell. Farther from the surface that the cameras see than a few cells their word counts: so there are no caves
-    inside of things, where nothing taught the field to be solid, and no mist that all see through.
+    a cell. Farther than a few cells from the surface that the cameras see, their depth decides. This
+    removes cavities inside objects, where the field had no supervision, and transparent mist.
     """
     inward, outward = INWARD_CELLS / TRUNCATION_CELLS, OUTWARD_CELLS / TRUNCATION_CELLS
 
@@ -176,10 +175,10 @@ def from_density(method: Method, level: float, depth: Value) -> Value:
 
 
 def surface_level(method: Method, depth_maps: Sequence[DepthMap], holds: Holds) -> float:
-    """The density where rays begin to end, found from the field itself, whatever its units and however sharp it is.
+    """The density where rays begin to end, found from the field itself, for any unit and sharpness.
 
     At the rendered depth half of a ray's light is spent; the median density there is known. But fields begin at the
-    surface and grow behind it, where nothing tells them not to. On a ramp that grows exponentially the optical
+    surface and grow behind it, where it has no supervision. On a ramp that grows exponentially the optical
     thickness so far is proportional to the density, so a share q is spent where it is log(1 - q) / log(1 / 2) as large.
     """
     found = torch.cat([x.positions(x.solid & (x.opacity > 0.9) & (x.facing > 0.3)) for x in depth_maps])
@@ -203,7 +202,7 @@ def at_probes(value: Value, grid: Grid, step: int) -> Float[Tensor, "i j k"]:
 
 
 def interpolated(value: Value, grid: Grid, step: int) -> Value:
-    """A function that is asked at probes alone, and interpolated between them."""
+    """A function that is evaluated at probes only, and interpolated between them."""
     probed = at_probes(value, grid, step)
     low, span = torch.tensor(grid.low), step * grid.cell * (torch.tensor(probed.shape) - 1)
 
@@ -214,10 +213,8 @@ def interpolated(value: Value, grid: Grid, step: int) -> Value:
     return between
 
 
-def find_surface(
-    grid: Grid, step: int, holds: Holds, value: Value, beyond: float
-) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
-    """From coarse to fine: probes tell which blocks the surface may pass through, and those are marched through.
+def find_surface(grid: Grid, step: int, holds: Holds, value: Value, beyond: float) -> tuple[Vertices, Faces]:
+    """From coarse to fine: probes find the blocks that the surface may pass through, and those are marched through.
 
     step:   corners of the grid from one probe to the next
     holds:  which points are inside what is meshed

@@ -1,4 +1,5 @@
-"""A page to share: one HTML file that opens from disk, with the scene and the program that draws it inside.
+"""A page to share: one HTML file that opens from disk, with the scene and the program that draws it inside. For open
+scenes it also has a backdrop: colours of unobserved directions, from the scene's own, and the floor as camera limit.
 
 The programs in web/ are built from the folder `web` of the repository (three.js and Spark for clouds, three.js for
 meshes and volumes, neither for pictures). They are compressed into the page, and so is what they show.
@@ -29,22 +30,87 @@ from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..exchange import spz
-from ..exchange.baked.browser import Browsable
+from ..exchange.baked import Browsable
 from ..figures import to_bytes
 from ..files import write_bytes
 from ..gaussians import Gaussians
+from ..geometry import evenly
 from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
 from ..system.progress import counting, track
-from .backdrop import Backdrop
+
+BACKDROP_VIEWS, BACKDROP_SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
+MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
+HORIZON_BAND = math.sin(math.radians(10))  # of the horizon, above and below
+MIN_SEEN_SHARE = 0.02  # share of pixels from which on something counts as seen
+HAZE_SHARE, SKY_SHARE = 0.5, 0.5  # of the way to white, where no photograph shows a horizon or a sky
+MAX_SHARE_BELOW_FLOOR = 0.02  # share of the surfaces in the box of interest that may lie below the floor
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """sRGB-encoded colours overhead, at the horizon and underfoot; and the height of the floor, in scene units."""
+
+    overhead: Vector
+    horizon: Vector
+    underfoot: Vector
+    floor: float
+
+
+@torch.no_grad()
+def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
+    """Colours of sky, horizon and ground from some of the photographs' cameras.
+
+    `None` for an object, and for a scene that is not opaque: its background belongs to the picture.
+    """
+    frame = method.frame
+    if frame.has_alpha or not frame.is_open:
+        return None
+    colours, heights, opacities, places = [], [], [], []
+    for i in evenly(range(len(cameras)), BACKDROP_VIEWS):
+        camera = cameras[i].to("cpu")
+        camera = camera.resized(min(1.0, BACKDROP_SIZE / int(camera.size.max())))
+        seen, rays = method.render(camera), camera.rays(camera.pixels())
+        depth = seen.depth.reshape(-1).cpu()
+        solid = depth.isfinite()
+        colours.append(seen.rgb.reshape(-1, 3).cpu().clamp(0, 1))
+        heights.append(rays.directions[:, 2])
+        opacities.append(seen.opacity.reshape(-1).cpu())
+        places.append((rays.origins + depth[:, None] * rays.directions)[solid & (opacities[-1] > 0.5)])
+    if (torch.cat(opacities) > 0.5).float().mean() < MIN_OPAQUE_SHARE:
+        return None
+    rgb, height, place = torch.cat(colours), torch.cat(heights), torch.cat(places)
+    everything = torch.ones_like(height, dtype=torch.bool)
+    underfoot = median(rgb, height < -HORIZON_BAND) or median(rgb, everything) or frame.background
+    horizon = median(rgb, height.abs() < HORIZON_BAND) or lighter(underfoot, HAZE_SHARE)
+    overhead = median(rgb, height > HORIZON_BAND) or lighter(horizon, SKY_SHARE)
+    return Backdrop(overhead, horizon, underfoot, floor(place, torch.tensor(frame.bounds)))
+
+
+def median(rgb: Float[Tensor, "pixel 3"], chosen: Tensor) -> Vector | None:
+    """The colour in the middle of the chosen ones, channel by channel; None where they are few."""
+    if chosen.float().mean() < MIN_SEEN_SHARE:
+        return None
+    red, green, blue = rgb[chosen].median(0).values.tolist()
+    return red, green, blue
+
+
+def lighter(colour: Vector, share: float) -> Vector:
+    red, green, blue = (value + share * (1 - value) for value in colour)
+    return red, green, blue
+
+
+def floor(places: Float[Tensor, "point 3"], bounds: Float[Tensor, "2 3"]) -> float:
+    """The height that nearly all surfaces above or below the box of interest's middle are above."""
+    low, high = bounds
+    near = places[((places >= low) & (places <= high))[:, :2].all(-1)]
+    return float(near[:, 2].quantile(MAX_SHARE_BELOW_FLOOR)) if len(near) else float(low[2])
+
 
 WEB = Path(__file__).parent / "web"
-MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
+MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # limits of zooming, times the first distance to the target
 MAX_OPEN_DISTANCE = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
-DEGREES_BELOW, DEGREES_BELOW_OPEN = (
-    20.0,
-    5.0,
-)  # degrees below the lowest photograph that the camera may go, also under the open sky
+DEGREES_BELOW, DEGREES_BELOW_OPEN = 20.0, 5.0  # limit of the camera below the lowest photograph; for open scenes
 ARC_SHARE = 0.8  # of the arc that photographs cover is shown
 HARMONICS_STEPS = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 MAX_CROP_SCALE = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
@@ -60,7 +126,7 @@ class Opening:
     """Camera, limits and colours with which a page begins: lengths in scene units, angles in degrees.
 
     background: colour behind everything, sRGB in [0, 1]
-    position, target: where the camera stands, and what it looks at and turns about
+    position, target: of the camera, and the point that it looks at and turns about
     angle:      of view, across the window's smaller side
     near, far:  distances along the optical axis between which the scene is drawn
     nearest, farthest: distances from the target that zooming keeps to
@@ -88,13 +154,9 @@ class Opening:
 
 
 def opening_of_scene(
-    title: str,
-    cameras: Camera,
-    frame: Frame,
-    background: Vector | None = None,
-    behind: Backdrop | None = None,
+    title: str, cameras: Camera, frame: Frame, background: Vector | None = None, behind: Backdrop | None = None
 ) -> Opening:
-    """An opening from where photographs were typically taken, looking at what they look at.
+    """An opening from a typical position of the photographs, in their viewing direction.
 
     cameras:    of the photographs
     background: instead of the frame's
@@ -132,7 +194,7 @@ def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
     settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
     with counting(f"Packing {len(gaussians):,} Gaussians"):
         packed = spz.gzipped(gaussians, steps=HARMONICS_STEPS)
-    write_page(path, "splats", settings, packed)
+    write_bytes(path, page_bytes("splats", settings, packed), "page")
 
 
 def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
@@ -143,11 +205,11 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
     data = mesh.faces.astype("<u4").tobytes() + steps.tobytes() + mesh.colours.tobytes()
     held = {"vertices": len(steps), "faces": len(mesh.faces), "low": low.tolist(), "high": (low + size).tolist()}
     settings = asdict(opening) | {"webgl": True, "packed": True} | held
-    write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0))
+    write_bytes(path, page_bytes("mesh", settings, gzip.compress(data, 9, mtime=0)), "page")
 
 
 def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
-    """A baked volume in the scene's frame, which a browser's graphics look at along the ray of each pixel.
+    """A baked volume in the scene's frame, which the browser marches along the ray of each pixel.
 
     Raises LumigraphError if the page would have MAX_PAGE_BYTES bytes or more.
     """
@@ -191,7 +253,7 @@ def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, co
         "pictures": list(zip(ends[:-1], ends[1:], strict=True)),
         "poses": seen_from.pose.tolist(),
     }
-    write_page(path, "views", settings, b"".join(pictures))
+    write_bytes(path, page_bytes("views", settings, b"".join(pictures)), "page")
 
 
 def views(around: Surroundings, count: int, size: tuple[int, int]) -> Camera:
@@ -210,13 +272,8 @@ def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
     return held.getvalue()
 
 
-def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) -> None:
-    """Put a program of web/, its settings and its data into the page."""
-    write_bytes(path, page_bytes(program, settings, data), "page")
-
-
 def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
-    """Bytes of the page of `write_page`."""
+    """A page with a program of web/, its settings and its data."""
     mouse, touch = ORBIT_HELP if settings["inward"] else LOOK_HELP
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")

@@ -2,6 +2,10 @@
 
 Methods that follow every lens render it as it is, ray by ray. Gaussians are seen on flat pictures only, so the sphere
 is put together from many small ones, each rendered for a few columns and a band of rows and read between its pixels.
+
+Omnidirectional stereo is a panorama for each eye. All around, the rays of both eyes leave a level circle along its
+tangents (`lens.OmnidirectionalStereo`; Peleg 2001), so the eyes are side by side in every direction. At the poles depth
+fades.
 """
 
 from __future__ import annotations
@@ -16,9 +20,10 @@ import torch
 from jaxtyping import Float, Int
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from ..camera import Camera
-from ..camera.lens import Equirectangular, Pinhole
+from ..camera.lens import Equirectangular, OmnidirectionalStereo, Pinhole
 from ..camera.rays import Rendering
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
@@ -30,7 +35,7 @@ from ..paths import Surroundings
 from ..system.memory import ask_for_picture
 from ..system.progress import track
 
-PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two looks at the progress
+PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two updates of the progress bar
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
 COLUMNS = 8  # flat pictures around the horizon, where one place sees all
 OVERSAMPLING = 1.25  # pixels of a flat picture's middle for one of the panorama's equator
@@ -39,9 +44,10 @@ JPEG_QUALITY = 95
 MIN_WIDTH, MAX_WIDTH = 64, 16_384  # pixels
 
 Vector = tuple[float, float, float]
+Point = Float[Tensor, " 3"]  # or a direction, in the scene's frame
 
 
-def panorama(method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], width: int) -> Rendering:
+def panorama(method: Method, place: Point, heading: Point, width: int) -> Rendering:
     """Panorama from a point in the scene's frame, (width / 2, width) pixels; up is +z.
 
     heading: direction of the middle column, made level
@@ -106,7 +112,7 @@ def fading(
 def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camera, Float[Tensor, "pixel 2"]]:
     """A pinhole camera that looks where some neighbouring pixels of a sphere look, and where on its picture they are.
 
-    It stands where the ray in the middle of them begins.
+    Its position is the origin of the ray in the middle of them.
     """
     assert isinstance(camera.lens, Equirectangular)
     middle = (pixels.amin(0) + pixels.amax(0))[None] / 2
@@ -130,9 +136,7 @@ def read(
     """Values of a picture at places (x, y) of it."""
     height, width = picture.shape[:2]
     share = 2 * at / torch.tensor([width, height]) - 1
-    found = torch.nn.functional.grid_sample(
-        picture.permute(2, 0, 1)[None], share[None, None], how, "border", align_corners=False
-    )
+    found = grid_sample(picture.permute(2, 0, 1)[None], share[None, None], how, "border", align_corners=False)
     return found[0, :, 0].T
 
 
@@ -152,8 +156,8 @@ def sphere_size(width: int) -> Float[Tensor, "1 2"]:
     return torch.tensor([[width, width / 2]])
 
 
-def level_camera(place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], lens: Equirectangular) -> Camera:
-    """A camera that stands upright and faces a heading."""
+def level_camera(place: Point, heading: Point, lens: Equirectangular) -> Camera:
+    """An upright camera that faces a heading."""
     level = torch.stack([heading[0], heading[1], torch.zeros_like(heading[0])])
     pose = look_at(place[None], level[None], torch.tensor([0.0, 0.0, 1.0]))
     return Camera(pose, lens, lens.size.long())
@@ -173,7 +177,7 @@ def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> t
     else:
         given = torch.tensor(source, dtype=torch.double)
         if not given.isfinite().all():
-            raise LumigraphError("Nobody can stand at a place that is not finite; give --from three numbers")
+            raise LumigraphError("A position that is not finite has no panorama; give --from three numbers")
         place = frame.to_source.inverse.points(given)
         words = "as asked"
     heading = around.axes[0] if not around.inward else around.focus - place - 1e-6 * around.axes[0]
@@ -183,7 +187,7 @@ def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> t
 def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -> None:
     """Write a PNG or a JPEG, whole or not at all.
 
-    whole: whether this is one panorama, which then says so in its metadata (Google's GPano), so that viewers show it
+    whole: whether this is one panorama, which is declared in its metadata (Google's GPano), so that viewers show it
            as a sphere
     Raises LumigraphError for another ending.
     """
@@ -202,7 +206,7 @@ def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -
 
 
 def picture_format(path: Path) -> str:
-    """Pillow's name for what an ending stands for."""
+    """Pillow's name of the format of an ending."""
     found = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}.get(path.suffix.lower())
     if found is None:
         raise LumigraphError(f"{path} should end in .png or .jpg, the kinds of picture there are; rename it")
@@ -223,13 +227,70 @@ def gpano(width: int, height: int) -> str:
         "PosePitchDegrees": 0,
         "PoseRollDegrees": 0,
     }
-    said = "\n".join(f"   <GPano:{name}>{value}</GPano:{name}>" for name, value in numbers.items())
+    tags = "\n".join(f"   <GPano:{name}>{value}</GPano:{name}>" for name, value in numbers.items())
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
         '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
         ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
         '  <rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/">\n'
-        f"{said}\n"
+        f"{tags}\n"
         "  </rdf:Description>\n </rdf:RDF>\n</x:xmpmeta>\n"
         '<?xpacket end="r"?>'
     )
+
+
+EYE_DISTANCE_SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
+PROBE_SIZE = 256  # pixels of the small panorama for distances
+MAX_SHIFT_PIXELS = 0.1  # pixels by which a flat picture may be off at its edge, at what is near
+MAX_COLUMNS = 32
+MIN_OPACITY = 0.5  # opacity from which on something is there
+
+
+def stereo_pair(
+    method: Method, place: Point, heading: Point, width: int, interpupillary: float, nearest: float
+) -> tuple[Rendering, Rendering]:
+    """Panoramas of the left and the right eye, (width / 2, width) pixels each; up is +z.
+
+    place:          the middle between the eyes, in the scene's frame
+    interpupillary: the distance between them, scene units
+    nearest:        distance to near surfaces, scene units; smaller needs more flat pictures
+    """
+    columns = columns_at_once(interpupillary / 2, nearest)
+    eyes = []
+    for name, side in (("Left eye", -0.5), ("Right eye", 0.5)):
+        offset = torch.tensor([[side * interpupillary]])
+        camera = level_camera(place, heading, OmnidirectionalStereo(sphere_size(width), offset=offset))
+        eyes.append(sphere(method, camera, name, columns))
+    return eyes[0], eyes[1]
+
+
+def top_bottom(left: Rendering, right: Rendering) -> Float[Tensor, "height width 3"]:
+    """The pair as one square picture, the left eye on top."""
+    return torch.cat([left.rgb, right.rgb])
+
+
+def surrounding_distances(method: Method, place: Point, heading: Point) -> tuple[float, float]:
+    """Near (2nd percentile) and median distance of surfaces around a point, scene units.
+
+    Directions are weighted by solid angle. Raises LumigraphError if no surface is around.
+    """
+    seen = sphere(method, level_camera(place, heading, Equirectangular(sphere_size(PROBE_SIZE))), "Looking around")
+    rows = torch.arange(PROBE_SIZE // 2) + 0.5
+    weight = torch.sin(torch.pi * rows / len(rows))[:, None].expand_as(seen.depth)
+    solid = (seen.opacity > MIN_OPACITY) & seen.depth.isfinite()
+    if not solid.any():
+        raise LumigraphError("Nothing is around that place; give --from another one, or --interpupillary")
+    depth, order = seen.depth[solid].sort()
+    share = weight[solid][order].cumsum(0)
+    near, middle = (depth[int(torch.searchsorted(share, q * share[-1]))].item() for q in (0.02, 0.5))
+    return near, middle
+
+
+def columns_at_once(radius: float, nearest: float) -> int:
+    """Largest number of columns that one flat picture may have.
+
+    Its camera is at the origin of the middle column's rays. Rays of a column k / 2 away begin k / 2 pixels' angle
+    further along the circle, which is ahead or behind by r k / 2 pixels' angle: points at a distance d and high up are
+    off by up to r k / (2 d) pixels.
+    """
+    return max(1, min(MAX_COLUMNS, int(2 * MAX_SHIFT_PIXELS * nearest / max(radius, 1e-9))))

@@ -20,7 +20,7 @@ from ..files import replacing
 from ..method import Method
 from ..system.progress import counting, track
 
-CANDIDATES_PER_POINT = 4  # as many pixels are looked at as points are wanted, times this
+CANDIDATES_PER_POINT = 4  # pixels that are considered for each point
 MIN_COSINE = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
 DEPTH_TOLERANCE = 0.01  # of the distance from the camera: depths that agree
 MIN_VIEWS = 2  # further cameras that must see a surface at the same place, where there are so many
@@ -28,7 +28,7 @@ MIN_VIEWS = 2  # further cameras that must see a surface at the same place, wher
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points of surfaces, in the frame that whoever made them says.
+    """Points of surfaces, in the frame of their maker: scene or source.
 
     normals: unit length, towards the cameras
     colours: sRGB-encoded
@@ -47,12 +47,7 @@ class PointCloud:
 
 @torch.no_grad()
 def extract_points(
-    method: Method,
-    cameras: Camera,
-    count: int = 200_000,
-    size: int = 400,
-    views: int = 64,
-    crop: Crop | None = None,
+    method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64, crop: Crop | None = None
 ) -> PointCloud:
     """At most `count` points in the scene's frame, spread evenly over what the cameras see.
 

@@ -1,27 +1,175 @@
-"""Postprocessing of triangle meshes: removal of small pieces, smoothing, simplification."""
+"""Marching cubes in blocks, only where the zero level can be (Lorensen and Cline 1987); and postprocessing of triangle
+meshes: removal of small pieces, smoothing, simplification.
+
+The topology of ambiguous cubes is that of Lewiner et al. (2003), from scikit-image.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import fast_simplification
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+from torch import Tensor
 
-from .polygons import compact
+from ..system.progress import track
+
+BLOCK = 16  # corners of a block along each axis
+BLOCKS_PER_BATCH = 64  # blocks whose corners are evaluated together
+MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
+
+Vertices = Float[np.ndarray, "vertex 3"]
+Faces = Int[np.ndarray, "face 3"]
+Values = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Corners of cubes: number (i, j, k) lies at low + cell (i, j, k).
+
+    low:   scene units
+    cell:  side of a cube, scene units
+    shape: corners along each axis
+    """
+
+    low: tuple[float, float, float]
+    cell: float
+    shape: tuple[int, int, int]
+
+    @staticmethod
+    def around(low: tuple[float, ...], high: tuple[float, ...], cell: float, margin: float) -> Grid:
+        """The grid whose cubes cover a box and a margin of that many cubes around it."""
+        first = np.array(low) - margin * cell
+        corners = np.ceil((np.array(high) - np.array(low)) / cell - 1e-6 + 2 * margin).astype(int) + 1
+        x, y, z = first.tolist()
+        i, j, k = corners.tolist()
+        return Grid((x, y, z), cell, (i, j, k))
+
+    def points(self, corners: Int[Tensor, "corner 3"]) -> Float[Tensor, "corner 3"]:
+        return torch.tensor(self.low) + self.cell * corners.float()
+
+    def every(self, step: int) -> Int[Tensor, "i j k 3"]:
+        """Each step-th corner along each axis, one beyond the last included."""
+        ranges = [torch.arange(0, n + step, step) for n in self.shape]
+        return torch.stack(torch.meshgrid(*ranges, indexing="ij"), -1)
+
+
+def zero_level(
+    grid: Grid, values: Values, active: Bool[np.ndarray, "i j k"], elsewhere: Float[np.ndarray, "i j k"]
+) -> tuple[Vertices, Faces]:
+    """Triangles where a function is zero, anticlockwise seen from where it is negative; vertices in scene units.
+
+    values:    the function, about -1 to 1; NaN where it is unknown, where the surface has a border
+    active:    blocks of BLOCK^3 corners to evaluate; each corner once
+    elsewhere: value of all corners of the other blocks
+    """
+    held = np.full(active.shape, -1)
+    where = np.argwhere(active)
+    held[active] = np.arange(len(where))
+    blocks = evaluate(grid, values, where)
+    held, elsewhere = np.pad(held, (0, 1), constant_values=-1), np.pad(elsewhere, (0, 1), constant_values=np.nan)
+    keys, places, faces, count = [], [], [], 0
+    marched = np.argwhere(touched(active))
+    for block in track(marched, "Marching through cubes", len(marched)):
+        cube = with_neighbours(block, blocks, held, elsewhere)
+        known = np.isfinite(cube)
+        cube = np.where(known, cube, -1.0)
+        if not cube.min() < 0 < cube.max():
+            continue
+        vertices, triangles, _, _ = marching_cubes(cube, 0.0, gradient_direction="ascent")
+        key, sure = edges(vertices, known)
+        keys.append(key + (block * BLOCK) @ STRIDES)
+        places.append(vertices + block * BLOCK)
+        faces.append(triangles[sure[triangles].all(-1)] + count)
+        count += len(vertices)
+    if not count:
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    _, first, same = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
+    vertices = np.array(grid.low) + grid.cell * np.concatenate(places)[first].astype(np.float64)
+    return compact(vertices, same[np.concatenate(faces)])
+
+
+def evaluate(
+    grid: Grid, values: Values, where: Int[np.ndarray, "block 3"]
+) -> Float[np.ndarray, "block BLOCK BLOCK BLOCK"]:
+    """The function at all corners of some blocks, never nearer to zero than MIN_ABS_VALUE."""
+    inside = torch.from_numpy(np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3))
+    out = np.empty((len(where), BLOCK, BLOCK, BLOCK), np.float32)
+    batches = range(0, len(where), BLOCKS_PER_BATCH)
+    for first in track(batches, "Looking at cells near the surface", len(batches)):
+        some = torch.from_numpy(where[first : first + BLOCKS_PER_BATCH])
+        corners = (some[:, None] * BLOCK + inside).reshape(-1, 3)
+        out[first : first + len(some)] = values(grid.points(corners)).reshape(-1, BLOCK, BLOCK, BLOCK).numpy()
+    return np.where(np.abs(out) < MIN_ABS_VALUE, np.where(out < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), out)
+
+
+def touched(active: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
+    """Blocks whose cubes have a corner in an active block: these, and their neighbours on the lower sides."""
+    out = active.copy()
+    for axis in range(3):
+        ahead = np.roll(out, -1, axis)
+        ahead[(slice(None),) * axis + (-1,)] = False
+        out |= ahead
+    return out
+
+
+def with_neighbours(
+    block: Int[np.ndarray, " 3"],
+    blocks: Float[np.ndarray, "block BLOCK BLOCK BLOCK"],
+    held: Int[np.ndarray, "i j k"],
+    elsewhere: Float[np.ndarray, "i j k"],
+) -> Float[np.ndarray, "side side side"]:
+    """A block's corners, and the first ones of its neighbours on the upper sides."""
+    cube = np.empty((BLOCK + 1,) * 3, np.float32)
+    for step in np.ndindex(2, 2, 2):
+        target = tuple(slice(BLOCK, BLOCK + 1) if s else slice(0, BLOCK) for s in step)
+        part = tuple(slice(0, 1) if s else slice(0, BLOCK) for s in step)
+        x, y, z = block + step
+        cube[target] = blocks[held[x, y, z]][part] if held[x, y, z] >= 0 else elsewhere[x, y, z]
+    return cube
+
+
+# of a key: 20 bits an axis, 4 for the direction, 3 in a cube's middle
+STRIDES = np.array([1 << 44, 1 << 24, 1 << 4], np.int64)
+
+
+def edges(
+    vertices: Vertices, known: Bool[np.ndarray, "side side side"]
+) -> tuple[Int[np.ndarray, " vertex"], Bool[np.ndarray, " vertex"]]:
+    """A number for the grid's edge that each vertex lies on, and whether the function is known at its ends.
+
+    Neighbouring blocks find the same vertex to the last bits but one; its edge is the same to the last.
+    """
+    nearest = np.rint(vertices)
+    between = np.abs(vertices - nearest) > 0.4 * MIN_ABS_VALUE
+    corner = np.where(between, np.floor(vertices), nearest).astype(np.int64)
+    kind = np.where(between.sum(-1) == 1, between.argmax(-1), 3)
+    sure = np.ones(len(vertices), bool)
+    for step in np.ndindex(2, 2, 2):
+        x, y, z = (corner + np.where(between, step, 0)).T
+        sure &= known[x, y, z]
+    return corner @ STRIDES + kind, sure
+
+
+def compact(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "used 3"], Faces]:
+    """A mesh without the vertices that no face has."""
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
 
 LAMBDA, MU = 0.5, -0.53  # of Taubin's two steps: the second undoes the first one's shrinking
 
 Triangles = tuple[Float[np.ndarray, "some 3"], Int[np.ndarray, "few 3"]]
 
 
-def larger_pieces(
-    vertices: Float[np.ndarray, "vertex 3"],
-    faces: Int[np.ndarray, "face 3"],
-    share: float,
-    seen: Bool[np.ndarray, " vertex"],
-) -> Triangles:
-    """The mesh without connected pieces whose area is less than a share of the largest one's, or that nobody sees."""
+def larger_pieces(vertices: Vertices, faces: Faces, share: float, seen: Bool[np.ndarray, " vertex"]) -> Triangles:
+    """The mesh without connected pieces whose area is less than a share of the largest one's, or unseen."""
     _, piece = connected_components(adjacency(len(vertices), faces), directed=False)
     areas = np.bincount(piece[faces[:, 0]], np.linalg.norm(face_normals(vertices, faces), axis=-1), piece.max() + 1)
     visible = np.bincount(piece[seen], minlength=len(areas)) > 0
@@ -30,9 +178,7 @@ def larger_pieces(
     return compact(vertices, faces[keep[piece[faces[:, 0]]]])
 
 
-def smoothed(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], times: int
-) -> Float[np.ndarray, "vertex 3"]:
+def smoothed(vertices: Vertices, faces: Faces, times: int) -> Vertices:
     """Vertices moved towards the mean of their neighbours and back again (Taubin 1995). Borders stay where they are."""
     if not times:
         return vertices
@@ -46,34 +192,29 @@ def smoothed(
     return vertices
 
 
-def simplified(vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], count: int) -> Triangles:
+def simplified(vertices: Vertices, faces: Faces, count: int) -> Triangles:
     """A mesh of about so many faces, kept where they matter most to the shape (Garland and Heckbert 1997)."""
     if len(faces) <= count:
         return vertices, faces
-    fewer, triangles = fast_simplification.simplify(
-        vertices.astype(np.float64), faces.astype(np.int32), target_count=count
-    )[:2]
+    pair = vertices.astype(np.float64), faces.astype(np.int32)
+    fewer, triangles = fast_simplification.simplify(*pair, target_count=count)[:2]
     return compact(np.asarray(fewer, np.float64), np.asarray(triangles, np.int64))
 
 
-def vertex_normals(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
-) -> Float[np.ndarray, "vertex 3"]:
+def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
     """Unit normals: the sum of those of the faces around, by area; zero where they cancel."""
     across = face_normals(vertices, faces)
     total = np.stack([np.bincount(faces.ravel(), np.repeat(across[:, k], 3), len(vertices)) for k in range(3)], -1)
     return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-30)
 
 
-def face_normals(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
-) -> Float[np.ndarray, "face 3"]:
+def face_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "face 3"]:
     """Normals of faces: outward, as long as twice the area."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     return np.cross(b - a, c - a)
 
 
-def adjacency(count: int, faces: Int[np.ndarray, "face 3"]) -> sparse.csr_array:
+def adjacency(count: int, faces: Faces) -> sparse.csr_array:
     """Adjacency matrix of vertices: 1 for each shared edge, symmetric."""
     a, b = np.concatenate([faces, np.roll(faces, 1, 1)]).ravel(), np.concatenate([np.roll(faces, 1, 1), faces]).ravel()
     matrix = sparse.coo_array((np.ones(len(a)), (a, b)), (count, count)).tocsr()
@@ -81,7 +222,7 @@ def adjacency(count: int, faces: Int[np.ndarray, "face 3"]) -> sparse.csr_array:
     return matrix
 
 
-def border(faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, " vertex"]:
+def border(faces: Faces) -> Int[np.ndarray, " vertex"]:
     """The vertices of edges that only one face has."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1).astype(np.int64)
     found, count = np.unique(edges[:, 0] << 32 | edges[:, 1], return_counts=True)

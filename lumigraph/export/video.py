@@ -1,4 +1,4 @@
-"""Films, their kind said by their ending: H.264 in MP4, which plays everywhere; GIF and WebP, moving pictures."""
+"""Films, with the format of their ending: H.264 in MP4, which plays everywhere; GIF and WebP, moving pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..system.progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
 WEBP_QUALITY = 85  # of 100
-GIF_COLOURS = 255  # of a GIF; its 256th says "as before"
+GIF_COLOURS = 255  # of a GIF; its 256th means "as before"
 PALETTE_SAMPLES = 400_000  # pixels of all frames together that choose a GIF's colours
 MAX_GIF_FPS = 50  # per second, of a GIF: browsers slow quicker ones down to 10
 
@@ -70,6 +70,7 @@ class Video(ABC):
     def __init__(self, path: Path, container: OutputContainer, fps: Fraction, stack: contextlib.ExitStack):
         self.path, self.container, self.fps, self.stack = path, container, fps, stack
         self.size: tuple[int, int] | None = None  # width, height
+        self.codec: VideoStream
 
     def add(self, frame: UInt8[Tensor, "height width 3"]) -> None:
         """A frame in sRGB bytes."""
@@ -100,13 +101,14 @@ class Video(ABC):
 
     @abstractmethod
     def begin(self) -> None:
-        """Called once, when the size is known."""
+        """Make the stream `codec`. Called once, when the size is known."""
 
     @abstractmethod
     def encode(self, pixels: UInt8[np.ndarray, "height width 3"]) -> None: ...
 
-    @abstractmethod
-    def flush(self) -> None: ...
+    def flush(self) -> None:
+        """Write the packets that the codec holds back."""
+        self.container.mux(self.codec.encode(None))
 
 
 class Mp4(Video):
@@ -119,18 +121,15 @@ class Mp4(Video):
         return np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
     def begin(self) -> None:
-        self.h264 = self.stream("libx264", "yuv420p", {"crf": str(CRF), "preset": "slow"})
-        context = self.h264.codec_context
+        self.codec = self.stream("libx264", "yuv420p", {"crf": str(CRF), "preset": "slow"})
+        context = self.codec.codec_context
         context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
         context.color_primaries, context.color_trc = 1, 1  # BT.709, both
 
     def encode(self, pixels: UInt8[np.ndarray, "height width 3"]) -> None:
         picture = av.VideoFrame.from_ndarray(pixels, format="rgb24")
         yuv = picture.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
-        self.container.mux(self.h264.encode(yuv))
-
-    def flush(self) -> None:
-        self.container.mux(self.h264.encode(None))
+        self.container.mux(self.codec.encode(yuv))
 
 
 class WebP(Video):
@@ -140,13 +139,11 @@ class WebP(Video):
     options: ClassVar[dict[str, str]] = {"loop": "0"}
 
     def begin(self) -> None:
-        self.webp = self.stream("libwebp_anim", "bgra", {"quality": str(WEBP_QUALITY), "lossless": "0"})
+        self.codec = self.stream("libwebp_anim", "bgra", {"quality": str(WEBP_QUALITY), "lossless": "0"})
 
     def encode(self, pixels: UInt8[np.ndarray, "height width 3"]) -> None:
-        self.container.mux(self.webp.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="bgra")))
-
-    def flush(self) -> None:
-        self.container.mux(self.webp.encode(None))
+        picture = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="bgra")
+        self.container.mux(self.codec.encode(picture))
 
 
 class Gif(Video):
@@ -175,14 +172,14 @@ class Gif(Video):
             colours = choose_colours(frames)
         table = np.zeros((256, 4), np.uint8)  # alpha, red, green, blue
         table[: len(colours), 0], table[: len(colours), 1:] = 255, colours
-        gif = self.stream("gif", "pal8", {})
-        gif.codec_context.time_base = Fraction(1, 100)
+        self.codec = self.stream("gif", "pal8", {})
+        self.codec.codec_context.time_base = Fraction(1, 100)
         for i, frame in enumerate(track(frames, f"Encoding {self.path.name}", self.count)):
             indexed: Any = (dithered(frame, colours), table)
             picture = av.VideoFrame.from_ndarray(indexed, format="pal8")
             picture.pts, picture.time_base = round(100 * i / self.fps), Fraction(1, 100)
-            self.container.mux(gif.encode(picture))
-        self.container.mux(gif.encode(None))
+            self.container.mux(self.codec.encode(picture))
+        super().flush()
 
 
 KINDS: dict[str, type[Video]] = {".mp4": Mp4, ".gif": Gif, ".webp": WebP}

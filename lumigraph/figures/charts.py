@@ -12,7 +12,7 @@ WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 30, 40  # margins around the plot
 SMOOTHING = 0.06  # share of a curve over which its bold line averages
 MAX_CURVE_POINTS = 600  # of a curve that are drawn; more cannot be seen
-COLOURS, DASHES = 8, 4  # that charts.css knows
+COLOURS, DASHES = 8, 4  # in charts.css
 LETTER_WIDTH, LINE_HEIGHT = 7.2, 18  # width of a letter, about, and height of a line of names
 DASH_SAMPLE_WIDTH = 30  # width of the piece of line before the name of a dashed one, with the gap behind it
 MIN_LABEL_GAP = 24  # between two numbers below the plot, at least
@@ -45,10 +45,10 @@ def line_chart(
 ) -> str:
     """Each series twice: faint as measured, bold as averaged. Empty if all of them have fewer points than two.
 
-    Two points are two marks: a line between them would tell of what nobody measured.
+    Two points are two marks: a line between them would suggest values that were not measured.
 
     log, log_x: of the y and the x axis; what has no logarithm, or is not finite, is left out
-    marks:      a dot at each point, which tells its numbers on hovering
+    marks:      a dot at each point, with its numbers on hovering
     smoothed:   if not, the measured curve alone, bold
     note:       a few words below the plot
     x_ticks:    what the x axis is marked at, in rising order, instead of round numbers
@@ -183,7 +183,7 @@ def letters(series: Series) -> float:
 
 
 def legend_rows(series: Sequence[Series], label: str) -> list[list[Series]]:
-    """Names in rows: the first stands right of the label, and stays empty if they do not all fit there."""
+    """Names in rows: the first is right of the label, and stays empty if they do not all fit there."""
     room = (WIDTH - RIGHT - LEFT) / LETTER_WIDTH
     rows: list[list[Series]] = [[]]
     if len(label) + sum(letters(s) + 2 for s in series) > room:

@@ -1,8 +1,8 @@
-"""Files that are written whole or not at all, and nowhere where somebody else's lie.
+"""Files that are written whole or not at all, and never over foreign files.
 
-What is there already is replaced only if Lumigraph wrote it, as a thing of the same kind, and nobody has changed it
-since (`marks`), or if the user said --overwrite to this very file. A folder goes only if Lumigraph wrote it as one and
-all that is in it. Commands ask by `claim` before any work; whoever writes asks again.
+A file is replaced only if Lumigraph wrote it, as the same kind, and it is unchanged since (`marks`), or if the user
+gave --overwrite for it. A folder is replaced only if Lumigraph wrote it as one, with all that is in it. Commands call
+`claim` before any work; writers call it again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import itertools
 import json
 import os
 import re
-import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
@@ -35,13 +34,15 @@ NUMBER_LIST = re.compile(r"\[[-+.eE\d,\s]*\]")
 MAX_JSON_DEPTH = 100  # nesting levels of JSON; a recursive walk has room for them
 BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 
+is_file, exists = os.path.isfile, os.path.exists  # False for a name that the system rejects
+
 Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
 
 _granted: dict[Path, Seen | None] = {}  # what lay there when this process was allowed to write there
 
 
 def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """Raise LumigraphError unless a file may be written there. For whoever has work to do first: before it.
+    """Raise LumigraphError unless a file may be written there. Commands call it before their work.
 
     kind:      what it will be; in the place of anything else it does not go
     overwrite: whether the user wants whatever file lies there replaced; None where there is no option to say so
@@ -56,7 +57,13 @@ def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable
             return
         check_room(place)
         if there is not None:
-            refuse_all_but_files(path)
+            if path.is_symlink():
+                raise LumigraphError(
+                    f"{path} is a link, which stays as it is; name the file that it leads to, or another one"
+                )
+            if not path.is_file():
+                what = "a folder" if path.is_dir() else "no ordinary file"
+                raise LumigraphError(f"{path} is {what}; choose another name for the file")
             if not (overwrite or marks.is_ours(path, kind)):
                 option = "" if overwrite is None else ", or give --overwrite"
                 raise LumigraphError(
@@ -93,7 +100,7 @@ def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[P
     """An empty file to fill, in the folder of `path`; it takes that place once the block ends well.
 
     ours: this is a part of a folder that was recognised by its own mark, such as a run's config.json: what may lie
-          there is ours, nobody needs to ask
+          there is ours
     After a fault or a kill the place holds what it held before. Raises LumigraphError as `claim` does, or if the disk
     refuses.
     """
@@ -190,15 +197,6 @@ def check_room(place: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(above))
 
 
-def refuse_all_but_files(path: Path) -> None:
-    mode = os.lstat(path).st_mode
-    if stat.S_ISLNK(mode):
-        raise LumigraphError(f"{path} is a link, which stays as it is; name the file that it leads to, or another one")
-    if not stat.S_ISREG(mode):
-        what = "a folder" if stat.S_ISDIR(mode) else "no ordinary file"
-        raise LumigraphError(f"{path} is {what}; choose another name for the file")
-
-
 def write_bytes(path: Path, data: bytes, kind: Kind = "file", ours: bool = False) -> None:
     with replacing(path, kind, ours) as new:
         new.write_bytes(data)
@@ -235,28 +233,9 @@ def from_json(data: bytes, where: Path | str) -> Any:
         raise LumigraphError(f"{where} cannot be read as JSON ({reason}{line}); restore it from a copy") from error
 
 
-def is_file(path: Path) -> bool:
-    """True if the path is a file; False for a name that the system rejects."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def exists(path: Path) -> bool:
-    """True if the path exists; False for a name that the system rejects."""
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
-
-
 def expanded(name: Path | str) -> Path:
-    """A path with the home folder for its ~, or as it stands where nobody is called so."""
-    try:
-        return Path(name).expanduser()
-    except RuntimeError:
-        return Path(name)
+    """A path with the home folder for its ~; unchanged for an unknown user."""
+    return Path(os.path.expanduser(name))
 
 
 def sync(path: Path) -> None:

@@ -1,6 +1,6 @@
 """One at a time: who works in a folder holds a lock on it, which the system drops when the process ends, even killed.
 
-So a lock that a killed process has left behind is no lock, and nobody has to delete it.
+So the lock file of a killed process is no lock and need not be deleted.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Holder:
 
 @contextlib.contextmanager
 def held(folder: Path, doing: str) -> Iterator[None]:
-    """Hold an existing folder inside this block; a process that holds it already goes on holding it.
+    """Hold an existing folder inside this block; a process that holds it already keeps it.
 
     doing: what is done with the folder meanwhile, as in "trained"
     Raises LumigraphError, which says who it is, if another process holds it.
@@ -63,7 +63,7 @@ def held(folder: Path, doing: str) -> Iterator[None]:
 
 
 def check_place(folder: Path) -> None:
-    """Raise LumigraphError if somebody's file lies where a folder's lock would: it would be replaced, and deleted."""
+    """Raise LumigraphError if a foreign file lies where a folder's lock would: it would be replaced, and deleted."""
     with explained(folder / LOCK_FILE):
         if not is_lock(folder / LOCK_FILE):
             raise LumigraphError(f"{folder / LOCK_FILE} is no lock of Lumigraph's; rename it, or choose another folder")
@@ -82,7 +82,7 @@ def is_lock(place: Path) -> bool:
 
 
 def taken(place: Path) -> TextIO | None:
-    """The lock's file, open and locked; None if somebody else has it."""
+    """The lock's file, open and locked; None if another process has it."""
     while True:
         file = open(place, "a+", encoding="utf-8")
         if not lock(file):
@@ -93,7 +93,7 @@ def taken(place: Path) -> TextIO | None:
             json.dump({"process": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%F %T")}, file)
             file.flush()
             return file
-        file.close()  # whoever had it deleted it just now: the next one will be another file
+        file.close()  # its holder deleted it just now: the next one will be another file
 
 
 def is_still(place: Path, file: TextIO) -> bool:

@@ -1,15 +1,12 @@
 """Records of files that Lumigraph wrote into a folder: lines of JSON in a file `.lumigraph` there.
 
-Each line is a file: its name, what kind of thing it is, its bytes and their SHA-256. A file is ours if a line says so
-and nobody has changed it since. Why here, rather than
+Each line is a file: its name, its kind, its bytes and their SHA-256. A file is ours if a line matches its present
+content. A mark inside each file would not do: some formats have no room (.splat), and it would outlive an edit or come
+from another user's Lumigraph. Nor would a record in the user's home: folders are moved, copied, mounted in containers.
 
-- inside each file: some formats have no room (.splat), and a mark inside stays when somebody edits the file, or is
-  there because a friend's Lumigraph wrote it;
-- in the user's home: folders are moved, copied, and mounted in containers; this one travels along.
-
-Lines are only ever added, in one write: processes that share a folder lose nothing of each other's, and of a kill
-remains half a line at most, which is passed over. A line comes before its file; one whose file never came fits no
-other. A `.lumigraph` that is somebody else's stays as it is; what is written beside it is not known again.
+Lines are only added, in one write: processes that share a folder lose nothing of each other's, and a kill leaves half a
+line at most, which is skipped. A line precedes its file; one whose file was never written matches no other. A
+`.lumigraph` of another program is kept, and files beside it are not recognised later.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def meant(name: str, known: Sequence[str]) -> str | None:
-    """The known name that somebody most likely meant by another; None where nothing is close.
+    """The known name that a user most likely meant by another; None where none is close.
 
     Letters alone count: the same ones ("instantngp"), a part of a name ("splat"), its words' initials ("3dgs", "ff"),
     and last what differs least from the name or a word of it.

@@ -1,7 +1,7 @@
 """Partial files: unique names in the destination folder, and removal of leftovers of killed processes.
 
 A process holds a lock on whatever it is writing, and the system drops the lock when the process ends, even killed. So
-what has such a name and no lock is a leftover of ours, and goes when somebody writes into the folder again. Where the
+what has such a name and no lock is a leftover of ours, deleted at the next write into the folder. Where the
 file system knows no locks it stays.
 """
 
@@ -29,7 +29,7 @@ def partial(folder: Path, is_folder: bool = False) -> Iterator[Path]:
         try:
             path.mkdir() if is_folder else path.touch(exist_ok=False)
             lock = locked(path)
-            if path.exists():  # else somebody took it for a leftover, before it was locked
+            if path.exists():  # else another process took it for a leftover, before it was locked
                 yield path
                 return
         finally:

@@ -47,16 +47,9 @@ def splat(
     bands: of the harmonics in use, at most as many as there are
     stop:  transmittance at which a pixel is finished
     """
+    ellipsoids = cloud.means, cloud.quaternions, cloud.log_scales.exp(), cloud.opacities.sigmoid()
     centres, conics, depths, colours, opacities = kernels.project(
-        cloud.means,
-        cloud.quaternions,
-        cloud.log_scales.exp(),
-        cloud.opacities.sigmoid(),
-        cloud.harmonics,
-        view,
-        min(bands, cloud.degree + 1),
-        blur,
-        cloud.antialiased,
+        *ellipsoids, cloud.harmonics, view, min(bands, cloud.degree + 1), blur, cloud.antialiased
     )
     tiles = kernels.tile(centres, conics, opacities, depths, view.size)
     rgb, depth, opacity = kernels.rasterize(centres, conics, opacities, colours, depths, tiles, stop)

@@ -1,7 +1,7 @@
 """Hot loops, one folder per operation: a reference in PyTorch, engines in Numba and Triton."""
 
-from ._dispatch import Engine as Engine
-from ._dispatch import using as using
+from ._operation import Engine as Engine
+from ._operation import using as using
 from .block_march import Blocks as Blocks
 from .block_march import block_march as block_march
 from .composite import composite as composite

@@ -20,9 +20,8 @@ from torch import Tensor
 from ..files import claim, write_json
 from ..system.console import console as plain_console
 from ..system.progress import track
-from ._dispatch import Engine, using
-from ._facts import operations as all_operations
-from ._facts import tensors
+from ._operation import Engine, tensors, using
+from ._operation import operations as all_operations
 
 MAX_SECONDS = 5.0  # seconds: what takes longer is repeated less often, but three times at least
 

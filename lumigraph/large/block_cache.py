@@ -1,4 +1,4 @@
-"""Cache of the blocks of a scene that is too large for memory: opened when a camera comes near, the oldest closed."""
+"""Cache of the blocks of a scene that is too large for memory: opened when in use, the least recently used closed."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ MAX_OPEN_BLOCKS = 8  # parts that stay open; a picture needs three
 
 
 class Nearby:
-    """Parts by number, of which those that were asked for last are open.
+    """Parts by number, of which the most recently used are open.
 
-    open:  gives a part by its number, on the device where it is to be
-    count: how many there are
-    most:  that stay open at a time
+    open:  opens a part by its number, on its device
+    most:  number of parts that stay open
     """
 
     def __init__(self, open: Callable[[int], Placed], count: int, most: int = MAX_OPEN_BLOCKS):

@@ -22,6 +22,7 @@ from torch import Tensor
 from .. import files, methods
 from ..camera import Camera
 from ..capture import Before, CapturePart, open_dataset
+from ..components.fields.appearance import Appearance
 from ..composition import PickedCloud, Placed
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
@@ -34,14 +35,10 @@ from ..run.folder import Run
 from ..run.opened import Trained
 from ..run.settings import Settings, Source
 from .block_cache import Nearby
-from .compositing import InBlocks
-from .merging import merged
+from .compositing import InBlocks, merged
 from .plan import BLOCKS_FOLDER, PLAN_FILE, Block, Plan
 
 MAX_REACH = 64.0
-NO_BLOCK_MESSAGE = (
-    "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
-)
 
 
 class BlockRun(Trained):
@@ -58,7 +55,10 @@ class BlockRun(Trained):
         self.runs = {block.name: run for block in self.plan.blocks if (run := state_of(self.folder, block)) is not None}
         self.blocks = [block for block in self.plan.blocks if block.name in self.runs]
         if not self.blocks:
-            raise LumigraphError(f"{self.folder} cannot be shown: {NO_BLOCK_MESSAGE}")
+            raise LumigraphError(
+                f"{self.folder} cannot be shown: it has no block that has learnt anything yet; `lumigraph train` with "
+                "the same options goes on with it"
+            )
         if missing := [block.name for block in self.plan.blocks if block.name not in self.runs]:
             warnings.warn(
                 f"{self.folder} is shown without {len(missing)} of its blocks, which have learnt nothing yet: "
@@ -67,8 +67,6 @@ class BlockRun(Trained):
                 2,
             )
         self.frame = self._frame()
-
-    # Where blocks are
 
     @property
     def centres(self) -> Float[Tensor, "block 3"]:
@@ -96,27 +94,24 @@ class BlockRun(Trained):
         rotation = torch.from_numpy(upright.T).double()
         to_source = Similarity.make(around.radius, rotation, torch.tensor(around.centre, dtype=torch.float64))
         frames = [self.runs[block.name].frame for block in self.blocks]
-        rescaled = [frame.to_source.scale / around.radius for frame in frames]
         own = Frame(source_from_scene=to_source.rows)
-        centres = [(own.to_source.inverse @ frame.to_source).matrix[:3, 3] for frame in frames]
-        low = torch.stack([c - scale for c, scale in zip(centres, rescaled, strict=True)]).amin(0).clamp(-1, 1)
-        high = torch.stack([c + scale for c, scale in zip(centres, rescaled, strict=True)]).amax(0).clamp(-1, 1)
-        farthest = max(
-            float(c.abs().max()) + scale * frame.reach
-            for c, scale, frame in zip(centres, rescaled, frames, strict=True)
-        )
+        centres = torch.stack([(own.to_source.inverse @ frame.to_source).matrix[:3, 3] for frame in frames])
+        numbers = [(frame.to_source.scale / around.radius, frame.reach, frame.near) for frame in frames]
+        scale, reach, near = torch.tensor(numbers, dtype=torch.float64).unbind(-1)
+        low = (centres - scale[:, None]).amin(0).clamp(-1, 1)
+        high = (centres + scale[:, None]).amax(0).clamp(-1, 1)
+        farthest = float((centres.abs().amax(1) + scale * reach).max())
+        times = [time for frame in frames if frame.times for time in frame.times]
         return replace(
             own,
             bounds=(tuple(low.tolist()), tuple(high.tolist())),
             reach=min(2.0 ** max(1, math.ceil(math.log2(farthest))), MAX_REACH),
-            near=min(frame.near * scale for frame, scale in zip(frames, rescaled, strict=True)),
+            near=float((near * scale).min()),
             background=frames[0].background,
             has_alpha=any(frame.has_alpha for frame in frames),
             image_count=sum(len(block.photographs) for block in self.blocks),
-            times=span(frames),
+            times=(min(times), max(times)) if times else None,
         )
-
-    # What it shows
 
     def method(
         self, device: torch.device | str = "cpu", exposures: Float[Tensor, " photograph"] | None = None
@@ -138,12 +133,8 @@ class BlockRun(Trained):
         run = self.runs[block.name]
         method = run.method(device)
         if code := self.plan.appearance.get(block.name):
-            from ..components.fields.appearance import Appearance
-
             method = method.given(Appearance(torch.tensor(code, device=device)))
         return Placed(method, self.frame.to_source.inverse @ run.frame.to_source)
-
-    # What it learnt from
 
     @cached_property
     def _photographs(self) -> dict[tuple[str, str], tuple[str, str]]:
@@ -216,8 +207,6 @@ class BlockRun(Trained):
         """All photographs."""
         return self.dataset(source)
 
-    # What evaluation says of it
-
     @property
     def learnt_from(self) -> Source:
         return self.plan.scene
@@ -262,9 +251,3 @@ def state_of(folder: Path, block: Block) -> Run | None:
     if run.method_name not in methods.available():
         run.new_method()  # says which methods there are
     return run if run.has_state else None
-
-
-def span(frames: list[Frame]) -> tuple[float, float] | None:
-    """From the first moment of all to the last."""
-    times = [time for frame in frames if frame.times for time in frame.times]
-    return (min(times), max(times)) if times else None

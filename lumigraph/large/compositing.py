@@ -2,6 +2,8 @@
 
 Tancik et al. 2022 (Block-NeRF, arXiv 2202.05263), section 4.3: blocks within reach of a camera, without those that do
 not see what it sees (4.3.1), each rendered by itself, their pictures mixed by how near the camera is to each (4.3.2).
+Clouds of Gaussians become one cloud: a block models badly what lies beyond its own ground, so each gives only what lies
+in its own cell, and cells do not overlap (Lin 2024, VastGaussian, section 3.4; Liu 2024, CityGaussian, section 3.3).
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ..camera import Camera
@@ -20,12 +22,12 @@ from ..camera.rays import Rendering
 from ..composition import Placed
 from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
+from ..gaussians import Gaussians, joined
 from ..method import Method
 from ..method.controls import Control, Value
+from .alignment import EXPOSURE, Asked, exposed
 from .block_cache import Nearby
-from .exposure_alignment import EXPOSURE, Asked, exposed
-from .visibility import PREVIEW_SIDE, saw
-from .weights import UNSEEN_WEIGHT, Mixing, inverse_distance, seeing, shares
+from .weights import PREVIEW_SIDE, UNSEEN_WEIGHT, Mixing, inverse_distance, saw, seeing, shares
 
 MIN_WEIGHT = 1e-3  # share of a picture below which a block is not rendered: a quarter of a step of 8 bits
 FULL_WEIGHT = 0.02  # share of a picture from which on a block counts fully where pixels are mixed one by one
@@ -35,14 +37,10 @@ class InBlocks(Method):
     """Several placed methods, each for a part of one large scene. Ready to render, and nothing else.
 
     frame:     the common frame, in which cameras, centres and radii are given
-    blocks:    a block each: its method, on the device where it stays, and the way from its own frame to the common one,
-               which is `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common
-               frame belong to no block's photographs. `Nearby` opens them where a camera comes near; here each is
-               asked once what it can be told
-    centres:   where blocks are
-    radii:     how far from its centre a camera may be that a block is asked about. A camera that is in reach of none is
-               shown by the nearest block
-    mixing:    numbers of the composition
+    parts:     a block each: its method, on its device, and the way from its own frame to the common one, which is
+               `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common frame belong
+               to no block's photographs. `Nearby` opens them where a camera comes near
+    radii:     distance from its centre within which a camera uses a block; a camera in reach of none uses the nearest
     exposures: of the capture's photographs, by their `image_index`, as `Scene.about["exposure"]` has them, where known
 
     Blocks are shown as if photographed with one exposure, the median of what is usual in each. The control `exposure`
@@ -74,8 +72,6 @@ class InBlocks(Method):
         self.exposures = exposures
         self.blocks = parts.each(partial(exposed, exposure=self.usual))
         self.eval()
-
-    # Being seen
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
@@ -121,8 +117,6 @@ class InBlocks(Method):
         distance = torch.stack(distances, -1).clamp_min(UNSEEN_WEIGHT)
         return shares((distance / distance.amin(-1, keepdim=True)) ** -c.power * entered)
 
-    # What is known of places
-
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per unit of the common frame: that of blocks in whose reach points lie, mixed by inverse distance.
         Raises LumigraphError where a block knows none."""
@@ -137,8 +131,6 @@ class InBlocks(Method):
         """Shares that blocks have at places."""
         distance = (points[:, None] - self.centres).norm(dim=-1)
         return shares(inverse_distance(distance, self.radii, self.config.power, self.config.most))
-
-    # Being told something
 
     @property
     def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the blocks
@@ -200,3 +192,36 @@ def mixed(seen: Sequence[Rendering], weights: Float[Tensor, "height width block"
     distance = (there * depth.nan_to_num(posinf=0.0)).sum(-1) / held.clamp_min(1e-6)
     background = rgb.new_tensor(frame.background)
     return Rendering(rgb + (1 - opacity)[..., None] * background, torch.where(held > 0.5, distance, torch.inf), opacity)
+
+
+@torch.no_grad()
+def merged(parts: Sequence[Placed], centres: Float[Tensor, "block 3"] | None = None) -> Gaussians:
+    """One cloud in the frame that the parts are placed in: of each part the Gaussians whose centres its cell holds.
+
+    parts:   one for each block, its method a cloud; a part's crop, in the part's own frame, holds besides its cell
+    centres: of the blocks, in the order of the parts, in the common frame; a part's cell are the points nearest to its
+             centre (Voronoi's), which reach to infinity at the outermost blocks, so that the sky is kept once as well.
+             None where the parts' crops are the cells
+    Ground plans stay upright where all centres have the same height. Harmonics, and what opacities mean, as `joined`
+    has them. Raises LumigraphError where parts and centres differ in number, no part is given, or one is no cloud.
+    """
+    if not parts or (centres is not None and len(centres) != len(parts)):
+        raise LumigraphError(
+            f"{len(parts)} blocks of splats and {0 if centres is None else len(centres)} centres do not go together; "
+            "give each block its centre"
+        )
+    clouds = [part.gaussians() for part in parts]
+    if centres is not None:
+        clouds = [cloud[nearest(cloud.means, centres) == i] for i, cloud in enumerate(clouds)]
+    return joined(clouds)
+
+
+def nearest(points: Float[Tensor, "point 3"], centres: Float[Tensor, "block 3"]) -> Int[Tensor, " point"]:
+    """The number of the centre nearest to each point, the first of equals."""
+    best = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    least = torch.full((len(points),), torch.inf, dtype=torch.float64, device=points.device)
+    for i, centre in enumerate(centres.to(points.device).double()):
+        squared = (points - centre).square().sum(-1)
+        best = torch.where(squared < least, i, best)
+        least = torch.minimum(squared, least)
+    return best

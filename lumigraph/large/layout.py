@@ -8,32 +8,37 @@ cell goes: to the farthest of those, and half-way to the next centre. Two neighb
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from ..capture import Places
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import read_json
 from ..files.ranges import Point, Positive, typed
-from .crossings import find_crossings
 from .plan import Block
 
 MIN_LARGE_VIEWS = 200  # photographs from which on a capture is divided by default
 VIEWS_PER_BLOCK = 64  # approximate
 MIN_CROSSING_VIEWS = 16  # mean number of photographs in a cell at a crossing; with fewer, crossings are not used
 OVERLAP_FACTOR = 4 / 3  # radius of a block relative to the radius of its cell
-NEAR_RADII, FACING_COSINE = (
-    1.25,
-    0.7,
-)  # radii within which a photograph that faces the block counts; minimum cosine of its direction
+NEAR_RADII, FACING_COSINE = 1.25, 0.7  # a photograph that faces the block counts within so many radii; least cosine
 SPLIT_FACTOR = 2.0  # times the usual radius of a cell, from which on it is split
 MAX_BLOCKS = 100_000  # blocks
 KMEANS_ROUNDS = 50  # of k-means
+GRAPH_NEIGHBOURS = 12  # candidate positions for the way to the next one
+STEP_QUANTILE = 0.9  # of the spanning tree's edges; rigs take many photographs at one place
+INNER_RADIUS, OUTER_RADIUS = 1.5, 3.5  # steps around a position, between which outgoing streets are counted
+MIN_STREET_ANGLE = np.radians(45)  # between two streets
+MIN_CORNER_ANGLE = np.radians(225)  # of the outer side of a corner
+CROSSING_RADIUS = 2.5  # steps within which positions belong to one crossing
+MAX_OFF_STREET_SHARE = 0.4  # share of positions off any street, above which the capture has no streets
+STEP_SCALES = (1.0, 1.5, 2.0, 3.0)  # times a step, at which streets are searched: parallel lanes are one street
 
 
 @dataclass(frozen=True)
@@ -60,19 +65,21 @@ def lay_out(places: Places, wish: str | Path = "auto", source: str = "the captur
     block. Raises LumigraphError for a number that there are too few places for, a file that is none, and one whose
     blocks are all elsewhere.
     """
-    if str(wish) == "auto" or str(wish).isdigit():
+    from_file = not (str(wish) == "auto" or str(wish).isdigit())
+    if not from_file:
         found = discs(places, None if str(wish) == "auto" else int(str(wish)))
     else:
         path = Path(wish)
         if not path.exists():
             raise LumigraphError(f"--blocks {wish} is no number and no file; give auto, a number of blocks, or a file")
         found = typed(Discs, read_json(path), path).blocks
-    owner = cells(places.ground, ground_of(places, found)) if len(found) else np.zeros(0, int)
+    middles = np.array([disc.centre for disc in found]).reshape(-1, 3) @ places.upright.T
+    owner = cells(places.ground, middles[:, :2]) if len(found) else np.zeros(0, int)
     blocks, empty, seen = [], [], np.zeros(len(places), bool)
     learnt = np.array([split == "train" for split in places.splits])
     for number, disc in enumerate(found):
         chosen = members(places, disc)
-        if str(wish) == "auto" or str(wish).isdigit():
+        if not from_file:
             chosen |= owner == number
         if (chosen & learnt).sum() < 2:
             empty.append(str(number))
@@ -85,23 +92,15 @@ def lay_out(places: Places, wish: str | Path = "auto", source: str = "the captur
             f"No block of {wish} has two photographs of {source} to learn from; its blocks are elsewhere, so correct "
             "their centres, which are in the frame of the photographs"
         )
-    tell(empty, int((~seen & learnt).sum()))
-    return blocks
-
-
-def tell(empty: Sequence[str], lost: int) -> None:
     if empty:
         verb = "block has" if len(empty) == 1 else "blocks have"
-        warnings.warn(
-            f"{len(empty)} {verb} fewer than two photographs to learn from and will not be trained: "
-            f"{', '.join(empty[:20])}{' ...' if len(empty) > 20 else ''}",
-            LumigraphWarning,
-            3,
-        )
-    if lost:
-        warnings.warn(
-            f"{lost} photographs to learn from are in no block, and nothing learns from them", LumigraphWarning, 3
-        )
+        message = f"{len(empty)} {verb} fewer than two photographs to learn from and will not be trained: "
+        message += f"{', '.join(empty[:20])}{' ...' if len(empty) > 20 else ''}"
+        warnings.warn(message, LumigraphWarning, 2)
+    if lost := int((~seen & learnt).sum()):
+        message = f"{lost} photographs to learn from are in no block, and nothing learns from them"
+        warnings.warn(message, LumigraphWarning, 2)
+    return blocks
 
 
 def discs(places: Places, number: int | None) -> list[Disc]:
@@ -109,7 +108,7 @@ def discs(places: Places, number: int | None) -> list[Disc]:
     ground = places.ground
     centres = spread(ground, number) if number else centres_for(ground)
     owner = cells(ground, centres)
-    reach = np.array([farthest(ground[owner == i], centre) for i, centre in enumerate(centres)])
+    reach = reaches(ground, centres, owner)
     if len(centres) > 1:  # cells touch half-way, also where no photograph is
         reach = np.maximum(reach, 0.5 * cKDTree(centres).query(centres, 2)[0][:, 1])
     least = 1e-3 * max(float(np.ptp(ground, axis=0).max()), 1e-6)  # a place where all photographs were taken at
@@ -129,7 +128,7 @@ def centres_for(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, 
         return spread(ground, max(1, round(len(ground) / VIEWS_PER_BLOCK)))
     while True:
         owner = cells(ground, centres)
-        reach = np.array([farthest(ground[owner == i], centre) for i, centre in enumerate(centres)])
+        reach = reaches(ground, centres, owner)
         worst = int(reach.argmax())
         if reach[worst] <= SPLIT_FACTOR * np.median(reach) or len(ground) < MIN_CROSSING_VIEWS * (len(centres) + 1):
             return centres
@@ -179,9 +178,69 @@ def members(places: Places, disc: Disc) -> Bool[np.ndarray, " photograph"]:
     return (flat <= disc.radius) | (towards & (flat <= NEAR_RADII * disc.radius))
 
 
-def ground_of(places: Places, found: Sequence[Disc]) -> Float[np.ndarray, "block 2"]:
-    return (np.array([disc.centre for disc in found]) @ places.upright.T)[:, :2]
+def reaches(
+    ground: Float[np.ndarray, "photograph 2"],
+    centres: Float[np.ndarray, "block 2"],
+    owner: Int[np.ndarray, " photograph"],
+) -> Float[np.ndarray, " block"]:
+    """Distance of each centre to the farthest photograph of its cell; 0 for an empty one."""
+    reach = np.zeros(len(centres))
+    np.maximum.at(reach, owner, np.linalg.norm(ground - centres[owner], axis=-1))
+    return reach
 
 
-def farthest(ground: Float[np.ndarray, "photograph 2"], centre: Float[np.ndarray, " 2"]) -> float:
-    return float(np.linalg.norm(ground - centre, axis=-1).max()) if len(ground) else 0.0
+def find_crossings(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, "crossing 2"]:
+    """The middles of crossings and corners, seen from above; none where there are no streets, or they never meet.
+
+    Both lanes of a street are one street only from a step on that is about as long as they are apart. So several are
+    tried, and the one counts at which most streets meet, the finest of equals.
+    """
+    step = usual_step(ground)
+    if step == 0:
+        return np.zeros((0, 2))
+    return max((crossings_at(ground, scale * step) for scale in STEP_SCALES), key=len)
+
+
+def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Float[np.ndarray, "crossing 2"]:
+    """Crossings and corners, as far as they show in places that are a step apart."""
+    nodes = thinned(ground, step)
+    near = cKDTree(nodes).query_ball_point(nodes, OUTER_RADIUS * step)
+    found = [ways(nodes[some] - node, step) for node, some in zip(nodes, near, strict=True)]
+    number, turns = np.array([n for n, _ in found]), np.array([widest > MIN_CORNER_ANGLE for _, widest in found])
+    at = nodes[(number >= 3) | ((number == 2) & turns)]
+    if not (number >= 3).any() or np.isin(number, (1, 2)).mean() < 1 - MAX_OFF_STREET_SHARE:
+        return np.zeros((0, 2))
+    pairs = cKDTree(at).query_pairs(CROSSING_RADIUS * step, output_type="ndarray")
+    links = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(at), len(at)))
+    count, label = connected_components(links, directed=False)
+    return np.stack([at[label == i].mean(0) for i in range(count)])
+
+
+def usual_step(ground: Float[np.ndarray, "photograph 2"]) -> float:
+    """Distance from one place to the next along the way; 0 where all places are one."""
+    if len(ground) < 3:
+        return 0.0
+    distance, index = cKDTree(ground).query(ground, min(GRAPH_NEIGHBOURS, len(ground)))
+    rows = np.repeat(np.arange(len(ground)), distance.shape[1])
+    shortest = np.maximum(distance.ravel(), 1e-12)  # what is 0 would be no way at all
+    ways = minimum_spanning_tree(csr_matrix((shortest, (rows, index.ravel())), (len(ground), len(ground)))).data
+    long = ways[ways > 1e-9]
+    return float(np.quantile(long, STEP_QUANTILE)) if len(long) else 0.0
+
+
+def thinned(ground: Float[np.ndarray, "photograph 2"], step: float) -> Float[np.ndarray, "node 2"]:
+    """One place for all photographs within a square of a step."""
+    _, cell = np.unique(np.floor(ground / step).astype(np.int64), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    return np.stack([np.bincount(cell, ground[:, k]) for k in range(2)], -1) / np.bincount(cell)[:, None]
+
+
+def ways(around: Float[np.ndarray, "near 2"], step: float) -> tuple[int, float]:
+    """In how many directions streets leave the middle of these places, 0 where there are places all around or none;
+    and the widest angle between two of them, radians."""
+    far = around[np.linalg.norm(around, axis=-1) > INNER_RADIUS * step]
+    if not len(far):
+        return 0, 0.0
+    angles = np.sort(np.arctan2(far[:, 1], far[:, 0]))
+    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
+    return int((gaps > MIN_STREET_ANGLE).sum()), float(gaps.max())

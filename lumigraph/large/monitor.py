@@ -1,6 +1,6 @@
-"""Progress of all blocks: one display for the terminal, and a file in the run's folder, whoever computes them.
+"""Progress of all blocks: one display for the terminal, and a file in the run's folder.
 
-What is shown is read from the blocks' own folders, so that it needs no word from workers on other machines.
+Both are read from the blocks' own folders, so that workers on other machines need not report.
 """
 
 from __future__ import annotations
@@ -26,11 +26,8 @@ from .plan import DONE_FILE
 
 POLL_SECONDS = 1.0  # seconds between looks
 TAIL_BYTES = 4096  # at a log's end, which contain its last line
-FIRST_LINE_SECONDS, INTERVAL_GROWTH, MAX_INTERVAL = (
-    10.0,
-    1.5,
-    60.0,
-)  # until the first line of a log; growth of the interval; its upper limit in seconds
+# Seconds until the first line of a log; growth of the interval between lines; its upper limit in seconds.
+FIRST_LINE_SECONDS, INTERVAL_GROWTH, MAX_INTERVAL = 10.0, 1.5, 60.0
 PROGRESS_FILE = "progress.json"
 
 
@@ -57,7 +54,7 @@ def stand_of(folder: Path) -> Stand:
             return Stand("beginning")
         share = budget.progress(int(row["step"]), float(row["seconds"]))
         return Stand("learning", share, float(row["seconds"]), row.get("psnr"))
-    except (LumigraphError, LookupError, TypeError, ValueError):  # somebody is writing it
+    except (LumigraphError, LookupError, TypeError, ValueError):  # it is being written
         return Stand("beginning")
 
 
@@ -79,10 +76,7 @@ def last_line(path: Path) -> dict[str, Any]:
 
 
 class Watching:
-    """Inside this block somebody sees how far all blocks of a run are.
-
-    folders: of the blocks, by name
-    """
+    """Context in which the progress of all blocks is shown. folders: of the blocks, by name"""
 
     def __init__(self, run: Path, folders: dict[str, Path], show: bool = True):
         self.run, self.folders, self.show = run, folders, show
@@ -112,10 +106,9 @@ class Watching:
         return new
 
     def note(self) -> None:
-        """Leave what is known in the run's folder, for who looks from elsewhere."""
-        files.write_json(
-            self.run / PROGRESS_FILE, {name: asdict(stand) for name, stand in self.stands.items()}, ours=True
-        )
+        """Write the progress of all blocks into the run's folder, for other processes."""
+        stands = {name: asdict(stand) for name, stand in self.stands.items()}
+        files.write_json(self.run / PROGRESS_FILE, stands, ours=True)
 
     @property
     def share(self) -> float:
@@ -126,7 +119,7 @@ class Watching:
         stands = self.stands.values()
         done = sum(stand.state == "done" for stand in stands)
         busy = [f"{name} {100 * x.share:.0f} %" for name, x in self.stands.items() if x.state == "learning"]
-        told = f"{100 * self.share:3.0f} %  {done} of {len(self.stands)} blocks done"
+        told = f"{100 * self.share:3.0f} %  {done} of {len(stands)} blocks done"
         return " · ".join([told, f"{clock(time.monotonic() - self._begin)} so far", *busy[:8]])
 
     def _watch(self) -> None:
@@ -136,16 +129,14 @@ class Watching:
         pause, due = FIRST_LINE_SECONDS, time.monotonic() + FIRST_LINE_SECONDS
         while not self._over.wait(POLL_SECONDS):
             for name in self.look():
-                self._say(f"block {name} is done: {described(self.stands[name])}")
+                if self.show:
+                    tell(f"block {name} is done: {described(self.stands[name])}")
             if time.monotonic() >= due:
-                self._say(self.line())
+                if self.show:
+                    tell(self.line())
                 self.note()
                 pause = min(INTERVAL_GROWTH * pause, MAX_INTERVAL)
                 due = time.monotonic() + pause
-
-    def _say(self, line: str) -> None:
-        if self.show:
-            tell(line)
 
     def _draw(self) -> None:
         columns = TextColumn("{task.description}", "bold", markup=False), BarColumn(24)

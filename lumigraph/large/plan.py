@@ -60,7 +60,7 @@ class Block:
 class Task:
     """task.json: all that a block is made of; nothing else says what becomes of its folder.
 
-    scene:   what `open_dataset` is told, with the block as a `Part`
+    scene:   source and options of `open_dataset`, with the block as `part`
     upright: the rotation from the source's frame that brings up to +z, the same for all blocks
     budget:  {"steps": n}, {"seconds": s} or {"quality": word}
     memory:  bytes of photographs that may stay in memory; a file holds what is more
@@ -129,7 +129,7 @@ class Plan:
 
     @staticmethod
     def read(path: Path) -> Plan:
-        """The plan in a file. Raises LumigraphError, naming it, where it is none of ours or damaged."""
+        """The plan in a file. Raises LumigraphError, naming it, where it is foreign or damaged."""
         said = files.read_json(path)
         if not isinstance(said, dict) or said.get("format") != PLAN_FORMAT:
             raise LumigraphError(f"{path} was not written by this version of Lumigraph; open it with the one that did")
@@ -146,12 +146,11 @@ class Plan:
         )
 
     def block(self, name: str) -> Block:
-        """Raises LumigraphError, naming those there are, for a block that there is not."""
-        for block in self.blocks:
-            if block.name == name:
-                return block
-        there = ", ".join(block.name for block in self.blocks)
-        raise LumigraphError(f"There is no block {name}; there are {there}")
+        """The block of a name. Raises LumigraphError, naming all blocks, if there is none."""
+        blocks = {block.name: block for block in self.blocks}
+        if name not in blocks:
+            raise LumigraphError(f"There is no block {name}; there are {', '.join(blocks)}")
+        return blocks[name]
 
     def task(self, block: Block) -> Task:
         """The task of a block."""

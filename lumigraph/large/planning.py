@@ -1,13 +1,16 @@
-"""Begin a run of many blocks: its folder, with the task of every block, before anything is trained."""
+"""Begin a run of many blocks: its folder, the task of every block and a picture of the plan, before any training."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image, ImageDraw, ImageFont
 
 from .. import files
 from ..budget import Budget
@@ -17,12 +20,17 @@ from ..figures import save_picture
 from ..files.plain import alike
 from ..run import check_new, processor
 from ..run.folder import versions
-from .drawing import draw_plan
 from .layout import lay_out
 from .plan import BLOCKS_FOLDER, PLAN_FILE, TASK_FILE, Block, Plan, Task, source_of
 
 DEFAULT_SECONDS = 60.0  # per block
 PICTURE_FILE = "blocks.png"
+DRAWING_SIDE, SUPERSAMPLING = 1000, 3  # pixels of the longer side; supersampling factor
+MARGIN, HEADER_HEIGHT = 40, 60
+PAPER_COLOUR, INK_COLOUR, FAINT_COLOUR, HELD_OUT_COLOUR = "#fbfaf8", "#1b1d22", "#6d717a", "#d97706"
+BLOCK_COLOURS = ("#2563eb", "#059669", "#7c3aed", "#db2777", "#0891b2", "#65a30d")
+DIRECTION_LENGTH = 14  # pixels of the line along a photograph's viewing direction
+MAX_SHOWN = 20_000  # photographs
 
 
 def survey(source: str, reader: str | None = None) -> Places:
@@ -34,7 +42,7 @@ def survey(source: str, reader: str | None = None) -> Places:
 class BlockRecipe:
     """Training of every block.
 
-    options: what `open_dataset` is told of the whole scene
+    options: of `open_dataset` for the whole scene
     budget:  of all blocks together, shared out evenly; None for a minute each, or a quality
     here:    whether the device is this machine's
     """
@@ -121,3 +129,43 @@ def difference(known: Plan, wanted: Plan) -> str | None:
     again = {block.name for block in known.blocks if block.scene is not None}
     blocks = [[x for x in plan["blocks"] if x["name"] not in again] for plan in (mine, other)]
     return None if alike(blocks[0], blocks[1]) else "layout of blocks"
+
+
+def draw_plan(places: Places, blocks: Sequence[Block]) -> Image.Image:
+    """North is where the second axis of the levelled source points; photographs that are held out are orange."""
+    turn = places.upright.T
+    centres = np.array([block.centre for block in blocks]) @ turn
+    radii = np.array([block.radius for block in blocks])
+    ground, gaze = places.ground, (places.forwards @ turn)[:, :2]
+    low = np.minimum(ground.min(0), (centres[:, :2] - radii[:, None]).min(0))
+    high = np.maximum(ground.max(0), (centres[:, :2] + radii[:, None]).max(0))
+    scale = SUPERSAMPLING * DRAWING_SIDE / max(float((high - low).max()), 1e-9)
+    width, height = (np.ceil((high - low) * scale) + 2 * SUPERSAMPLING * MARGIN).astype(int)
+    image = Image.new("RGB", (int(width), int(height) + SUPERSAMPLING * HEADER_HEIGHT), PAPER_COLOUR)
+    draw = ImageDraw.Draw(image, "RGBA")
+
+    def at(point: np.ndarray) -> tuple[float, float]:
+        x, y = (point - low) * scale + SUPERSAMPLING * MARGIN
+        return float(x), float(height - y) + SUPERSAMPLING * HEADER_HEIGHT
+
+    letters = ImageFont.load_default(18 * SUPERSAMPLING)
+    for i, (centre, radius) in enumerate(zip(centres[:, :2], radii, strict=True)):
+        colour, (x, y), r = BLOCK_COLOURS[i % len(BLOCK_COLOURS)], at(centre), radius * scale
+        draw.ellipse([x - r, y - r, x + r, y + r], f"{colour}18", colour, 2 * SUPERSAMPLING)
+    for i in range(0, len(ground), max(1, len(ground) // MAX_SHOWN)):
+        held_out = places.splits[i] != "train"
+        (x, y), colour, dot = at(ground[i]), HELD_OUT_COLOUR if held_out else FAINT_COLOUR, 2.2 * SUPERSAMPLING
+        dx, dy = SUPERSAMPLING * DIRECTION_LENGTH * gaze[i]
+        draw.line([x, y, x + dx, y - dy], colour, SUPERSAMPLING)
+        draw.ellipse([x - dot, y - dot, x + dot, y + dot], colour)
+    for i, (block, centre) in enumerate(zip(blocks, centres[:, :2], strict=True)):
+        (x, y), text = at(centre), f"{block.name}: {len(block.photographs)}"
+        box = draw.textbbox((x, y), text, letters, anchor="mm")
+        draw.rounded_rectangle([box[0] - 12, box[1] - 9, box[2] + 12, box[3] + 9], 12, f"{PAPER_COLOUR}e0")
+        draw.text((x, y), text, BLOCK_COLOURS[i % len(BLOCK_COLOURS)], letters, anchor="mm")
+    head = (
+        f"{len(blocks)} blocks, {len(places)} photographs; beside each name how many are of it, overlap counted twice"
+    )
+    letters = ImageFont.load_default(17 * SUPERSAMPLING)
+    draw.text((SUPERSAMPLING * MARGIN, SUPERSAMPLING * 22), head, INK_COLOUR, letters)
+    return image.resize((image.width // SUPERSAMPLING, image.height // SUPERSAMPLING), Image.Resampling.LANCZOS)

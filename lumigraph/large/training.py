@@ -1,27 +1,58 @@
-"""Train all blocks of a run, in this process one after another or on the workers of a Ray cluster; then align their
-appearances, or merge their clouds."""
+"""Train all blocks of a run, in this process one after another or on Ray's workers; then align their appearances, or
+merge their clouds. Train one block again from other photographs.
+
+Workers are on this machine, or on a cluster with storage that all its machines share. A block goes out as a path and
+comes back as a few numbers: photographs are read where they are learnt from, and states are files. So a worker, a
+machine or this process may be lost at any time; training continues from what was saved.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import contextlib
+import os
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from .. import files
+from ..budget import Budget
+from ..capture import Places
 from ..components.fields.appearance import Appearance
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
 from ..files.locks import held
 from ..method.capabilities import HasGaussians, can
-from .appearance_alignment import align_appearance
+from ..system.allocation import settle_memory
+from ..system.signals import Interrupt
+from .alignment import align_appearance
 from .block_cache import Nearby
 from .block_run import BlockRun
+from .layout import Disc, members
 from .monitor import Watching, in_order
-from .on_ray import Workers, on_workers
-from .plan import PLAN_FILE, Done, Plan
-from .planning import place_of
-from .worker import Conducted, train_block
+from .plan import PLAN_FILE, TASK_FILE, Block, Done, Plan, Task, source_of
+from .planning import place_of, write_task
+from .worker import Conducted, Ended, finished, train_block, writable
 
 CLOUD_FILE = "cloud.ply"
+UPDATES_FOLDER = "updates"  # in the run: a block is trained there before it replaces the old one
+INSTALL_MESSAGE = "Ray is not installed, which shares blocks out to workers: pip install 'lumigraph[ray]', or leave out"
+MAX_LOSSES = 30  # of a block's worker, before the block is given up
+ADDRESS_TIMEOUT = 10.0  # seconds
+POLL_SECONDS = 0.5  # between checks for a stop
+END_SECONDS = 90.0  # for workers to finish their step and save after a stop
+STORE_BYTES = 100 << 20  # of Ray's object store on this machine: results are small
+RAY_ENVIRONMENT = {  # that Ray reads as it is loaded, unless the user's environment has them
+    "RAY_USAGE_STATS_ENABLED": "0",  # no reports
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_worker_niceness": "0",  # else workers get next to nothing of a busy machine
+}
 
 
 def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Conducted:
@@ -32,25 +63,19 @@ def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Condu
     """
     folders = {block.name: place_of(run, block) for block in plan.blocks}
     with held(run, "trained"), Watching(run, folders, show):
-        if workers.count is None and workers.address is None:
-            return one_by_one(folders)
-        return on_workers(run, folders, workers)
-
-
-def one_by_one(folders: dict[str, Path]) -> Conducted:
-    """In this process."""
-    done: dict[str, Done] = {}
-    failed: dict[str, str] = {}
-    for name in in_order(folders):
-        try:
-            ended = train_block(folders[name])
-        except LumigraphError as fault:
-            failed[name] = str(fault)
-            continue
-        if ended.done is None:
-            return Conducted(done, failed, ended.signal)
-        done[name] = ended.done
-    return Conducted(done, failed)
+        if workers.count is not None or workers.address is not None:
+            return on_workers(folders, workers)
+        found = Conducted({}, {})
+        for name in in_order(folders):  # in this process
+            try:
+                ended = train_block(folders[name])
+            except LumigraphError as fault:
+                found.failed[name] = str(fault)
+                continue
+            if ended.done is None:
+                return replace(found, signal=ended.signal)
+            found.done[name] = ended.done
+        return found
 
 
 def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
@@ -82,3 +107,182 @@ def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
     plan = replace(opened.plan, appearance=found | known)
     plan.write(opened.folder / PLAN_FILE)
     return plan
+
+
+def update(
+    run: Path, name: str, source: str, places: Places, options: dict[str, Any], budget: Budget | None, show: bool = True
+) -> Ended:
+    """Learn a block of a run again, put it into its place, and align it to its neighbours.
+
+    source, places: of the new photographs, in the frame of the old ones
+    options: of `open_dataset` for them
+    budget:  None for the one that the block had
+    The new block replaces the old one when it is done; an interrupted update continues. Files of other blocks stay.
+    Raises LumigraphError for an unknown block, and where no photograph is of it.
+    """
+    if not files.is_file(run / PLAN_FILE):
+        raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
+    with held(run, "trained"):
+        plan = Plan.read(run / PLAN_FILE)
+        block = again(plan.block(name), source, places, options, budget)
+        task, place = plan.task(block), place_of(run, block)
+        if not ((place / TASK_FILE).exists() and Task.read(place).key == task.key and finished(place, task)):
+            folder = run / UPDATES_FOLDER / f"{name}-{task.key[:8]}"
+            write_task(folder, task)
+            with Watching(run, {name: folder}, show):
+                ended = train_block(folder)
+            if ended.done is None:
+                return ended
+            files.exchange(folder, place)
+            shutil.rmtree(folder, ignore_errors=True)  # what was there before
+        blocks = [block if one.name == name else one for one in plan.blocks]
+        replace(plan, blocks=blocks).write(run / PLAN_FILE)
+        finish(run, again=[name])
+    return Ended(finished(place, task))
+
+
+def again(block: Block, source: str, places: Places, options: dict[str, Any], budget: Budget | None) -> Block:
+    """The block as it will learn from other photographs."""
+    chosen = members(places, Disc(block.centre, block.radius))
+    learnt = np.array([split == "train" for split in places.splits])
+    if (chosen & learnt).sum() < 2:
+        raise LumigraphError(
+            f"{source} has fewer than two photographs to learn from within block {block.name}; their poses must be in "
+            "the frame of the run's own photographs, so capture them together with some of those"
+        )
+    names = [places.names[i] for i in np.flatnonzero(chosen)]
+    told = budget.to_json() if budget else block.budget
+    return replace(block, photographs=names, scene=source_of(source, options), budget=told)
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Workers that train blocks.
+
+    count:   blocks at a time on this machine, each in a process of its own; None for this process alone
+    address: of a Ray cluster that is there already, HOST:PORT
+    cpus, gpus, memory: demand of a block: processors, GPUs, bytes
+    """
+
+    count: int | None = None
+    address: str | None = None
+    cpus: int = 1
+    gpus: float = 0.0
+    memory: int = 2 << 30
+
+
+def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
+    """Learn blocks on workers. Raises LumigraphError where Ray is not there, or nothing answers at the address."""
+    ray = library("--workers" if workers.address is None else "--address")
+    with connected(ray, workers), Interrupt() as interrupt:
+        feasible(ray.nodes(), workers)
+        demand = {"num_cpus": workers.cpus, "num_gpus": workers.gpus, "memory": workers.memory}
+        remote = ray.remote(**demand, max_retries=MAX_LOSSES)(on_worker)
+        waiting = {remote.remote(str(folders[name].resolve())): name for name in in_order(folders)}
+        done: dict[str, Done] = {}
+        failed: dict[str, str] = {}
+        told_at = 0.0
+        while waiting:
+            ready, _ = ray.wait(list(waiting), num_returns=1, timeout=POLL_SECONDS)
+            for one in ready:
+                name = waiting.pop(one)
+                try:
+                    found = ray.get(one)
+                except ray.exceptions.TaskCancelledError:
+                    continue
+                except ray.exceptions.RayError as fault:
+                    failed[name] = sentence(fault)
+                    continue
+                if isinstance(found, Done):
+                    done[name] = found
+                elif found is not None:
+                    failed[name] = found
+            if interrupt.signal and not told_at:
+                told_at = time.monotonic()
+                for one in waiting:
+                    ray.cancel(one, force=False)
+            if told_at and time.monotonic() > told_at + END_SECONDS:
+                break
+    return Conducted(done, failed, interrupt.signal)
+
+
+def on_worker(folder: str) -> Done | str | None:
+    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped."""
+    settle_memory()
+    with contextlib.redirect_stderr(sys.stdout):
+        try:
+            writable(Path(folder))
+            return train_block(Path(folder)).done
+        except LumigraphError as fault:
+            return str(fault)
+
+
+@contextlib.contextmanager
+def connected(ray: Any, workers: Workers) -> Iterator[None]:
+    """A cluster: one on this machine for as long as the block lasts, or one that is there already."""
+    if workers.address is not None:
+        answering(workers.address)
+        place: dict[str, Any] = {"address": workers.address}
+    else:
+        cpus = workers.cpus * (workers.count or 1)
+        place = {"num_cpus": cpus, "object_store_memory": STORE_BYTES, "include_dashboard": False}
+    try:
+        ray.init(**place, logging_level="error", log_to_driver=False)
+    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as fault:
+        where = workers.address or "this machine"
+        raise LumigraphError(
+            f"Ray on {where} could not be used ({first_line(fault)}); look at `ray status`, and where the cluster asks "
+            "for a token, set RAY_AUTH_MODE=token here as well"
+        ) from fault
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
+    """Raise LumigraphError unless some machine of the cluster has what a block asks for; Ray would wait for one."""
+    asked = {"CPU": workers.cpus, "GPU": workers.gpus, "memory": workers.memory}
+    there = [node["Resources"] for node in nodes if node.get("Alive")]
+    if not any(all(node.get(name, 0) >= least for name, least in asked.items()) for node in there):
+        raise LumigraphError(
+            f"No machine of the cluster has what a block asks for ({workers.cpus} processors, {workers.gpus:g} GPUs, "
+            f"{workers.memory / 1e9:.1f} GB of memory); start one that has, by `ray start`"
+        )
+
+
+def library(option: str) -> Any:
+    """Ray itself. Raises LumigraphError, saying how to install it, where it is not."""
+    for name, value in RAY_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+    except ImportError as fault:
+        raise LumigraphError(f"{INSTALL_MESSAGE} {option} to learn block after block in this process") from fault
+    return ray
+
+
+def answering(address: str) -> None:
+    """Raise LumigraphError unless something listens at HOST:PORT."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdigit()):
+        raise LumigraphError(f"--address {address} is no HOST:PORT; `ray start --head` says which it is")
+    try:
+        socket.create_connection((host, int(port)), ADDRESS_TIMEOUT).close()
+    except (OSError, OverflowError) as fault:
+        raise LumigraphError(
+            f"Nothing answers at {address} ({first_line(fault)}); start a cluster there with `ray start --head "
+            f"--port={port}`, or correct --address"
+        ) from fault
+
+
+def sentence(fault: BaseException) -> str:
+    """Why a block was given up."""
+    if "OutOfMemory" in type(fault).__name__:
+        return "its worker ran out of memory again and again; give smaller blocks, or fewer --workers"
+    return f"its worker was lost {MAX_LOSSES} times or failed ({first_line(fault)})"
+
+
+def first_line(fault: BaseException) -> str:
+    lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
+    return (lines[-1] if lines else type(fault).__name__).rstrip(".")

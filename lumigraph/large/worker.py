@@ -5,8 +5,8 @@
     ├── config.json, cameras.json, checkpoints/, metrics.jsonl ...   an ordinary run
     └── done.json     last, with a hash of the task
 
-What is done is skipped, what has a state goes on from it, anything else begins. So it may be called again whenever a
-process, a machine or whoever drives them was lost.
+A finished block is skipped, a block with a state continues from it, any other begins. So it may be called again after
+the loss of a process or a machine.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -66,7 +66,7 @@ def train_block(folder: Path, save_every: float = SAVE_SECONDS) -> Ended:
     if (done := finished(folder, task)) is not None:
         return Ended(done)
     with patiently_held(folder), limited(task.threads):
-        if (done := finished(folder, task)) is not None:  # by whoever held it
+        if (done := finished(folder, task)) is not None:  # by the process that held it
             return Ended(done)
         begin = time.perf_counter()
         data = opened(task)
@@ -127,19 +127,16 @@ def begun(folder: Path, task: Task, data: Scene) -> tuple[Run, Method]:
 def patiently_held(folder: Path) -> Iterator[None]:
     """Hold a block's folder; wait for a while for a process that is about to end. Raises LumigraphError as `held`."""
     until = time.monotonic() + LOCK_TIMEOUT
-    while True:
-        holding = held(folder, "trained")
-        try:
-            holding.__enter__()
-            break
-        except LumigraphError:
-            if time.monotonic() > until:
-                raise
-            time.sleep(0.5)
-    try:
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(held(folder, "trained"))
+                break
+            except LumigraphError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.5)
         yield
-    finally:
-        holding.__exit__(None, None, None)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What some methods can do beyond rendering, and one way to ask for it: `can(method, HasDensity)`."""
+"""Capabilities of methods beyond rendering, and a test for one: `can(method, HasDensity)`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ..errors import LumigraphError
 from ..exchange.baked import Atlas, Octree
 from ..exchange.packing import Stored
 from ..gaussians import Gaussians
+from .field import Colours, Densities, Directions, Points
 
 
 @runtime_checkable
@@ -28,9 +29,7 @@ class HasDensity(Protocol):
 class HasField(Protocol):
     """Knows density and colour at points, as baking, conversion and composition ask for them."""
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
 
 
@@ -88,9 +87,7 @@ class RefinesPoses(Protocol):
 class HasVisibility(Protocol):
     """Knows which places its photographs saw."""
 
-    def visibility(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> Float[Tensor, " point"]:
+    def visibility(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
         """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
 
 
@@ -129,7 +126,7 @@ class HasLooks(Protocol):
     """Marches along rays."""
 
     def looks(self, rays: Rays) -> list[Look]:
-        """What lies along rays, one entry for each pass, the one that is composited into the picture last."""
+        """Density and colour along rays, one entry for each pass, the one that is composited last."""
 
 
 @runtime_checkable
@@ -137,11 +134,11 @@ class CanCompress(Protocol):
     """Says how it may be stored in fewer bytes."""
 
     def storage(self) -> dict[str, Stored]:
-        """How tensors of `state_dict` may be stored, by name; those that are not named are stored to the bit."""
+        """Storage of tensors of `state_dict`, by name; those that are not named are stored to the bit."""
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each row of tensors, by name, adds to one picture (Li 2023, eq. 4): the sum over pixels of the
-        compositing weights that it has a share in."""
+        """Share of each row of tensors, by name, in one picture (Li 2023, eq. 4): the sum over pixels of the
+        compositing weights that it contributes to."""
 
     def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
         """Take out the rows that matter least, which together have a share of all importance; gives the importance of
@@ -177,7 +174,7 @@ LACKING = {
 
 
 def can(method: object, capability: type[Any]) -> bool:
-    """Whether a method, or all of a class, has a capability. Its class must have the functions: a network may be called
+    """True if a method, or all of a class, has a capability. Its class must have the functions: a network may be called
     `field` too. Values must be there and not None; `isinstance` does not find those that are submodules."""
     kind = method if isinstance(method, type) else type(method)
     functions = [name for name in vars(capability) if not name.startswith("_")]

@@ -58,7 +58,7 @@ class Control:
 
     @property
     def domain(self) -> str:
-        """What the control can be, as text: "-3 to 3 stops", "colour, grey"."""
+        """Range or choices as text: "-3 to 3 stops", "colour, grey"."""
         if self.range is not None:
             return " ".join([f"{self.range[0]:g} to {self.range[1]:g}", *([self.unit] if self.unit else [])])
         if len(self.choices) <= NAMED:

@@ -10,6 +10,11 @@ from torch import Tensor
 
 from .part import Part
 
+Points = Float[Tensor, "point 3"]  # in the scene
+Directions = Float[Tensor, "point 3"]  # unit length
+Colours = Float[Tensor, "point 3"]  # sRGB-encoded
+Densities = Float[Tensor, " point"]  # per scene unit
+Codes = Float[Tensor, "point code"]
 Features = Tensor | tuple[Tensor, ...]  # of points, one row each: what `Field.colour` takes of `Field.geometry`
 
 
@@ -30,29 +35,18 @@ class Field(Part):
     joint: ClassVar[bool] = False
 
     @abstractmethod
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
-    ) -> tuple[Float[Tensor, " point"], Features]:
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Features]:
         """Density per scene unit, and features for `colour`."""
 
     @abstractmethod
-    def colour(
-        self, features: Any, directions: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
         """sRGB-encoded colour seen along unit directions. features: as `geometry` gives them"""
 
-    def density(
-        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
-    ) -> Float[Tensor, " point"]:
+    def density(self, points: Points, code: Codes | None = None) -> Densities:
         """Density per scene unit."""
         return self.geometry(points, code)[0]
 
-    def forward(
-        self,
-        points: Float[Tensor, "point 3"],
-        directions: Float[Tensor, "point 3"],
-        code: Float[Tensor, "point code"] | None = None,
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def forward(self, points: Points, directions: Directions, code: Codes | None = None) -> tuple[Densities, Colours]:
         """Density per scene unit and sRGB-encoded colour."""
         density, features = self.geometry(points, code)
         return density, self.colour(features, directions, code)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..camera.rays import Look, Rays, Rendering
 from ..datasets.scene import Batch, Scene
 from ..volume import composite
-from .field import Field
+from .field import Colours, Densities, Directions, Field, Points
 from .ray_method import RayMethod
 from .sampler import Pass, Sampler
 
@@ -69,9 +69,7 @@ class FieldMethod(RayMethod, ABC):
 
     # At points
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
         code = self.shown_code
         density, rgb = self.network(points, directions, None if code is None else code.expand(len(points), -1))

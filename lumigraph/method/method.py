@@ -25,7 +25,7 @@ from .part import Part
 
 @runtime_checkable
 class Lesson(Protocol):
-    """What one step learns from: rays, a photograph, points of a shape. Its length is how many.
+    """Input of one step: rays, a photograph, points of a shape. Its length is their number.
 
     unit: what is counted, in the plural: "rays", "points"
     """
@@ -71,7 +71,12 @@ class Method(nn.Module, ABC):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """The Config to use where the user chose none: the paper's on a GPU, on a CPU what learns most in a minute."""
+        """The Config to use where the user chose none: the paper's on a GPU, `cpu_preset` elsewhere."""
+        return cls.Config() if device.type == "cuda" else cls.cpu_preset()
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """Numbers that learn most in a minute on a CPU; the paper's by default."""
         return cls.Config()
 
     @classmethod
@@ -94,7 +99,7 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def batch(self, data: Any, generator: torch.Generator) -> Lesson:
-        """What one step learns from. All randomness comes from `generator`, on the CPU."""
+        """Input of one step. All randomness comes from `generator`, on the CPU."""
 
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         """The terms to minimise, by name; their sum descends."""
@@ -127,7 +132,7 @@ class Method(nn.Module, ABC):
 
     @property
     def complete(self) -> bool:
-        """Whether there is nothing left to learn, whatever the budget: after the last photograph of a fusion, say."""
+        """True if nothing is left to learn at any budget, such as after the last photograph of a fusion."""
         return False
 
     def begin(self, data: Any, seconds: float = math.inf) -> None:
@@ -161,7 +166,7 @@ class Method(nn.Module, ABC):
 
     @abstractmethod
     def render(self, camera: Camera) -> Rendering:
-        """What one camera sees, (height, width, ...), without gradients, in eval mode."""
+        """Rendering of one camera, (height, width, ...), without gradients, in eval mode."""
 
     @property
     def background(self) -> Float[Tensor, "1 3"]:
@@ -177,7 +182,7 @@ class Method(nn.Module, ABC):
 
     @property
     def moves_cameras(self) -> bool:
-        """Whether a part learns poses; what would follow from given poses is then left out of `begin`."""
+        """True if a part learns poses; `begin` then derives nothing from the given ones."""
         return any(part.moves_cameras for part in self.parts)
 
     def storage(self) -> dict[str, Stored]:
@@ -189,7 +194,7 @@ class Method(nn.Module, ABC):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """What a user may turn, beside the camera."""
+        """Settings that a user may change, beside the camera."""
         return tuple(control for part in self.parts for control in part.controls)
 
     @property
@@ -200,7 +205,7 @@ class Method(nn.Module, ABC):
 
     @property
     def evidence_views(self) -> int | None:
-        """How many photographs of a scene it is given where nobody says; None for all there are to learn from."""
+        """Default number of photographs of a scene as evidence; None for all to learn from."""
         return None
 
     def evidence_bytes(self, scene: Scene) -> int:

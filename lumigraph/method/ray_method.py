@@ -41,8 +41,8 @@ class RayMethod(Method):
     @property
     def pass_weights(self) -> dict[str, float]:
         """Weights of the passes' errors in the loss, by the names of their looks; 1 for one that is not named. Nothing
-        is learnt from a pass of weight 0."""
-        return {}
+        is learnt from a pass of weight 0. By default the Config's `coarse_loss_weight`, if it has one."""
+        return {"coarse": getattr(self.config, "coarse_loss_weight", 1.0)}
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of each pass's picture (Mildenhall 2020, eq. 6), where `looks` takes a generator beside the
@@ -59,7 +59,7 @@ class RayMethod(Method):
         return terms
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """What each ray sees, in front of a background colour: the last look at it, composited."""
+        """Rendering of each ray before a background colour: the last look, composited."""
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
 

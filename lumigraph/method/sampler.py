@@ -16,6 +16,7 @@ from ..camera.rays import Look, Rays, Samples
 from .field import Features, Field
 from .part import Part
 
+RayCodes = Float[Tensor, "ray code"]
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
@@ -92,11 +93,7 @@ class Sampler(Part):
 
     @abstractmethod
     def sample(
-        self,
-        rays: Rays,
-        field: Field,
-        code: Float[Tensor, "ray code"] | None = None,
-        generator: torch.Generator | None = None,
+        self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
         """Passes along rays, the one that is composited last.
 

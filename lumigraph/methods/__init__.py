@@ -65,6 +65,6 @@ def learning_from(dataset: type[Any]) -> list[str]:
 
 
 def name_of(method: Any) -> str:
-    """What the user types for a method, or for its class: the name of the file that holds it."""
+    """Name of a method or its class on the command line: that of its file."""
     kind = method if isinstance(method, type) else type(method)
     return kind.__module__.rpartition(".")[2].replace("_", "-")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -13,23 +13,23 @@ from torch import Tensor, nn
 from .. import kernels
 from ..camera import Camera
 from ..camera.rays import Look
-from ..components.fields.mlp import MLP
+from ..components.fields.layers import MLP
 from ..components.fields.teacher import cells_of, logit, teacher_of
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import sampler_for
+from ..components.sampling.samplers import ProposalNumbers, sampler_for
 from ..components.sampling.spaces import NDC, Space, space_of
-from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
+from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod
+from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
 Voxels = Annotated[int, between(64, 1 << 30)]
@@ -116,18 +116,14 @@ class VoxelField(Field):
     def grids(self) -> tuple[VoxelGrid, VoxelGrid]:
         return self.density_grid, self.feature_grid
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density: interpolate, then activate (section 4.1, "post-activation"). Features: the points' coordinates."""
         coordinates = self.space.warp(points)
         thickness = nn.functional.softplus(self.density_grid(coordinates)[:, 0] + self.shift(int(self.stage)))
         density = thickness * float(1 / self.edge)  # contracted voxels are larger
         return density * self.space.stretch(points) if self.space.is_open else density, coordinates
 
-    def colour(
-        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
         found = self.feature_grid(features)
         harmonics = kernels.spherical_harmonics(directions, self.config.sh_bands)
         if self.stage == 0:  # which knows one colour for all directions (section 4.2)
@@ -175,46 +171,20 @@ class DVGO(FieldMethod):
         self._adam: LazyAdam | None = None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            coarse_voxels=64**3,
-            voxels=128**3,
-            hidden_width=32,
-            coarse_share=0.1,
-            doublings=3,
-            growing_share=0.4,
-            step_size=0.8,
-            occupancy=OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1),
-            open_samples_per_step=1 << 16,
-            density_learning_rate=0.6,
-            feature_learning_rate=0.2,
-            network_learning_rate=5e-3,
-            point_weight=0.0,
-            entropy_weight=0.0,
-        )
+    def cpu_preset(cls) -> Any:
+        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1)
+        c = Config(occupancy, coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8)
+        c = replace(c, coarse_share=0.1, doublings=3, growing_share=0.4, open_samples_per_step=1 << 16)
+        c = replace(c, density_learning_rate=0.6, feature_learning_rate=0.2, network_learning_rate=5e-3)
+        return replace(c, point_weight=0.0, entropy_weight=0.0)
 
     @classmethod
     def smallest(cls) -> Any:
         """Grids of a few thousand voxels that reach the fine stage and double twice within some twenty quick steps."""
-        return Config(
-            coarse_voxels=16**3,
-            voxels=24**3,
-            feature_channels=4,
-            hidden_width=16,
-            hidden_layers=1,
-            sh_bands=2,
-            coarse_share=0.2,
-            doublings=2,
-            growing_share=0.5,
-            occupancy=OccupancyNumbers(4096, occupancy_resolution=16),
-            open_samples_per_step=4096,
-            density_learning_rate=0.5,
-            feature_learning_rate=0.2,
-            network_learning_rate=1e-2,
-        )
+        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), coarse_voxels=16**3, voxels=24**3)
+        c = replace(c, feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096)
+        c = replace(c, density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2)
+        return replace(c, coarse_share=0.2, doublings=2, growing_share=0.5)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -260,7 +230,7 @@ class DVGO(FieldMethod):
         return {name: share * rate for name, rate in {**rates, "network": c.network_learning_rate}.items()}
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """What no learning is needed for: the silhouettes' hull, and how many photographs see each voxel."""
+        """Initialise with the silhouettes' hull and the number of photographs that see each voxel."""
         super().begin(data, seconds)
         if self._adam is not None:
             rates = self._view_share(data)
@@ -316,8 +286,8 @@ class DVGO(FieldMethod):
 
     @torch.no_grad()
     def _view_share(self, scene: Scene) -> Float[Tensor, " corner"]:
-        """How many photographs see each corner, as a share of the most: by it the coarse stage learns, so that what one
-        camera alone has before its lens does not grow dense first (section 4.1)."""
+        """Photographs that see each corner, as a share of the most: rates of the coarse stage, so that space before one
+        camera alone does not grow dense first (section 4.1)."""
         n = VIEW_CELLS
         counts = torch.zeros(n**3, device=self.device)
         box = self.network.density_grid.box
@@ -373,7 +343,7 @@ class DVGO(FieldMethod):
         self.sampler.settle(self.density, self.random(~0))
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each corner adds to one picture; see `components.sampling.importance`."""
+        """Share of each corner in one picture; see `components.sampling.importance`."""
 
         def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
             return self.network.density_grid(self.network.space.warp(points))

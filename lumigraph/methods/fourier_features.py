@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera.rays import Rays, Rendering
-from ..components.fields.dense import Dense
-from ..components.fields.encodings import FourierFeatures as Waves
+from ..components.fields.encodings import FourierEncoding
+from ..components.fields.layers import Dense
 from ..datasets.scene import Batch, Frame, Scene
 from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
 from ..method import RayMethod
@@ -48,15 +48,15 @@ class FourierFeatures(RayMethod):
     Config = Config
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        rows = frequencies(config)
-        self.encoding = nn.Identity() if rows is None else Waves(rows)
-        widths = [2 if rows is None else 2 * len(rows), *[config.hidden_width] * (config.layers - 1)]
+        c = config or Config()
+        super().__init__(frame, c)
+        rows = frequencies(c)
+        self.encoding = nn.Identity() if rows is None else FourierEncoding(rows)
+        widths = [2 if rows is None else 2 * len(rows), *[c.hidden_width] * (c.layers - 1)]
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            hidden = [Dense(a, b, relu=True, exact=config.exact or a < FEW) for a, b in pairwise(widths)]
-            self.layers = nn.Sequential(*hidden, Dense(config.hidden_width, 3, exact=True))
+            torch.manual_seed(c.seed)
+            hidden = [Dense(a, b, relu=True, exact=c.exact or a < FEW) for a, b in pairwise(widths)]
+            self.layers = nn.Sequential(*hidden, Dense(c.hidden_width, 3, exact=True))
 
     @classmethod
     def smallest(cls) -> Any:
@@ -74,7 +74,7 @@ class FourierFeatures(RayMethod):
         return Rendering(rgb, t.where(hit, math.inf), hit.float())
 
     def meet(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 2"], Bool[Tensor, " ray"]]:
-        """Where rays meet the wall: how far away, at which place, and whether within the scene's bounds at all."""
+        """Intersections of rays with the wall: distance, place, and a mask of those within the scene's bounds."""
         t = -rays.origins[:, 1] / rays.directions[:, 1]
         x, _, z = rays.at(t).unbind(1)
         (left, _, bottom), (right, _, top) = self.frame.bounds

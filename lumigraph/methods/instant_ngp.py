@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import torch
@@ -10,23 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
-from ..components.fields.teacher import teacher_of
+from ..components.fields.hash_field import HashField, HashNumbers
+from ..components.fields.teacher import distil, teacher_of
 from ..components.sampling.importance import importance
-from ..components.sampling.occupancy_sampler import (
-    CPU_OCCUPANCY,
-    CPU_STEPS,
-    TINY_OCCUPANCY,
-    TINY_STEPS,
-    OccupancyNumbers,
-    StepNumbers,
-)
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import sampler_for
+from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ..components.sampling.spaces import Box, space_of
-from ..components.training.distillation import distil
-from ..components.training.exposure import Exposure, Setting
-from ..components.training.photometric import backdrop, huber, residuals
+from ..components.training.photometric import Exposure, Setting, backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
 from ..datasets.scene import Batch, Frame
@@ -38,8 +28,7 @@ from ..volume import composite
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them, but for huber_delta and scenes without bounds; `InstantNGP.preset`
-    has those of a plain CPU."""
+    """The paper's numbers, but for huber_delta and scenes without bounds; `InstantNGP.preset` has a plain CPU's."""
 
     table: HashNumbers = HashNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()
@@ -60,7 +49,7 @@ class Config:
 class InstantNGP(FieldMethod):
     """A hash table sampled in occupied cells, or where proposals are in scenes without bounds."""
 
-    Config = Config
+    Config, further_bytes = Config, staticmethod(sampling_bytes)
     network: HashField
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -77,31 +66,15 @@ class InstantNGP(FieldMethod):
         self.exposure = Exposure(frame.image_count, c.exposure_correction) if learns_gains else None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute: half as many levels with twice the
-        features, smaller tables and networks, a wider step and a smaller batch."""
-        if device.type == "cuda":
-            return Config()
-        sampling = CPU_TABLE, CPU_OCCUPANCY, CPU_STEPS
-        return Config(*sampling, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
+    def cpu_preset(cls) -> Any:
+        """Half as many levels with twice the features, smaller tables and networks, a wider step, a smaller batch."""
+        return Config(**CPU_HASH, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and networks with both corrections and a grid of three sizes, within some twenty quick steps."""
-        return Config(
-            table=TINY_TABLE,
-            occupancy=TINY_OCCUPANCY,
-            steps=TINY_STEPS,
-            poses=PoseNumbers(refine_cameras=True),
-            hidden_width=16,
-            learning_rate=2e-2,
-            exposure_correction="yes",
-        )
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        activations = config.table.activation_bytes(config.occupancy.samples_per_step, config.hidden_width)
-        return super().further_bytes(frame, config, learning) + activations * learning
+        c = Config(**TINY_HASH, poses=PoseNumbers(refine_cameras=True), exposure_correction="yes")
+        return replace(c, hidden_width=16, learning_rate=2e-2)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The Huber loss of composited colours, before random backgrounds where rays need not end."""

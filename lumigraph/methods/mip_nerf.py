@@ -8,17 +8,15 @@ from typing import Any
 import torch
 
 from ..camera import Camera
-from ..components.fields.coordinate_field import NetworkNumbers
-from ..components.fields.frustum_field import FrustumField
-from ..components.fields.teacher import teacher_of
+from ..components.fields.coordinate_field import FrustumField, NetworkNumbers
+from ..components.fields.teacher import POINTS_PER_RAY, distil, teacher_of
 from ..components.sampling.cone_sampler import ConeSampler
-from ..components.sampling.hierarchical_sampler import RayNumbers
-from ..components.sampling.occupancy_mask import MaskNumbers
+from ..components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
+from ..components.sampling.occupancy import MaskNumbers
+from ..components.sampling.samplers import sampling_bytes
 from ..components.sampling.spaces import space_of
-from ..components.training.coarse_to_fine import BandSchedule, joining_of
-from ..components.training.distillation import POINTS_PER_RAY, distil
 from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..components.training.schedules import falling
+from ..components.training.schedules import BandSchedule, exponential_decay, joining_of
 from ..datasets.scene import Frame
 from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width
 from ..method import FieldMethod
@@ -45,7 +43,7 @@ class Config:
 class MipNeRF(FieldMethod):
     """One network, evaluated twice on frustums of cones: evenly at first, then where density was found."""
 
-    Config = Config
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), exponential_decay
     network: FrustumField
     sampler: ConeSampler
 
@@ -59,39 +57,14 @@ class MipNeRF(FieldMethod):
         self.sampler = ConeSampler(space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding)
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller network, evaluated where something is."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            network=NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16),
-            rays=RayNumbers(32, 16, rays_per_step=1024),
-            mask=MaskNumbers(occupancy_resolution=128),
-            hidden_width=128,
-            learning_rate=4e-3,
-            final_learning_rate=2e-4,
-            coarse_loss_weight=0.0,
-            warmup=0.02,
-        )
+    def cpu_preset(cls) -> Any:
+        """A smaller network, evaluated where something is."""
+        return Config(**CPU_NETWORK, network=NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16))
 
     @classmethod
     def smallest(cls) -> Any:
         """The paper's network, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
-        return Config(
-            network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6),
-            rays=RayNumbers(16, 12, rays_per_step=192),
-            mask=MaskNumbers(occupancy_resolution=16),
-            hidden_width=32,
-            learning_rate=5e-3,
-            final_learning_rate=5e-4,
-            warmup=0.1,
-        )
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        masked = config.mask.occupancy_resolution > 0  # then the number of samples is not known beforehand
-        activations = config.network.activation_bytes(config.rays.samples_per_step, config.hidden_width)
-        return 0 if masked else activations * learning
+        return Config(**TINY_NETWORK, network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6))
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """The network, taught at points by the teacher."""
@@ -103,14 +76,5 @@ class MipNeRF(FieldMethod):
         points = POINTS_PER_RAY * c.rays.rays_per_step
         distil(self.network, known, self.network.space, [optimizer], points, chance, self.device)
 
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        return {"coarse": self.config.coarse_loss_weight}
-
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.network.parameters(), self.config.learning_rate), *super().optimizers()]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        """Exponential decay after a warm-up (section 4)."""
-        c = self.config
-        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)

@@ -10,13 +10,13 @@ from torch.nn.functional import softplus
 
 from ..camera import Camera
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ..components.fields.teacher import teacher_of
-from ..components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
-from ..components.sampling.occupancy_mask import MaskNumbers
+from ..components.fields.teacher import POINTS_PER_RAY, distil, teacher_of
+from ..components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, HierarchicalSampler, RayNumbers
+from ..components.sampling.occupancy import MaskNumbers
+from ..components.sampling.samplers import sampling_bytes
 from ..components.sampling.spaces import space_of
-from ..components.training.distillation import POINTS_PER_RAY, distil
 from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..components.training.schedules import falling
+from ..components.training.schedules import exponential_decay
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, between
@@ -53,7 +53,7 @@ class Config:
 class NeRF(FieldMethod):
     """Coarse samples evenly along each ray, fine ones where the coarse ones found density (section 5.2)."""
 
-    Config = Config
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), exponential_decay  # section 5.3
     network: CoordinateField
     sampler: HierarchicalSampler
 
@@ -71,42 +71,16 @@ class NeRF(FieldMethod):
         self.sampler = HierarchicalSampler(space, c.rays, c.mask, *passes)
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller network for both passes, evaluated where something is."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            network=NetworkNumbers(depth=6, skip_layer=3),
-            rays=RayNumbers(32, 16, rays_per_step=1024),
-            mask=MaskNumbers(occupancy_resolution=128),
-            hidden_width=128,
-            learning_rate=4e-3,
-            final_learning_rate=2e-4,
-            warmup=0.02,
-            networks=1,
-            coarse_loss_weight=0.0,
-            transmittance_threshold=1e-3,
-        )
+    def cpu_preset(cls) -> Any:
+        """A smaller network for both passes, evaluated where something is."""
+        network = NetworkNumbers(depth=6, skip_layer=3)
+        return Config(**CPU_NETWORK, network=network, networks=1, transmittance_threshold=1e-3)
 
     @classmethod
     def smallest(cls) -> Any:
         """The paper's two networks, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
-        return Config(
-            network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=5),
-            rays=RayNumbers(16, 12, rays_per_step=192),
-            mask=MaskNumbers(occupancy_resolution=16),
-            hidden_width=32,
-            learning_rate=5e-3,
-            final_learning_rate=5e-4,
-            transmittance_threshold=1e-3,
-            warmup=0.1,
-        )
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        masked = config.mask.occupancy_resolution > 0  # then the number of samples is not known beforehand
-        activations = config.network.activation_bytes(config.rays.samples_per_step, config.hidden_width)
-        return 0 if masked else activations * learning
+        network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=5)
+        return Config(**TINY_NETWORK, network=network, transmittance_threshold=1e-3)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Both networks alike, taught at points by the teacher."""
@@ -119,15 +93,6 @@ class NeRF(FieldMethod):
         if network.coarse:
             network.coarse.network.load_state_dict(network.network.state_dict())
 
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        return {"coarse": self.config.coarse_loss_weight}
-
     def optimizers(self) -> list[torch.optim.Optimizer]:
         own = torch.optim.Adam(self.network.parameters(), self.config.learning_rate, eps=1e-7)
         return [own, *super().optimizers()]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        """Exponential decay (section 5.3)."""
-        c = self.config
-        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)

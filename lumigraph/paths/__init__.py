@@ -1,5 +1,13 @@
 """Camera paths of films: automatic ones, and curves through keyframes."""
 
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..datasets.scene import Frame
+from ..errors import LumigraphError
 from .automatic import PATHS as PATHS
 from .automatic import UP as UP
 from .automatic import Surroundings as Surroundings
@@ -7,7 +15,59 @@ from .automatic import angle_of_view as angle_of_view
 from .automatic import camera_path as camera_path
 from .automatic import film_size as film_size
 from .automatic import fitting as fitting
-from .film import PATH_KINDS as PATH_KINDS
-from .film import film_cameras as film_cameras
-from .opening import best_centred as best_centred
-from .opening import pivot as pivot
+from .keyframes import CameraPath
+
+DEFAULT_SIZE = 480  # pixels of a film by default
+DEFAULT_FRAMES = 120  # of a film along a path without a length
+OUTWARD_FOCUS_DISTANCE = 0.02  # scene units from an outward-looking camera to its pivot, so that it turns on the spot
+MIN_FOCUS_SHARE = 0.1  # of the typical distance to the focus: smallest distance of a pivot
+PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
+
+
+def film_cameras(
+    cameras: dict[str, Camera], frame: Frame, path: str | CameraPath, frames: int | None = None, size: int | None = None
+) -> Camera:
+    """The cameras of a film, one for each frame.
+
+    cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
+    path:   one of PATH_KINDS, or a CameraPath
+    frames: None for the default of the path: 120, every held-out view, as long as keyframes last
+    size:   longer side; None as the photographs, up to a limit
+    Raises LumigraphError for held-out views where there are none, or of several sizes.
+    """
+    if path != "held-out":
+        train = cameras["train"]
+        shape = film_size(train, size or min(DEFAULT_SIZE, int(train.size[0].max())))
+        if isinstance(path, str):
+            return camera_path(path, train, frame, DEFAULT_FRAMES if frames is None else frames, shape)
+        return path.cameras(frame, shape, frames)
+    views = cameras.get("test")
+    if views is None or not len(views):
+        raise LumigraphError("There are no held-out views here; choose another --path")
+    if len(views.size.unique(dim=0)) > 1:
+        raise LumigraphError("The held-out views are of several sizes, which no film holds; choose another --path")
+    longest = size or min(DEFAULT_SIZE, int(views.size.max()))
+    return views[: frames or len(views)].resized(longest / int(views.size.max()))
+
+
+def pivot(around: Surroundings, position: Float[Tensor, " 3"], forward: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    """The point that a camera turns about, on its optical axis and in the scene's frame.
+
+    Among photographs that look inward it is the point of the axis nearest to their focus, c + max(d . (f - c), m) d,
+    where m keeps a camera that looks elsewhere from turning about a point in its own lens. Among those that look
+    outward it lies OUTWARD_FOCUS_DISTANCE of the camera.
+
+    forward: unit length
+    """
+    if not around.inward:
+        return position + OUTWARD_FOCUS_DISTANCE * forward
+    least = MIN_FOCUS_SHARE * float(around.polar[:, 2].median().exp())
+    return position + max(float((around.focus - position) @ forward), least) * forward
+
+
+def best_centred(around: Surroundings) -> int:
+    """Number of the photograph whose optical axis passes the focus at the smallest angle; the one in the middle of all,
+    where they look outward."""
+    if not around.inward:
+        return around.middle
+    return int(around.cosine.argmax())

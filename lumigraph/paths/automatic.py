@@ -1,6 +1,6 @@
 """Camera paths for films. They follow where the photographs were taken from, so that nothing unseen is shown.
 
-Cameras that look at something are described by where they stand around it: azimuth, elevation and distance about the
+Cameras that look at something are described by their position around it: azimuth, elevation and distance about the
 point that they look at. Photographs taken all around it give a full circle; those from one side, a sway to and fro.
 Cameras that look outward give a turn on the spot, where one of them stood. All paths but `held_out` close upon
 themselves or end smoothly.
@@ -26,7 +26,7 @@ from ..geometry import look_at, nearest_to_lines, unit
 Poses = Float[Tensor, "frame 3 4"]
 
 FULL_CIRCLE = math.radians(260)  # of azimuth that must be covered for a path to go all the way round
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.double)  # scenes stand upright
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.double)  # scenes are upright
 SHARPNESS = 4.0  # of the weights with which nearby cameras set a path's height and distance (von Mises)
 MAX_DEVIATIONS = 4.0  # median deviations of log distance beyond which a camera does not count
 FRAMES_PER_KEY = 6  # interpolated frames between two photographs, at least

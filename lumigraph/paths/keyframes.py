@@ -77,7 +77,7 @@ class CameraPath:
         if not self.keyframes:
             raise LumigraphError("The path has no keyframe; give it at least one")
         if not 0 < self.fps <= 1000:
-            raise LumigraphError(f"The path asks for {self.fps:g} frames per second; give it from 1 to 1000")
+            raise LumigraphError(f"The path has {self.fps:g} frames per second; give it from 1 to 1000")
         for i, key in enumerate(self.keyframes):
             check(key, f"Keyframe {i + 1}")
         for i, (a, b) in enumerate(pairwise(self.keyframes)):
@@ -113,15 +113,15 @@ class CameraPath:
 
         Raises LumigraphError for a file that holds neither.
         """
-        said = read_json(path)
-        if not isinstance(said, dict):
-            said = {}
+        fields = read_json(path)
+        if not isinstance(fields, dict):
+            fields = {}
         try:
-            if said.get("format") == FORMAT:
-                rest = {name: value for name, value in said.items() if name != "format"}
+            if fields.get("format") == FORMAT:
+                rest = {name: value for name, value in fields.items() if name != "format"}
                 return typed(cls, rest, path, closed=True)
-            if {"poses", "lens", "size", "source_from_scene"} <= said.keys():
-                film = typed(Film, said, path)
+            if {"poses", "lens", "size", "source_from_scene"} <= fields.keys():
+                film = typed(Film, fields, path)
                 return cls(keys_of_film(film, Lens.from_json(film.lens, path)), fps=film.fps)
         except LumigraphError as error:
             text = str(error)
@@ -129,7 +129,7 @@ class CameraPath:
                 raise
             raise LumigraphError(f"{path} is no camera path: {text[:1].lower()}{text[1:]}") from error
         raise LumigraphError(
-            f"{path} holds no camera path that this version knows; save one in the viewer, "
+            f"{path} holds no camera path that this version reads; save one in the viewer, "
             "or take the JSON beside a film"
         )
 
@@ -144,7 +144,7 @@ class CameraPath:
         return torch.cat([rotation, position[:, :, None]], -1), curve[:, 3].exp()
 
     def times_at(self, seconds: Float[Tensor, " time"]) -> Float[Tensor, " time"] | None:
-        """The moments of a moving scene that are seen then, evenly from keyframe to keyframe; None if they say none."""
+        """The moments of a moving scene that are seen then, evenly from keyframe to keyframe; None without times."""
         times = [key.time for key in self.keyframes if key.time is not None]
         if not times:
             return None
@@ -167,7 +167,7 @@ class CameraPath:
             step = 1 / self.fps
         else:
             step = self.duration / max(frames - open_end, 1)
-        last = begin + self.duration  # rounding takes nobody past it
+        last = begin + self.duration  # against rounding beyond the end
         seconds = (begin + step * torch.arange(frames, dtype=torch.double)).clamp_max(last)
         (pose, fov), time = self.at(seconds), self.times_at(seconds)
         focal = 0.5 * min(size) / torch.tan(0.5 * fov.deg2rad())
@@ -238,9 +238,8 @@ def check(key: Keyframe, name: str) -> None:
             "at right angles and right-handed"
         )
     if not MIN_DEGREES <= key.fov <= MAX_DEGREES:
-        raise LumigraphError(
-            f"{name} sees {key.fov:g} degrees; a flat picture shows from {MIN_DEGREES:g} to {MAX_DEGREES:g}"
-        )
+        limits = f"{MIN_DEGREES:g} to {MAX_DEGREES:g}"
+        raise LumigraphError(f"{name} sees {key.fov:g} degrees; a flat picture shows {limits}")
 
 
 def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:

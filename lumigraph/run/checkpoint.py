@@ -3,8 +3,8 @@
     000800/     weights.safetensors · optimizer.safetensors · state.json
     000800/     weights.packed · state.json     of a run that was compressed
 
-One is written beside the one before and renamed once it is whole; only then does the older one go, by way of a name
-that whoever reads passes over. So there is a complete state whenever there was one before, however the writer ended.
+One is written beside the one before and renamed once it is whole; only then is the older one deleted, by way of a name
+that readers skip. So there is a complete state whenever there was one before, however the writer ended.
 """
 
 from __future__ import annotations
@@ -118,31 +118,25 @@ class Checkpoints:
         tensors: dict[str, Tensor] = {"generator": generator.get_state()}
         structure = flatten([optimizer.state_dict() for optimizer in optimizers], tensors)
         with files.replacing_folder(folder) as new:
-            sums = {
-                name: write_tensors(new / name, content)
-                for name, content in ((WEIGHTS_FILE, method.state_dict()), (OPTIMIZER_FILE, tensors))
-            }
+            contents = {WEIGHTS_FILE: method.state_dict(), OPTIMIZER_FILE: tensors}
+            sums = {name: write_tensors(new / name, content) for name, content in contents.items()}
             sums[STRUCTURE_KEY] = checksum(json.dumps(structure).encode())
-            known = {name: asdict(total) for name, total in sums.items()}
-            about = {"format": CHECKPOINT_FORMAT, "method": self.method, **asdict(state), "files": known}
-            (new / STATE_FILE).write_text(json.dumps({**about, STRUCTURE_KEY: structure}), "utf-8")
+            self._write_state(new, state, sums, structure)
         for path in self.folder.iterdir():
-            if path != folder and is_state(path):
-                retire(path)
+            if path != folder and is_state(path):  # renamed first, so that none is half deleted under its own name
+                with files.explained(path), partial(path.parent, is_folder=True) as aside:
+                    os.replace(path, aside / path.name)
 
     def save_packed(self, state: State, weights: bytes) -> None:
         """Write the state of a run that was compressed, in which there is nothing yet. weights: see `packing.write`"""
         with files.replacing_folder(self.folder / f"{state.step:06d}") as new:
             (new / PACKED_FILE).write_bytes(weights)
-            known = {PACKED_FILE: asdict(checksum(weights))}
-            about = {
-                "format": CHECKPOINT_FORMAT,
-                "method": self.method,
-                **asdict(state),
-                "files": known,
-                STRUCTURE_KEY: [],
-            }
-            (new / STATE_FILE).write_text(json.dumps(about), "utf-8")
+            self._write_state(new, state, {PACKED_FILE: checksum(weights)}, [])
+
+    def _write_state(self, folder: Path, state: State, sums: dict[str, Sum], structure: Any) -> None:
+        known = {name: asdict(total) for name, total in sums.items()}
+        about = {"format": CHECKPOINT_FORMAT, "method": self.method, **asdict(state), "files": known}
+        (folder / STATE_FILE).write_text(json.dumps({**about, STRUCTURE_KEY: structure}), "utf-8")
 
     @property
     def weights(self) -> Path:
@@ -169,13 +163,10 @@ class Checkpoints:
             raise LumigraphError(
                 f"{self.run} was compressed, which keeps nothing to go on learning with; resume the run it was made of"
             )
-        tensors = self._read_tensors(checkpoint, OPTIMIZER_FILE)
-        about = self._about(checkpoint)
+        tensors, about = self._read_tensors(checkpoint, OPTIMIZER_FILE), self._about(checkpoint)
         structure = about.optimizers
         if about.files.get(STRUCTURE_KEY) != checksum(json.dumps(structure).encode()):
-            raise LumigraphError(
-                f"{checkpoint / 'state.json'} is damaged: its optimizers are not those that were saved"
-            )
+            raise LumigraphError(f"{checkpoint / STATE_FILE} is damaged: its optimizers are not those that were saved")
         with understood(checkpoint):
             generator.set_state(tensors["generator"])
             for optimizer, saved in zip(optimizers, unflatten(structure, tensors), strict=True):
@@ -266,13 +257,5 @@ def is_state(path: Path) -> bool:
     """True if a folder is a complete or partial checkpoint and contains no foreign files."""
     if not CHECKPOINT_NAME.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
         return False
-    return all(
-        file.name in (WEIGHTS_FILE, OPTIMIZER_FILE, STATE_FILE, PACKED_FILE) and not file.is_dir()
-        for file in path.iterdir()
-    )
-
-
-def retire(path: Path) -> None:
-    """Delete a checkpoint so that a half-deleted one cannot be taken for a whole one."""
-    with files.explained(path), partial(path.parent, is_folder=True) as aside:
-        os.replace(path, aside / path.name)
+    own = WEIGHTS_FILE, OPTIMIZER_FILE, STATE_FILE, PACKED_FILE
+    return all(file.name in own and not file.is_dir() for file in path.iterdir())

@@ -1,4 +1,4 @@
-"""A composition's file: which parts, where each stands, and which of them leads.
+"""JSON files that open: compositions, and runs in the canonical frame of their category.
 
     {
       "format": "lumigraph composition 1",
@@ -14,8 +14,20 @@ source: of a part: anything that opens, from this file's folder or absolute
 place:  similarity from the source's frame of the part to that of the composition, both those of photographs or files,
         where keyframes and exports lie as well. A 4 x 4 matrix, or a scale, a rotation (a quaternion w, x, y, z, or
         degrees about +z) and a translation, in this order; what is left out changes nothing
-box:    two corners in the part's scene frame, as `lumigraph info` tells its bounds and the viewer crops it
-lead:   the part whose cameras, background and vertical the composition has; the first, unless said
+box:    two corners in the part's scene frame, as `lumigraph info` prints its bounds and the viewer crops it
+lead:   the part whose cameras, background and vertical the composition has; by default the first
+
+    {
+      "format": "lumigraph canonical 1",
+      "source": "../runs/chair-3",
+      "place": {"scale": 0.61, "rotation": [0.2, 0.9, -0.3, 0.1], "translation": [0.02, 0.1, -0.05]},
+      "bounds": [[-0.5, -0.5, -0.8], [0.5, 0.5, 0.8]],
+      "agreement": 0.94
+    }
+
+place:     similarity from the run's source frame to the canonical frame
+bounds:    two corners of the opaque region, in the canonical frame
+agreement: similarity to the mean shape of the category, 1 for the same
 """
 
 from __future__ import annotations
@@ -31,15 +43,18 @@ import torch
 
 from .. import files
 from ..camera import Camera
-from ..camera.crop import Box
+from ..camera.crop import CropBox
 from ..composition import Placed, compose, frame_around
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..files.ranges import Name, Point, Row, between, typed
+from ..files.ranges import Name, Point, Row, Share, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
+from .folder import Run
 from .opened import Opened
 
 FORMAT = "lumigraph composition 1"
+CANONICAL_FORMAT = "lumigraph canonical 1"
 
 
 @dataclass(frozen=True)
@@ -48,7 +63,7 @@ class CompositionPart:
 
     source: str
     place: Similarity
-    box: Box | None = None
+    box: CropBox | None = None
 
 
 class Composition(Opened):
@@ -66,7 +81,14 @@ class Composition(Opened):
         if here in within:
             raise LumigraphError(f"{self.path} holds itself, by way of its parts; take that part out of it")
         self.parts, self.lead = read_composition(self.path)
-        self.opened = [open_part(self._found(part), (*within, here)) for part in self.parts]
+        self.opened = []
+        for part in self.parts:
+            place = self.path.parent / files.expanded(part.source)
+            if not files.exists(place):
+                raise LumigraphError(
+                    f"{self.path} names {part.source} as a part, but there is no {place}; correct its path"
+                )
+            self.opened.append(open_part(place, (*within, here)))
         first = self.opened[self.lead].frame
         to_source = self.parts[self.lead].place @ first.to_source
         self.places = [
@@ -78,12 +100,6 @@ class Composition(Opened):
         others = [(opened.frame, place, part.box) for opened, place, part in every]
         del others[self.lead]
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
-
-    def _found(self, part: CompositionPart) -> Path:
-        path = self.path.parent / files.expanded(part.source)
-        if not files.exists(path):
-            raise LumigraphError(f"{self.path} names {part.source} as a part, but there is no {path}; correct its path")
-        return path
 
     def method(self, device: torch.device | str = "cpu") -> Method:
         """All parts in one picture. A source that is named several times is held once."""
@@ -150,12 +166,11 @@ def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     found = typed(CompositionRecord, said, path, closed=True)
     if found.lead not in range(len(found.parts)):
         raise LumigraphError(f"{path}: part {found.lead} should lead, and there are {len(found.parts)}; correct it")
-    return [
-        CompositionPart(
-            part.source, place_from_json(part.place, path), None if part.box is None else box_of(part.box, path)
-        )
-        for part in found.parts
-    ], found.lead
+    parts = []
+    for part in found.parts:
+        place = place_from_json(part.place, path)
+        parts.append(CompositionPart(part.source, place, None if part.box is None else box_of(part.box, path)))
+    return parts, found.lead
 
 
 def write_composition(path: Path, parts: Sequence[CompositionPart], lead: int = 0) -> None:
@@ -181,13 +196,13 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
     return said
 
 
-def box_of(corners: tuple[Vector, Vector], where: Path | str) -> Box:
+def box_of(corners: tuple[Vector, Vector], where: Path | str) -> CropBox:
     """Raises LumigraphError, naming `where`, for corners that hold nothing."""
     if not all(a < b for a, b in zip(*corners, strict=True)):
         raise LumigraphError(
             f"{where}: the box {corners} has nothing between its lower and its upper corner; correct it"
         )
-    return Box(*corners)
+    return CropBox(*corners)
 
 
 def place_from_json(said: Any, where: Path | str = "a composition") -> Similarity:
@@ -221,3 +236,69 @@ def place_to_json(place: Similarity) -> dict[str, Any]:
     said["translation"] = [rounded(x) for x in place.matrix[:3, 3].tolist()]
     nothing: dict[str, Any] = {"scale": 1.0, "rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0] * 3}
     return {name: value for name, value in said.items() if value != nothing[name]}
+
+
+@dataclass(frozen=True)
+class CanonicalRecord:
+    """The file."""
+
+    source: Name
+    place: Any
+    bounds: tuple[Point, Point]
+    agreement: Share
+    format: str = CANONICAL_FORMAT
+
+
+class Canonicalised(Opened):
+    """A run in the canonical frame of its category, in which exports of it lie, and which stands upright in
+    compositions. Raises LumigraphError for a file that is none, and where the run is gone."""
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        said = typed(CanonicalRecord, files.read_json(self.path), self.path, closed=True)
+        box_of(said.bounds, self.path)
+        self.agreement = said.agreement
+        self.run = Run(self.path.parent / files.expanded(said.source))
+        self.place = place_from_json(said.place, self.path) @ self.run.frame.to_source
+        self.frame = canonical_frame(self.run.frame, self.place.scale, said.bounds)
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The run's method at its place."""
+        return compose(self.frame, [Placed(self.run.method(device), self.place, leads=True)]).to(device)
+
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras of the run, in the canonical frame."""
+        return {split: cameras.transformed(self.place.matrix) for split, cameras in self.run.cameras().items()}
+
+    @property
+    def conversion_fault(self) -> str:
+        return f"is a run at another place; convert {self.run.path}, and align that again"
+
+    @property
+    def photographed(self) -> bool:
+        return self.run.photographed
+
+    def view_names(self) -> dict[str, list[str]]:
+        return self.run.view_names()
+
+
+def canonical_frame(frame: Frame, scale: float, bounds: tuple[Vector, Vector]) -> Frame:
+    """The frame of a run that was moved into the canonical one, which is its own source.
+
+    scale: canonical units to one of the run's scene
+    """
+    farthest = max(abs(x) for corner in bounds for x in corner)
+    if frame.is_open:
+        farthest = max(farthest, frame.reach * scale)
+    reach = 2.0 ** math.ceil(math.log2(max(farthest, 1.0)))
+    rows = Similarity.make(1.0).rows
+    return replace(frame, bounds=bounds, reach=reach, near=frame.near * scale, source_from_scene=rows, forward=None)
+
+
+def write_canonicalised(
+    path: Path, source: str, place: Similarity, bounds: tuple[Vector, Vector], agreement: float
+) -> None:
+    """Write the file of one run, in a folder that is made as a whole."""
+    shown = [[round(x, 6) for x in corner] for corner in bounds]
+    said = {"format": CANONICAL_FORMAT, "source": source, "place": place_to_json(place), "bounds": shown}
+    files.write_json(path, said | {"agreement": round(agreement, 4)}, ours=True)

@@ -18,7 +18,7 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ from typing import Any
 import torch
 
 from .. import files, methods
-from ..camera import Camera, ring
+from ..camera import Camera
+from ..capture import KINDS, Before, open_dataset
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
@@ -34,15 +35,13 @@ from ..files import marks
 from ..files.locks import LOCK_FILE, check_place, held
 from ..files.marks import MARKS_FILE
 from ..files.partials import PARTIAL_NAME
-from ..files.plain import understood
+from ..files.plain import alike, understood
 from ..files.ranges import check
 from ..method import Method
-from . import cameras
 from .checkpoint import PACKED_FILE, Checkpoints, State
-from .measured import read_rows
-from .needs import check_memory
 from .opened import Trained
-from .settings import Settings, Source
+from .records import cameras_json, cameras_of, read_cameras, read_rows
+from .settings import Settings, Source, check_memory
 
 
 class Run(Trained):
@@ -53,6 +52,7 @@ class Run(Trained):
 
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
+        self._config, self._cameras = self.folder / "config.json", self.folder / "cameras.json"
         if not files.is_file(self._config):
             if is_block_run(self.folder):
                 raise LumigraphError(
@@ -62,6 +62,7 @@ class Run(Trained):
             raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
         self.settings = Settings.read(self._config)
         self.frame = self.settings.frame
+        self._checkpoints = Checkpoints(self.folder, self.method_name)
 
     @classmethod
     def create(
@@ -97,9 +98,9 @@ class Run(Trained):
         with files.explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
         with held(folder, "made a run"):
-            check_new(folder)  # again, for somebody else may have been quicker
+            check_new(folder)  # again, for another process may have been quicker
             if isinstance(data, Scene):
-                files.write_json(folder / "cameras.json", cameras.to_json(data))
+                files.write_json(folder / "cameras.json", cameras_json(data))
             settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
 
@@ -123,16 +124,8 @@ class Run(Trained):
 
     def set_budget(self, **budget: Any) -> None:
         """Remember another budget, as `Budget.to_json` says it."""
-        self.settings = self.settings.with_budget(**budget)
+        self.settings = replace(self.settings, budget=budget)
         self.settings.write(self._config)
-
-    @property
-    def _config(self) -> Path:
-        return self.folder / "config.json"
-
-    @property
-    def _cameras(self) -> Path:
-        return self.folder / "cameras.json"
 
     # What was trained on what
 
@@ -185,8 +178,6 @@ class Run(Trained):
 
         Raises LumigraphError if it gives another frame than the run was trained in.
         """
-        from ..capture import KINDS, Before, open_dataset
-
         source = source or self.settings.scene.source
         if self.kind not in KINDS:
             raise LumigraphError(
@@ -195,10 +186,10 @@ class Run(Trained):
             )
         options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
         if self.photographed:
-            names = cameras.read(self._cameras).names
+            names = read_cameras(self._cameras).names
             options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
-        if not self.settings.agrees(data.frame):
+        if not alike(self.frame.to_json(), data.frame.to_json()):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"
             raise LumigraphError(f"{source} is not what {self.folder} was trained on: {what}; train a new run on it")
         return data
@@ -211,16 +202,15 @@ class Run(Trained):
         return data
 
     def cameras(self) -> dict[str, Camera]:
-        """The photographs' cameras by split, in the run's frame; a ring around the bounds where there were none."""
         if not self.photographed:
-            return {"train": ring(self.frame.bounds)}
-        return cameras.cameras(self._cameras, self.frame.image_count)
+            return super().cameras()
+        return cameras_of(self._cameras, self.frame.image_count)
 
     def view_names(self) -> dict[str, list[str]]:
         """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         if not self.photographed:
             return {}
-        said = cameras.read(self._cameras)
+        said = read_cameras(self._cameras)
         return {split: [said.names[i] for i in index] for split, index in said.splits.items()}
 
     # Its state
@@ -261,10 +251,6 @@ class Run(Trained):
         """Give optimizers and random numbers the latest state. Without any state, leaves them as they are."""
         if self.has_state:
             self._checkpoints.load_training(optimizers, generator)
-
-    @property
-    def _checkpoints(self) -> Checkpoints:
-        return Checkpoints(self.folder, self.method_name)
 
     # What was measured
 

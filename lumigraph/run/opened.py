@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from ..camera import Camera, dome
+from ..camera import Camera, dome, ring
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..exchange import size_of
@@ -17,7 +17,7 @@ from ..gaussians import Gaussians
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
 from .checkpoint import State
-from .measured import read_evaluation
+from .records import read_evaluation
 from .settings import Settings, Source
 
 
@@ -50,9 +50,9 @@ class Opened(ABC):
     def method(self, device: torch.device | str = "cpu") -> Method:
         """Method, ready to render."""
 
-    @abstractmethod
     def cameras(self) -> dict[str, Camera]:
-        """Cameras by split, in `frame`; "train" is always among them."""
+        """Cameras by split, in `frame`; "train" is always among them. A ring around the bounds without photographs."""
+        return {"train": ring(self.frame.bounds)}
 
     @property
     def photographed(self) -> bool:

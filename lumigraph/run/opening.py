@@ -1,24 +1,40 @@
-"""open_any(): one door to everything that opens. A new kind of file is a line here and a file beside this one."""
+"""open_any(): opens runs, splat files, SNeRG's folders and compositions, with cameras around those that have none."""
 
 from __future__ import annotations
 
 import importlib
+import math
+from dataclasses import replace
 from pathlib import Path
 
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .. import methods
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..exchange import is_splat_file, place_of, snerg
+from ..exchange import is_splat_file, place_of, read_gaussians, snerg
+from ..exchange.baked import Atlas
 from ..files import is_file, read_json
-from .canonicalised import FORMAT, Canonicalised
-from .composition import Composition
+from ..files.ranges import changed
+from ..gaussians import Gaussians
+from ..geometry import Similarity
+from ..method import Method
+from .composition import CANONICAL_FORMAT, Canonicalised, Composition
 from .folder import Run, is_block_run
 from .opened import Opened, Trained
-from .snerg_folder import SnergFolder
-from .splat_file import SplatFile
+
+BOX_SHARE = 0.96  # of visible Gaussians inside the box of interest, along each axis
+# Splat files have y pointing down by custom, as the cameras they were learnt from; scenes stand upright.
+UPRIGHT_ROTATION = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+VOXEL_MARGIN = 0.02  # beyond [-1, 1]^3, that a voxel may reach
+WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or
-    not), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
+    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a folder of
+    SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
 
     within: compositions that it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
@@ -28,7 +44,7 @@ def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
         return SplatFile(place_of(path))
     if path.suffix.lower() == ".json" and not path.is_dir():
         said = read_json(path)
-        if isinstance(said, dict) and said.get("format") == FORMAT:
+        if isinstance(said, dict) and said.get("format") == CANONICAL_FORMAT:
             return Canonicalised(path)
         return Composition(path, open_any, within)
     if is_file(path):
@@ -42,3 +58,91 @@ def open_run(path: Path | str) -> Trained:
         return Run(path)
     large = importlib.import_module("..large", __package__)  # by name, for that room stands above this one
     return large.BlockRun(path)
+
+
+class SplatFile(Opened):
+    """A cloud in a file, with a ring of cameras around it. Raises LumigraphError for a file that is no cloud."""
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        self.gaussians: Gaussians = read_gaussians(self.path)
+        if not len(self.gaussians):
+            raise LumigraphError(f"{self.path} holds no Gaussians, so there is nothing to show")
+        self.frame = frame_of(self.gaussians)
+        self._in_scene = self.gaussians.transformed(self.frame.to_source.inverse.matrix)
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The cloud, ready to render."""
+        kind = methods.find("gaussian-splatting")
+        cloud = self.gaussians
+        method = kind(self.frame, changed(kind.Config(), sh_degree=cloud.degree, antialiased=cloud.antialiased))
+        method.cloud.replace(self._in_scene)
+        return method.to(device).eval()
+
+    def source_gaussians(self) -> Gaussians:
+        return self.gaussians
+
+
+def frame_of(gaussians: Gaussians) -> Frame:
+    """The frame of a scene whose source are the axes of a file."""
+    return Frame(reach=64.0, near=0.01, source_from_scene=upright_similarity(gaussians).inverse.rows)
+
+
+def upright_similarity(gaussians: Gaussians) -> Similarity:
+    """Similarity that moves most of the visible cloud into [-1, 1]^3, upright."""
+    means = gaussians.means.double().cpu()
+    solid = means[gaussians.opacities.sigmoid().cpu() > 0.1]
+    means = (solid if len(solid) > 10 else means) @ UPRIGHT_ROTATION.T
+    some = means[:: max(1, len(means) // 100_000)]
+    shares = torch.tensor([(1 - BOX_SHARE) / 2, (1 + BOX_SHARE) / 2], dtype=torch.float64)
+    low, high = torch.quantile(some, shares, dim=0)
+    scale = 2 / max(float((high - low).max()), 1e-9)
+    return Similarity.make(scale, UPRIGHT_ROTATION, -scale * (low + high) / 2)
+
+
+class SnergFolder(Opened):
+    """An atlas in a folder, with a ring of cameras around it. Raises LumigraphError for a folder that holds none."""
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        atlas = snerg.read(self.path)
+        places, _ = atlas.voxels()
+        if not len(places):
+            raise LumigraphError(f"{self.path} holds no voxels, so there is nothing to show")
+        corners = atlas.low + atlas.voxel * torch.stack([places.amin(0), places.amax(0) + 1])
+        to_source = Similarity.make(1.0) if atlas.contracted else within_reach(corners)
+        scale, shift = to_source.inverse.scale, to_source.inverse.matrix[:3, 3].float()
+        self.atlas = replace(atlas, low=scale * atlas.low + shift, voxel=scale * atlas.voxel)
+        if (network := self.atlas.network) and len(network.biases[0]) != len(network.biases[1]):
+            raise LumigraphError(f"{self.path} has a network of two widths, of which one is read; export it anew")
+        low, high = ((scale * corner + shift).clamp(-1, 1).tolist() for corner in corners)
+        reach = reach_of(atlas, places) if atlas.contracted else 1.0
+        rows = to_source.rows
+        self.frame = Frame(
+            (tuple(low), tuple(high)), reach, near=0.01, background=WHITE_BACKGROUND, source_from_scene=rows
+        )
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The atlas, ready to render."""
+        kind = methods.find("snerg")
+        network = self.atlas.network
+        numbers = {} if network is None else {"view_width": len(network.biases[0])}
+        numbers |= {"block_size": self.atlas.block + 2, "whole": self.atlas.contracted}
+        method = kind(self.frame, replace(kind.smallest(), **numbers))
+        method.take(self.atlas)
+        return method.to(device).eval()
+
+
+def reach_of(atlas: Atlas, places: Int[Tensor, "voxel 3"]) -> float:
+    """The least power of two with which rays go as far as what lies in these voxels of contracted coordinates."""
+    radius = float((atlas.low + atlas.voxel * (places + 0.5)).norm(dim=-1).amax())
+    farthest = 1 / max(2 - radius, 0.5 * atlas.voxel)
+    return min(64.0, max(2.0, 2.0 ** math.ceil(math.log2(farthest / (2 * math.sqrt(3))))))
+
+
+def within_reach(corners: Float[Tensor, "2 3"]) -> Similarity:
+    """The way back from where a box lies in [-1, 1]^3: as it is if it lies there, else shrunk and moved."""
+    low, high = corners.double()
+    if float(corners.abs().max()) <= 1 + VOXEL_MARGIN:
+        return Similarity.make(1.0)
+    return Similarity.make(float((high - low).max()) / 2, torch.eye(3, dtype=torch.float64), (low + high) / 2)

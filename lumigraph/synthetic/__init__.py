@@ -11,37 +11,41 @@
     open_scene("procedural:city,crossings=6")             scenes may have options of their own
 
     open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
-    open_dataset("procedural:toys,count=20,turned=1")     the same, each in a pose that nobody chose
+    open_dataset("procedural:toys,count=20,turned=1")     the same, each in a random pose
 
 A new scene is a new file in `scenes/`, a new category of objects one in `categories/`; nothing is compiled for it.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from PIL import Image
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
 from ..capture.capture import Capture, PixelPlane, Shot
 from ..capture.raw import RawPhoto, facts, planes
 from . import categories as categories
 from . import scenes as scenes
-from .blender_folder import write_blender as write_blender
-from .jitter import jittered as jittered
 from .members import is_category as is_category
 from .members import is_collection as is_collection
 from .members import member_stage
 from .members import members_of as members_of
-from .options import told
 from .rendering import eight_bits, photograph, radiance
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
 from .stage import SyntheticStage as SyntheticStage
+from .stage import told
 from .world import Lamp as Lamp
 from .world import Material as Material
 from .world import Object as Object
@@ -49,10 +53,12 @@ from .world import Pose as Pose
 from .world import Sky as Sky
 from .world import Sun as Sun
 from .world import World as World
+from .world import rotation_about
 
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 TURN = "turn"  # of `Scene.about`: rotation from an object's upright frame to the source's; see `Stage.turn`
 TRACER = 1  # of the pictures that are kept: another number traces them anew
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def confirm(request: str) -> None:
@@ -64,7 +70,7 @@ def confirm(request: str) -> None:
 def read(request: str) -> Capture:
     """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
 
-    Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
+    Pictures are traced when they are read. Raises LumigraphError for a name or an option that does not exist.
     """
     if is_category(request):
         return capture(member_stage(request), f"procedural:{request}", kept=True)
@@ -117,7 +123,7 @@ def identity(stage: SyntheticStage, camera: Camera) -> str:
 
 
 def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]:
-    """The layers of one photograph, of which nothing is traced before somebody asks."""
+    """The layers of one photograph, traced on request."""
 
     def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> PixelPlane:
         values = partial(known, stage, camera, name)
@@ -162,7 +168,7 @@ def taken_raw(stage: SyntheticStage, camera: Camera) -> RawPhoto:
 
 
 def without_passers_by(stage: SyntheticStage, camera: Camera) -> np.ndarray:
-    """The photograph as it would be in its own light with nobody there, bytes (height, width, 3)."""
+    """The photograph as it would be in its own light without passers-by, bytes (height, width, 3)."""
     assert stage.lasting is not None and camera.image_index is not None
     return eight_bits(*photograph(stage.lasting(int(camera.image_index)), camera), alpha=False)
 
@@ -181,3 +187,63 @@ def picture(stage: SyntheticStage, camera: Camera) -> np.ndarray:
     if stage.sensor is not None and camera.image_index is not None:
         return taken_raw(stage, camera).developed(stage.sensor.brightness(int(camera.image_index)))
     return eight_bits(*photograph(stage.world_of(camera), camera), alpha=not stage.world.sky.visible)
+
+
+def jittered(stage: SyntheticStage, amount: float, seed: int) -> dict[str, Camera]:
+    """The stage's cameras, those to learn from each turned by `amount` degrees about an axis of its own and moved by
+    `amount` percent of the longest side of the box of interest, or of `Stage.error`, any way. Held-out ones stay where
+    they are."""
+    random = np.random.default_rng([seed, 0x9E3779B9])
+    low, high = (np.array(corner) for corner in stage.bounds)
+    shift = amount / 100 * (stage.error or float((high - low).max()))
+    cameras = stage.cameras["train"]
+    pose = cameras.pose.double().numpy().copy()
+    for one in pose:
+        axis, way = random.normal(size=(2, 3))
+        one[:, :3] = rotation_about(tuple(axis), amount) @ one[:, :3]
+        one[:, 3] += shift * way / np.linalg.norm(way)
+    return stage.cameras | {"train": replace(cameras, pose=torch.from_numpy(pose).to(cameras.pose))}
+
+
+def write_blender(stage: SyntheticStage, folder: Path, truth: bool = True) -> None:
+    """Render every camera of a stage into a new folder, as Blender's synthetic scenes are (Mildenhall et al. 2020).
+
+    FOLDER/transforms_train.json, transforms_test.json ...    poses, OpenGL convention (x right, y up, z backward);
+                                                              "time" where things move, as in D-NeRF (Pumarola 2021)
+    FOLDER/train/r_0000.png                                   RGBA, or RGB where the sky is visible
+    FOLDER/train/r_0000_truth.npz                             depth (along the ray), normals, ids, albedo, names
+
+    truth: also write what is exactly known about every pixel
+    Raises FileExistsError if the folder exists, ValueError for lenses that the format cannot express.
+    """
+    folder.mkdir(parents=True)
+    for split, cameras in stage.cameras.items():
+        (folder / split).mkdir()
+        frames = []
+        for i in range(len(cameras)):
+            seen = render(stage.world_of(cameras[i]), cameras[i])
+            path = f"{split}/r_{i:04d}"
+            pixels = eight_bits(seen.rgb.numpy(), seen.opacity.numpy(), alpha=not stage.world.sky.visible)
+            Image.fromarray(pixels).save(folder / f"{path}.png")
+            if truth:
+                known = {k: v.numpy() for k, v in (("depth", seen.depth), *seen.extra.items())}
+                known["names"] = np.array(stage.world.names)
+                np.savez_compressed(folder / f"{path}_truth.npz", allow_pickle=False, **known)
+            pose = np.vstack([cameras.pose[i].double().numpy(), [0, 0, 0, 1]]) @ OPENGL
+            beside = {f"{name}_file_path": f"./{path}_truth.npz" for name in ("depth", "labels", "normals") if truth}
+            when = {} if cameras.time is None else {"time": float(cameras.time[i])}
+            frames.append({"file_path": f"./{path}", **when, "transform_matrix": pose.tolist(), **beside})
+        units = {"depth_unit_scale_factor": 1.0, "is_euclidean_depth": True} if truth else {}
+        listed = {"camera_angle_x": angle_across(cameras), **units, "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(listed, indent=1))
+
+
+def angle_across(cameras: Camera) -> float:
+    """The field of view that all cameras share, radians: all that the format says about lenses."""
+    lens = cameras.lens
+    if not isinstance(lens, Pinhole):
+        raise ValueError(f"Blender's format has pinhole cameras only, not {type(lens).__name__}")
+    focal, centre, size = lens.focal, lens.centre, cameras.size
+    if not ((focal == focal[0, 0]).all() and (size == size[0]).all() and (2 * centre == size).all()):
+        raise ValueError("Blender's format requires all cameras alike, with square pixels and the centre in the middle")
+    return 2 * math.atan(float(cameras.size[0, 0]) / (2 * float(focal[0, 0])))

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from .. import geometry
 from ..camera import Camera
 from ..camera.lens import Pinhole
-from ..geometry import transforms as geometry
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 

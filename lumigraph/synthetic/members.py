@@ -7,21 +7,31 @@ Its pictures are traced once and then lie in the user's cache, for a collection 
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
+
+import numpy as np
 
 from ..capture import meshes
 from ..errors import LumigraphError
 from ..files.names import natural
 from ..files.ranges import Seed, between
 from . import categories
-from .meshes import mesh_stage
-from .options import told
-from .stage import SyntheticStage
-from .turned import turned
+from .cameras import dome, pinhole, spiral
+from .categories import FIELD_OF_VIEW, surrounded
+from .shapes import triangle_of
+from .stage import SyntheticStage, told
+from .textures import Plain
+from .world import Material, Object, Pose, Vector, nested
 
-Number = Annotated[int, between(0, 99_999)]
+RADIUS = 0.85  # of the ball around a mesh, about its middle
+THICKNESS = 4e-3  # of its triangles
+BOUNDS: tuple[Vector, Vector] = ((-RADIUS,) * 3, (RADIUS,) * 3)
+BALL_RADIUS = 1.2  # contains every member in every rotation
+CAMERA_DISTANCE = 4.1  # from the centre, at which that ball just fits into the picture
+MAX_ELEVATION = 60.0  # degrees of the cameras above and below the horizon: no side is the lower one
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,7 @@ class Member:
     views: Annotated[int, between(1, 10_000)] = 20
     seed: Seed = 0
     turned: Annotated[int, between(0, 1)] = 0
-    member: Number = 0
+    member: Annotated[int, between(0, 99_999)] = 0
 
 
 @dataclass(frozen=True)
@@ -83,10 +93,56 @@ def members_of(request: str) -> dict[str, str]:
 
 
 def member_stage(request: str) -> SyntheticStage:
-    """One object and the cameras around it."""
+    """One object and the cameras around it. Raises LumigraphError for a file of a mesh that holds no surface."""
     name, one = told(Member, request)
     if (path := path_of(request)) is not None:
-        stage, number = mesh_stage(path, one.size, one.views, one.seed), zlib.crc32(path.name.encode())
+        number = zlib.crc32(path.name.encode())
+        random = np.random.default_rng((one.seed, number))
+        stage = surrounded(tuple(plates(path)), BOUNDS, one.size, one.views, random)
     else:
         stage, number = categories.stage(name, one.member, one.size, one.views, one.seed), one.member
     return turned(stage, one.size, (one.seed, number)) if one.turned else stage
+
+
+def plates(path: Path) -> Iterator[Object]:
+    """Plates for the triangles of a mesh, centred at the origin, in the mean colours of their corners. Raises
+    LumigraphError for a file that holds no surface."""
+    mesh = meshes.read_shape(path, path.stem).mesh
+    if not len(mesh.faces):
+        raise LumigraphError(f"{path} holds points and no surface, of which there is nothing to photograph")
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    points = mesh.vertices - 0.5 * (low + high)
+    points = points * ((RADIUS - THICKNESS) / np.linalg.norm(points, axis=1).max())
+    for face in mesh.faces:
+        if (plate := triangle_of(points[face].astype(float), THICKNESS)) is not None:
+            shape, rotation, position = plate
+            red, green, blue = (mesh.colours[face].mean(0) / 255).round(3).tolist()
+            paint = Material(Plain((red, green, blue)), gloss=0.3, roughness=0.5)
+            yield Object(shape, paint, Pose(tuple(position.tolist()), nested(rotation)), path.stem)
+
+
+def turned(stage: SyntheticStage, size: int, seed: tuple[int, int]) -> SyntheticStage:
+    """The stage with its objects turned about the origin by a random rotation; light and horizon stay. Cameras stand
+    all around. `Stage.turn` is the rotation since the object stood upright, where that is known.
+
+    size: of the square pictures, pixels
+    """
+    random = np.random.default_rng((*seed, 0x7EEDED))
+    motion = Pose(rotation=nested(any_rotation(random)))
+    objects = tuple(replace(thing, pose=motion @ thing.pose) for thing in stage.world.objects)
+    views, held_out = (len(stage.cameras[split]) for split in ("train", "test"))
+    cameras = {
+        "train": pinhole(dome(views, CAMERA_DISTANCE, random, -MAX_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW),
+        "test": pinhole(spiral(held_out, CAMERA_DISTANCE, random, -MAX_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW),
+    }
+    bounds = (-BALL_RADIUS, -BALL_RADIUS, -BALL_RADIUS), (BALL_RADIUS, BALL_RADIUS, BALL_RADIUS)
+    known = Pose() if stage.turn is None else Pose(rotation=stage.turn)
+    world, turn = replace(stage.world, objects=objects), (motion @ known).rotation
+    return replace(stage, world=world, cameras=cameras, bounds=bounds, reach=BALL_RADIUS, turn=turn)
+
+
+def any_rotation(random: np.random.Generator) -> np.ndarray:
+    """A rotation matrix, all equally likely: the first factor of a Gaussian matrix (Stewart 1980)."""
+    q, r = np.linalg.qr(random.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.sign(np.linalg.det(q))

@@ -72,13 +72,10 @@ class Sectors(Texture):
 
 
 @dataclass(frozen=True)
-class Rings(Texture):
+class Rings(Stripes):
     """Bands around z."""
 
     kind = RINGS
-    period: float = 0.1
-    share: float = 0.5
-    shift: float = 0.0
 
 
 @dataclass(frozen=True)

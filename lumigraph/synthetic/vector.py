@@ -13,10 +13,7 @@ COMPILE_OPTIONS = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "nsz", "arcp", "contract"},
 }
-INNER_OPTIONS = {
-    **COMPILE_OPTIONS,
-    "no_cpython_wrapper": True,
-}  # for functions called by compiled code only: quicker to compile
+INNER_OPTIONS = {**COMPILE_OPTIONS, "no_cpython_wrapper": True}  # of functions for compiled code only: compile quicker
 
 
 @njit(**INNER_OPTIONS)

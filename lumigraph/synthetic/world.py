@@ -15,51 +15,28 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..color.srgb import linear_from_srgb
-from .boxes import hierarchy
 from .shapes import SolidShape
 from .textures import Colour, Texture
 
 Vector = tuple[float, float, float]
 Rotation = tuple[Vector, Vector, Vector]  # its rows
 
-OBJECT = np.dtype(
-    [
-        ("kind", "i8"),
-        ("material", "i8"),
-        ("identity", "i8"),
-        ("size", "f8", 6),
-        ("half", "f8", 3),
-        ("rotation", "f8", (3, 3)),
-        ("position", "f8", 3),
-    ]
-)
-MATERIAL = np.dtype(
-    [
-        ("texture", "i8"),
-        ("a", "f8", 3),
-        ("b", "f8", 3),
-        ("numbers", "f8", 4),
-        ("gloss", "f8"),
-        ("roughness", "f8"),
-        ("metal", "f8"),
-    ]
-)
-LIGHT = np.dtype([("distant", "i8"), ("position", "f8", 3), ("radius", "f8"), ("colour", "f8", 3)])
-SKY = np.dtype(
-    [
-        ("visible", "i8"),
-        ("zenith", "f8", 3),
-        ("horizon", "f8", 3),
-        ("ground", "f8", 3),
-        ("clouds", "f8"),
-        ("haze", "f8"),
-        ("reach", "f8"),
-        ("exposure", "f8", 3),
-    ]
-)
-
-
 KINDS = ("objects", "materials", "nodes")  # of `Arrays`, what is each object's own
+FAR_DISTANCE = 1e30  # in place of infinity, because infinity times zero is not a number
+
+
+def record(**fields: str) -> np.dtype:
+    """Type of a row for the tracer, from NumPy's names of its fields' types."""
+    return np.dtype(list(fields.items()))
+
+
+OBJECT = record(kind="i8", material="i8", identity="i8", size="6f8", half="3f8", rotation="(3,3)f8", position="3f8")
+MATERIAL = record(texture="i8", a="3f8", b="3f8", numbers="4f8", gloss="f8", roughness="f8", metal="f8")
+LIGHT = record(distant="i8", position="3f8", radius="f8", colour="3f8")
+SKY = record(
+    visible="i8", zenith="3f8", horizon="3f8", ground="3f8", clouds="f8", haze="f8", reach="f8", exposure="3f8"
+)
+NODE = record(low="3f8", high="3f8", object="i8", skip="i8")
 
 
 class Arrays(NamedTuple):
@@ -109,6 +86,11 @@ class Material:
     roughness: float = 0.4
     metal: float = 0.0
 
+    def describe(self):
+        texture, a, b, numbers = self.texture.describe()
+        numbers = (*numbers, 0.0, 0.0, 0.0, 0.0)[:4]
+        return texture, linear_from_srgb(a), linear_from_srgb(b), numbers, self.gloss, self.roughness, self.metal
+
 
 @dataclass(frozen=True)
 class Object:
@@ -147,7 +129,7 @@ class Lamp:
     colour: Colour = (1.0, 1.0, 1.0)
 
     def describe(self):
-        return 0, self.position, self.radius, _linear(self.colour) * self.power
+        return 0, self.position, self.radius, linear_from_srgb(self.colour) * self.power
 
     def moved(self, pose: Pose) -> Lamp:
         return replace(self, position=(pose @ Pose(self.position)).position)
@@ -169,7 +151,7 @@ class Sun:
 
     def describe(self):
         toward = np.array(self.direction) / np.linalg.norm(self.direction)
-        return 1, toward, self.radius, _linear(self.colour) * self.power
+        return 1, toward, self.radius, linear_from_srgb(self.colour) * self.power
 
     def moved(self, pose: Pose) -> Sun:
         return replace(self, direction=(Pose(rotation=pose.rotation) @ Pose(self.direction)).position)
@@ -200,7 +182,7 @@ class Sky:
     balance: Colour = (1.0, 1.0, 1.0)
 
     def describe(self):
-        colours = (_linear(c) * self.light for c in (self.zenith, self.horizon, self.ground))
+        colours = (linear_from_srgb(c) * self.light for c in (self.zenith, self.horizon, self.ground))
         exposure = self.exposure * np.array(self.balance)
         return int(self.visible), *colours, self.clouds, self.haze, self.reach, exposure
 
@@ -249,7 +231,7 @@ class World:
             row["material"], row["identity"] = materials[thing.material], names[thing.name]
         return Arrays(
             objects,
-            np.array([_material(m) for m in materials], MATERIAL),
+            np.array([material.describe() for material in materials], MATERIAL),
             np.array([x.describe() for x in self.lights], LIGHT),
             np.array([self.sky.describe()], SKY),
             hierarchy([o.bounds() for o in self.objects]),
@@ -292,16 +274,57 @@ def rotation_about(axis: Vector, degrees: float) -> np.ndarray:
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-def _material(material: Material):
-    texture, a, b, numbers = material.texture.describe()
-    numbers = (*numbers, 0.0, 0.0, 0.0, 0.0)[:4]
-    return texture, _linear(a), _linear(b), numbers, material.gloss, material.roughness, material.metal
-
-
-def _linear(colour: Colour) -> np.ndarray:
-    return linear_from_srgb(colour)
-
-
 def nested(matrix: np.ndarray):
     """The rows of a matrix, as `Pose.rotation` has them."""
     return tuple(tuple(row) for row in matrix.tolist())
+
+
+def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The tree over boxes (low, high), as an array of NODE in depth-first order: where a ray misses a box, it goes on
+    at `skip`, past everything inside it; there is no stack. Unbounded ones come first; the others are split again and
+    again where a ray then has least to ask (surface area heuristic, Goldsmith and Salmon 1987)."""
+    if not boxes:
+        return np.zeros(0, NODE)
+    low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR_DISTANCE, FAR_DISTANCE) for x in zip(*boxes, strict=True))
+    bounded = high[:, 0] < FAR_DISTANCE
+    nodes: list[tuple] = []
+
+    def grow(members: np.ndarray) -> None:
+        box = low[members].min(0), high[members].max(0)
+        if len(members) == 1:
+            nodes.append((*box, members[0], len(nodes) + 1))
+            return
+        place = len(nodes)
+        nodes.append(())
+        for half in split_boxes(low, high, members):
+            grow(half)
+        nodes[place] = (*box, -1, len(nodes))
+
+    for one in np.flatnonzero(~bounded):
+        grow(np.array([one]))
+    if bounded.any():
+        grow(np.flatnonzero(bounded))
+    return np.array(nodes, NODE)
+
+
+def split_boxes(low: np.ndarray, high: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two groups whose boxes, weighted by how many each holds, have least surface."""
+    if len(members) == 2:
+        return members[:1], members[1:]
+    best, groups = np.inf, (members[:1], members[1:])
+    for axis in range(3):
+        order = members[np.argsort((low + high)[members, axis], kind="stable")]
+        left = half_surface(np.minimum.accumulate(low[order]), np.maximum.accumulate(high[order]))[:-1]
+        back = order[::-1]
+        right = half_surface(np.minimum.accumulate(low[back]), np.maximum.accumulate(high[back]))[-2::-1]
+        count = np.arange(1, len(members))
+        cost = left * count + right * count[::-1]
+        if cost.min() < best:
+            best, cut = cost.min(), cost.argmin() + 1
+            groups = order[:cut], order[cut:]
+    return groups
+
+
+def half_surface(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    x, y, z = (high - low).T
+    return x * y + y * z + z * x

@@ -1,8 +1,8 @@
 """Allocation: how this process takes memory from the system, and when it gives it back.
 
-A training step takes and gives back a hundred megabytes. GNU's C library asks the system for every large piece and
-returns it at once, and the system fills each page with zeros again: a third of the processor time of a step of
-Instant-NGP. So what is given back is kept, up to a limit, for the next step.
+A training step allocates and frees a hundred megabytes. GNU's C library requests every large piece from the system and
+returns it at once, and the system zeroes each page again: a third of the processor time of a step of Instant-NGP. So
+freed memory is kept, up to a limit, for the next step.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ USER_SETTINGS = {  # by which users, and programs, say so themselves
 
 
 def settle_memory() -> None:
-    """Have all threads take their memory from one place, and keep there what they give back, unless the user's
-    environment says how.
+    """Let all threads allocate from one arena and keep freed memory there, unless the user's environment decides.
 
-    GNU's C library gives every thread an arena of its own. What one has given back there, others cannot use: a process
-    that opened six viewers one after the other held 130 MB of it. Ours are few, and ask for memory seldom.
+    GNU's C library gives every thread an arena of its own, whose freed memory others cannot use: a process that opened
+    six viewers one after the other held 130 MB of it. Our threads are few and allocate seldom.
     """
     if sys.platform != "linux" or "malloc" in os.environ.get("GLIBC_TUNABLES", ""):
         return

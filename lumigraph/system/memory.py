@@ -19,7 +19,7 @@ STATUS_FILE = Path("/proc/self/status")
 SPARED_SHARE = 0.3  # of free memory, left to other programs
 IMAGES_SHARE = 0.4  # of the machine's memory that images may take; the rest is for training and other programs
 BYTES_PER_PIXEL = 128  # while a picture is rendered: ray, colour, depth and opacity, in parts and in total
-OUT_OF_MEMORY_MESSAGES = (
+MEMORY_FAULTS = (
     "can't allocate memory",
     "bad_alloc",
     "Storage size calculation overflowed",
@@ -62,7 +62,7 @@ def free_on(device: torch.device) -> int:
 
 
 def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str] | str) -> None:
-    """Raise LumigraphError unless so many bytes may be had on a device: what needs them, and what needs less."""
+    """Raise LumigraphError unless so many bytes may be had on a device. what: needs them; remedy: needs less"""
     if size > (free := free_on(device)):
         less = remedy if isinstance(remedy, str) else remedy()
         raise LumigraphError(f"{what} would need {gigabytes(size)} of memory, and {gigabytes(free)} are free; {less}")
@@ -70,9 +70,8 @@ def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str
 
 def ask_for_picture(width: int, height: int, device: torch.device) -> None:
     """Raise LumigraphError unless a rendering of so many pixels may be had on a device."""
-    ask_for(
-        BYTES_PER_PIXEL * width * height, device, f"A picture of {width} x {height} pixels", "give a smaller --size"
-    )
+    what = f"A picture of {width} x {height} pixels"
+    ask_for(BYTES_PER_PIXEL * width * height, device, what, "give a smaller --size")
 
 
 def gigabytes(size: float) -> str:
@@ -83,9 +82,7 @@ def gigabytes(size: float) -> str:
 def want_of_memory(error: BaseException) -> str | None:
     """One sentence for a fault that is for want of memory: what asked for how much. None for any other fault."""
     told = str(error)
-    if not (
-        isinstance(error, MemoryError | torch.OutOfMemoryError) or any(sign in told for sign in OUT_OF_MEMORY_MESSAGES)
-    ):
+    if not (isinstance(error, MemoryError | torch.OutOfMemoryError) or any(sign in told for sign in MEMORY_FAULTS)):
         return None
     asked = re.search(r"allocate ([\d.]+) ?(bytes|[KMGTPE]iB)", told)
     amount = "more" if asked is None else gigabytes(float(asked[1]) * UNITS[asked[2][0]])

@@ -31,7 +31,7 @@ def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
 
 @contextmanager
 def counting(description: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
-    """A function to be told how many of `total` are done; None if nobody knows how much there is to do.
+    """A function that takes how many of `total` are done; None for an unknown total.
 
     What takes longer than a moment is seen: as a bar on a terminal, in a log as a line now and then. A stage within
     another one is not shown.

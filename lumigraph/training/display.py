@@ -1,24 +1,28 @@
-"""Progress of training on stderr: a bar on a terminal, plain lines elsewhere."""
+"""Progress of training on stderr: an announcement, then a bar on a terminal or plain lines elsewhere."""
 
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import torch
+from jaxtyping import Int
 from rich.console import RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 from rich.text import Text
+from torch import Tensor
 
-from ..budget import Budget
+from ..budget import Budget, lasting
 from ..datasets.dataset import Dataset
+from ..datasets.scene import Scene
 from ..method import Lesson, Method
+from ..method.capabilities import HasGaussians, can
+from ..system import threads
 from ..system.console import console, is_live
-from ..system.progress import clock, short
-from .announce import how_long, learner, learnt_from, machine
+from ..system.progress import clock, short, tell
 
 REFRESH = 0.5  # seconds between looks at a bar
 FIRST_LINE_SECONDS = 3.0  # seconds to the first line with a time left
@@ -157,7 +161,7 @@ class TrainingDisplay:
         if self._live:
             self.console.print(line, soft_wrap=True)
         elif self.show:
-            print(line, file=sys.stderr, flush=True)
+            tell(line)
 
 
 def sizes(statistics: dict[str, float]) -> list[str]:
@@ -171,3 +175,44 @@ def time_left(budget: Budget, step: int, seconds: float, begun: tuple[int, float
     if budget.steps is None:
         return max(budget.total - seconds, 0.0)
     return (budget.total - step) * (seconds - begun[1]) / max(step - begun[0], 1)
+
+
+def learnt_from(data: Dataset) -> str:
+    """Number of training and held-out inputs; size of photographs now and in the source."""
+    held_out = len(data.splits.get("test", ()))
+    aside = f", {held_out:,} held out"
+    if not isinstance(data, Scene):
+        return f"Learning from {len(data.splits['train']):,} of {data.kind}{aside}"
+    count = len(data.splits["train"])
+    size, full = pixel_sizes(data.cameras.size), None if data.full_sizes is None else pixel_sizes(data.full_sizes)
+    reduced = f", reduced from {full}" if full and full != size else ""
+    return f"Learning from {count:,} photograph{'' if count == 1 else 's'}{aside}, {size} pixels{reduced}"
+
+
+def pixel_sizes(of: Int[Tensor, "photograph 2"]) -> str:
+    """One size, or the smallest and the largest."""
+    some = sorted({(int(w), int(h)) for w, h in of.tolist()}, key=lambda size: size[0] * size[1])
+    told = [f"{width}x{height}" for width, height in some]
+    return told[0] if len(told) == 1 else f"{told[0]} to {told[-1]}"
+
+
+def learner(name: str, method: Any) -> str:
+    """A method's name and how large it is: Gaussians, or numbers that it learns."""
+    if can(method, HasGaussians):
+        return f"{name}, {len(method.gaussians()):,} Gaussians"
+    return f"{name}, {sum(x.numel() for x in method.parameters() if x.requires_grad):,} numbers to learn"
+
+
+def machine(device: torch.device) -> str:
+    """A device; on a CPU how many threads compute."""
+    if device.type == "cuda":
+        return f"on {torch.cuda.get_device_name(device)} ({device})"
+    return f"on the CPU with {threads.description()}"
+
+
+def how_long(budget: Budget, step: int, seconds: float) -> str:
+    """Remaining budget. The time of a step is known only after some steps."""
+    if budget.steps is None:
+        return f"for {lasting(budget.total - seconds)}"
+    done = f", {step:,} of them done" if step else ""
+    return f"for {budget}{done}; how long they take is told once a few are done"

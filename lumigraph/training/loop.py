@@ -29,9 +29,7 @@ FIRST_SAVE_SECONDS = 10.0  # seconds of training; a fault or a kill in the first
 PREVIEW_SHARES = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
 PREVIEW_SIZE = 256  # pixels along the longer side
 MIN_ERROR = 1e-10  # mean squared error below which the PSNR stays 100 dB
-MAX_SMALL_GRADIENT = (
-    1 << 16
-)  # gradients up to this many numbers are looked at in every step, larger ones in every logged step
+MAX_SMALL_GRADIENT = 1 << 16  # numbers of a gradient that is checked in every step; larger ones in logged steps only
 
 
 @dataclass(frozen=True)

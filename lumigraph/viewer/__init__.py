@@ -2,5 +2,5 @@
 
 from .address import Address as Address
 from .address import choose_address as choose_address
-from .subject import Subject as Subject
+from .shared import Subject as Subject
 from .viewer import Viewer as Viewer

@@ -18,7 +18,7 @@ MAX_PORT_TRIES = 100  # ports after the usual one
 class Address:
     """A host as the user named it, and a port that was free a moment ago.
 
-    token: what a browser must know besides; empty where only this machine can reach the viewer
+    token: secret that a browser must send; empty where only this machine can reach the viewer
     """
 
     host: str
@@ -32,7 +32,7 @@ class Address:
 
     @property
     def urls(self) -> list[str]:
-        """All addresses that the viewer answers to, as far as this machine knows its own."""
+        """All addresses that the viewer answers to, as far as they can be found."""
         hosts = own_addresses() if is_wildcard(self.host) else [self.host]
         secret = f"/?token={self.token}" if self.token else ""
         return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}{secret}" for host in hosts]
@@ -71,9 +71,7 @@ def free_port(host: str, port: int) -> int | None:
             return listening.getsockname()[1]
     except (socket.gaierror, UnicodeError) as error:  # the latter for what is no name at all
         reason = getattr(error, "strerror", None) or "it is no name of a host"
-        raise LumigraphError(
-            f"Host {host[:60]!r} is not known ({reason}); give --host an address of this machine"
-        ) from error
+        raise LumigraphError(f"There is no host {host[:60]!r} ({reason}); give --host one of this machine") from error
     except PermissionError as error:
         raise LumigraphError(f"Port {port} may not be used by this user; give --port one from 1024 on") from error
     except OSError as error:
@@ -104,7 +102,7 @@ def own_addresses() -> list[str]:
         found += [str(entry[4][0]) for entry in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
     except socket.gaierror:
         pass
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # says which address is used; sends nothing
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # finds the address in use; sends nothing
         try:
             probe.connect(("192.0.2.1", 9))
             found.append(probe.getsockname()[0])

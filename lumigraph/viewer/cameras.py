@@ -1,17 +1,25 @@
-"""Cameras of the house from the browser's, and how widely a camera looks."""
+"""ViewRequest: all settings of one picture for one client; cameras from the browser's, and their angles of view;
+Flight: a client's camera moved by the server."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.crop import Crop
 from ..camera.lens import Pinhole
+from ..datasets.scene import Vector
 from ..geometry import to_matrix
+from ..method.controls import Value
 
 MAX_FIELD_OF_VIEW = math.radians(120)  # of a view, and of a photograph that is drawn as a frustum
 
@@ -50,3 +58,132 @@ def angle_for(camera: Camera, aspect: float) -> float:
     """Vertical angle of view, in radians, at which a window of an aspect (width / height) shows a whole photograph."""
     across, down = angles(camera)
     return min(MAX_FIELD_OF_VIEW, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """A camera in the browser, and the settings of its client.
+
+    pose:       camera-to-world, +x right, +y down, +z forward
+    angle:      vertical angle of view, radians
+    canvas:     the browser's (width, height) in pixels
+    longest:    pixels along the longer side of the sharpest picture
+    mode:       one of MODES, or the name of one of the method's extras
+    background: colour behind everything
+    exact:      whether Gaussians are rendered here rather than by the browser
+    crop:       what is shown of the scene; None for all of it
+    depth:      whether the browser needs depth, because it draws something beside the scene
+    settings:   names and values of the method's controls that the client has turned
+    floaters:   arguments of `cleaned` for them, names and numbers; none if they stay
+    """
+
+    pose: tuple[tuple[float, ...], ...]
+    angle: float
+    canvas: tuple[int, int]
+    longest: int
+    mode: str
+    background: Vector
+    exact: bool = False
+    crop: Crop | None = None
+    depth: bool = False
+    settings: tuple[tuple[str, Value], ...] = ()
+    floaters: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def part(self) -> bool:
+        """True if a part of the scene is hidden by a crop or as floaters."""
+        return self.crop is not None or bool(self.floaters)
+
+    @property
+    def full(self) -> tuple[int, int]:
+        """(width, height) of the sharpest picture."""
+        width, height = self.canvas
+        share = min(1.0, self.longest / max(width, height))
+        return max(1, round(width * share)), max(1, round(height * share))
+
+    def camera(self, size: tuple[int, int]) -> Camera:
+        """The camera of a picture of this (width, height), whose aspect is the canvas's."""
+        width, height = size
+        vertical = 0.5 / math.tan(0.5 * self.angle)  # focal length over height
+        focal = torch.tensor([[vertical * width * self.canvas[1] / self.canvas[0], vertical * height]])
+        lens = Pinhole(focal, torch.tensor([[0.5 * width, 0.5 * height]]))
+        return Camera(torch.tensor([self.pose]), lens, torch.tensor([[width, height]]))
+
+
+STEP_SECONDS = 1 / 25  # seconds
+FLIGHT_SECONDS = 0.6  # that a flight to a photograph takes
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Flight:
+    """A mover of one client's camera. A new flight ends the one before."""
+
+    def __init__(self, client: Any):
+        self._client, self._number = client, 0
+
+    def stop(self) -> None:
+        self._number += 1
+
+    def place(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
+        """Set the camera: its pose, the distance to the point it turns about, its vertical angle of view in radians."""
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.up_direction = upwards(pose)
+            camera.position = pose[:, 3]
+            camera.look_at = pose[:, 3] + distance * pose[:, 2]
+            camera.fov = angle
+
+    def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
+        """Move the camera smoothly to what `place` would set. Returns on arrival, or when another flight begins."""
+        self._number += 1
+        number, camera = self._number, self._client.camera
+        begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
+        goal = pose[:, 3], pose[:, 3] + distance * pose[:, 2], upwards(pose), angle
+        count = round(FLIGHT_SECONDS / STEP_SECONDS)
+        for i in range(1, count):
+            if number != self._number:
+                return
+            t = i / count
+            t = t * t * (3 - 2 * t)
+            position, ahead, up, fov = (a + t * (b - a) for a, b in zip(begin, goal, strict=True))
+            with self._client.atomic():
+                camera.up_direction = up
+                camera.position = position
+                camera.look_at = ahead
+                camera.fov = fov
+            time.sleep(STEP_SECONDS)
+        self.place(pose, distance, angle)
+
+    def play(
+        self,
+        poses: Float[np.ndarray, "frame 3 4"],
+        distance: float,
+        angles: list[float],
+        seconds: float,
+        shown: Callable[[int], None] = lambda frame: None,
+    ) -> bool:
+        """Move the camera along a path in a time, skipping frames if need be; returns whether it came to the end.
+
+        shown: called with the number of each frame that is not skipped
+        """
+        self._number += 1
+        number, begin = self._number, time.perf_counter()
+        while (now := time.perf_counter() - begin) < seconds:
+            if number != self._number:
+                return False
+            i = min(int(now / seconds * len(poses)), len(poses) - 1)
+            self.place(poses[i], distance, angles[i])
+            shown(i)
+            time.sleep(STEP_SECONDS)
+        self.place(poses[-1], distance, angles[-1])
+        shown(len(poses) - 1)
+        return True
+
+
+def upwards(pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, " 3"]:
+    """The up direction that makes the browser show a pose's own roll: as near to the scene's up as can be."""
+    right = pose[:, 0]
+    up = UP - (UP @ right) * right
+    if up @ -pose[:, 1] < 0.05:  # upside down, or nearly level with the axis
+        up = -pose[:, 1]
+    return up / np.linalg.norm(up)

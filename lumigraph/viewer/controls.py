@@ -1,63 +1,48 @@
-"""Controls: the settings of one client's own view."""
+"""The tab `View` of one client: Controls for settings of the view, MethodControls for controls of the method."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..datasets.scene import Frame, Vector
+import numpy as np
+
+from ..datasets.scene import Vector
+from ..method.controls import Control, Value
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
 from .serving import PAGE
+from .shared import Shared
 
-DEFAULT_RESOLUTION = 1024  # pixels along the longer side, unless the client wants another
+DEFAULT_RESOLUTION = 1024  # pixels along the longer side, at first
 CLIENT_SIDE_LINK = f'<a href="{PAGE}" target="_blank">Drawn by this browser, in a tab of its own</a>'
 MIN_DEGREES, MAX_DEGREES = 10.0, 120.0  # degrees
 
 
 class Controls:
-    """The contents of a client's tab `View`.
+    """The contents of the tab `View` of a client of viser. changed: called when anything that is drawn changes."""
 
-    client:  viser's
-    tab:     viser's, which holds them
-    changed: called when anything that is drawn changes
-    cloud:   whether the method is a cloud of Gaussians, which the browser can draw
-    page:    whether there is a page on which the browser draws the scene itself
-    """
-
-    def __init__(
-        self, client: Any, tab: Any, frame: Frame, cloud: bool, changed: Callable[[], None], page: bool = False
-    ):
-        self._client, self._frame, self._changed = client, frame, changed
+    def __init__(self, client: Any, shared: Shared, changed: Callable[[], None]):
+        self._client, self._frame, self._changed = client, shared.subject.frame, changed
         self._modes = {mode.capitalize(): mode for mode in MODES}  # by how the dropdown names them
         gui = client.gui
-        with tab:
+        with shared.tabs[0]:
             self._mode = gui.add_dropdown("Show", list(self._modes))
-            self._exact = gui.add_checkbox(
-                "Draw exactly", False, visible=cloud, hint="Drawn by our own renderer and sent, not by the browser"
-            )
-            self._angle = gui.add_slider(
-                "Angle of view", MIN_DEGREES, MAX_DEGREES, 1.0, 50.0, hint="Degrees, from top to bottom"
-            )
-            self._sharpest = gui.add_slider(
-                "Resolution",
-                240,
-                2048,
-                16,
-                DEFAULT_RESOLUTION,
-                hint="Pixels along the longer side, once the camera rests",
-            )
-            self._background = gui.add_rgb("Background", to_bytes(frame.background))
+            hint = "Drawn by our own renderer and sent, not by the browser"
+            self._exact = gui.add_checkbox("Draw exactly", False, visible=shared.is_cloud, hint=hint)
+            hint = "Degrees, from top to bottom"
+            self._angle = gui.add_slider("Angle of view", MIN_DEGREES, MAX_DEGREES, 1.0, 50.0, hint=hint)
+            hint = "Pixels along the longer side, once the camera rests"
+            self._sharpest = gui.add_slider("Resolution", 240, 2048, 16, DEFAULT_RESOLUTION, hint=hint)
+            self._background = gui.add_rgb("Background", to_bytes(self._frame.background))
             self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
             self._points = gui.add_checkbox("Sparse points", False, visible=False)
-            if page:
+            if shared.subject.page is not None:
                 gui.add_html(CLIENT_SIDE_LINK)
             self.status = gui.add_markdown("")
-        for drawn in (self._mode, self._exact, self._sharpest, self._background):
+        for drawn in (self._mode, self._exact, self._sharpest, self._background, self._cameras, self._points):
             drawn.on_update(lambda _: self._update())
-        self._cameras.on_update(lambda _: self._update())
-        self._points.on_update(lambda _: self._update())
         self._angle.on_update(lambda _: self._set_angle())
         self._shadows = {CAMERAS: True, POINTS: True}
         self._update()
@@ -98,7 +83,7 @@ class Controls:
             self._modes |= {name: name for name in names}
             self._mode.options = tuple(self._modes)
 
-    def tell_angle(self, radians: float) -> None:
+    def show_angle(self, radians: float) -> None:
         """Show the camera's angle of view at the slider."""
         degrees = float(min(max(round(math.degrees(radians)), MIN_DEGREES), MAX_DEGREES))
         if degrees != self._angle.value:
@@ -106,7 +91,7 @@ class Controls:
 
     def _set_angle(self) -> None:
         camera = self._client.camera
-        if abs(math.degrees(camera.fov) - self._angle.value) > 0.51:  # not when it was only told, and rounded
+        if abs(math.degrees(camera.fov) - self._angle.value) > 0.51:  # not when it was only shown, rounded
             camera.fov = math.radians(self._angle.value)
 
     def _update(self) -> None:
@@ -121,3 +106,56 @@ class Controls:
 def to_bytes(colour: Vector) -> tuple[int, int, int]:
     red, green, blue = (round(255 * x) for x in colour)
     return red, green, blue
+
+
+STEPS = 200  # of a slider
+
+
+class MethodControls:
+    """The folder `Controls` in the tab `View` of a client, if the method has any. changed: called when one is moved."""
+
+    def __init__(self, client: Any, shared: Shared, changed: Callable[[], None]):
+        controls: Sequence[Control] = shared.method.controls
+        self._controls, self._begun = controls, {x.name: shared.method.control(x.name) for x in controls}
+        self._handles: dict[str, Any] = {}
+        if not controls:
+            return
+        with shared.tabs[0], client.gui.add_folder("Controls"):
+            for control in controls:
+                handle = self._handles[control.name] = add(client.gui, control, self._begun[control.name])
+                handle.on_update(lambda _: changed())
+
+    @property
+    def values(self) -> tuple[tuple[str, Value], ...]:
+        """Names and values of the controls that differ from their initial values."""
+        return tuple((name, value) for name, value in self._now().items() if value != self._begun[name])
+
+    @property
+    def time(self) -> float | None:
+        """The shown moment of a moving scene."""
+        time = self._now().get("time")
+        return None if time is None else float(time)
+
+    def show_time(self, moment: float) -> None:
+        """Turn the control `time` to a moment, where there is one."""
+        if "time" in self._handles:
+            self._handles["time"].value = moment
+
+    def _now(self) -> dict[str, Value]:
+        found: dict[str, Value] = {}
+        for control in self._controls:
+            shown = self._handles[control.name].value
+            # sliders round, also beyond the ends of their range
+            found[control.name] = shown if control.range is None else float(np.clip(shown, *control.range))
+        return found
+
+
+def add(gui: Any, control: Control, value: Value) -> Any:
+    """A slider or a list, set to a value."""
+    label = f"{control.name.replace('_', ' ').capitalize()}{f' ({control.unit})' if control.unit else ''}"
+    if control.range is None:
+        choices = tuple(dict.fromkeys((*control.choices, str(value))))  # a blend of two is none of them
+        return gui.add_dropdown(label, choices, initial_value=value, hint=control.about or None)
+    least, most = control.range
+    step = max((most - least) / STEPS, 1e-9)
+    return gui.add_slider(label, least, most, step, float(value), hint=control.about or None)

@@ -10,75 +10,66 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from ..camera.crop import Box, Crop, Sphere
-from ..datasets.scene import Frame, Vector
+from ..camera.crop import Crop, CropBox, Sphere
+from ..datasets.scene import Vector
 from ..errors import LumigraphError
-from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
+from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
 from .path_panel import code
-from .subject import NAME, NAME_RULE, Keep
+from .shared import NAME, NAME_RULE, Keep, Shared
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
 HANDLE = 0.25  # length of a handle's arrows, in longest sides of the bounds
 CIRCLE_SEGMENTS = 64  # pieces of a drawn circle
 NUMBER_STEP = 0.001  # scene units: step of the numbers
+FLOATERS = {  # arguments of `cleaned`: label, range with step and default, hint
+    "min_opacity": ("Least opacity", (0.0, 0.5, 0.005, MIN_OPACITY), "Fainter Gaussians are left out"),
+    "max_scale": ("Largest size", (0.01, 1.0, 0.01, MAX_SCALE), "In extents of the cloud"),
+    "isolation": (
+        "Isolation",
+        (0.0, 8.0, 0.1, ISOLATION),
+        "How much farther from its neighbours than most one may be, in standard deviations",
+    ),
+}
 
 
 class CropPanel:
     """The contents of the tab.
 
-    client:  viser's
-    tab:     viser's, which holds them
-    cloud:   whether the method is a cloud of Gaussians, of which some can be left out
-    changed: called when what is shown changes
-    keep:    saves what is left under a name and says where; None where nothing can be saved
-    name:    that is proposed for it
-    tell:    says a title and a text to the client
+    changed: called when the crop or the floaters change
+    keep:    saves the rest under a name and returns its path; None where nothing can be saved
+    notify:  shows the client a title and a text
     """
 
     def __init__(
         self,
         client: Any,
-        tab: Any,
-        frame: Frame,
-        cloud: bool,
+        shared: Shared,
         changed: Callable[[], None],
         keep: Keep | None,
-        name: str,
-        tell: Callable[[str, str], None],
+        notify: Callable[[str, str], None],
     ):
-        self._client, self._changed, self._keep, self._tell = client, changed, keep, tell
+        self._client, self._changed, self._keep, self._notify = client, changed, keep, notify
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
-        (lower, upper), gui = frame.bounds, client.gui
+        (lower, upper), gui = shared.subject.frame.bounds, client.gui
         middle = cast(Vector, tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True)))
-        longest = max(b - a for a, b in zip(lower, upper, strict=True))
-        self._size = longest
-        with tab:
+        self._size = longest = max(b - a for a, b in zip(lower, upper, strict=True))
+        with shared.tabs[1]:
             self._shape = gui.add_dropdown("Show", (ALL, BOX, SPHERE))
             self._lower = gui.add_vector3("Lower", lower, step=NUMBER_STEP, visible=False)
             self._upper = gui.add_vector3("Upper", upper, step=NUMBER_STEP, visible=False)
             self._middle = gui.add_vector3("Middle", middle, step=NUMBER_STEP, visible=False)
             self._radius = gui.add_number("Radius", longest / 2, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
-            self._clean = gui.add_checkbox("Leave out floaters", False, visible=cloud)
+            self._clean = gui.add_checkbox("Leave out floaters", False, visible=shared.is_cloud)
             self._floaters = {
-                "min_opacity": gui.add_slider(
-                    "Least opacity", 0.0, 0.5, 0.005, MIN_OPACITY, hint="Fainter Gaussians are left out", visible=False
-                ),
-                "max_scale": gui.add_slider(
-                    "Largest size", 0.01, 1.0, 0.01, MAX_SCALE, hint="In extents of the cloud", visible=False
-                ),
-                "isolation": gui.add_slider(
-                    "Isolation",
-                    *(0.0, 8.0, 0.1, ISOLATION),
-                    hint="How much farther from its neighbours than most one may be, in standard deviations",
-                    visible=False,
-                ),
+                name: gui.add_slider(label, *limits, hint=hint, visible=False)
+                for name, (label, limits, hint) in FLOATERS.items()
             }
             if keep is not None:
-                self._name = gui.add_text(
-                    "Name", name, hint="Of a splat file, .ply or .spz, or of a folder for a new run"
-                )
+                name = f"{shared.subject.title.partition('.')[0]}-part.ply"
+                hint = "Of a splat file, .ply or .spz, or of a folder for a new run"
+                self._name = gui.add_text("Name", name, hint=hint)
                 gui.add_button("Save").on_click(lambda _: self._save())
                 self._about = gui.add_markdown("")
         numbers = self._lower, self._upper, self._middle, self._radius
@@ -90,14 +81,14 @@ class CropPanel:
         """The chosen crop in the scene's frame; `None` for the whole scene."""
         if self._shape.value == BOX:
             a, b = self._lower.value, self._upper.value
-            return Box(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
+            return CropBox(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
         if self._shape.value == SPHERE:
             return Sphere(vector(self._middle.value), max(float(self._radius.value), NUMBER_STEP))
         return None
 
     @property
     def floaters(self) -> tuple[tuple[str, float], ...]:
-        """Names and numbers of what `cleaned` is told of floaters; nothing while they stay."""
+        """Arguments of `cleaned` for floaters; none while they stay."""
         return tuple((name, float(x.value)) for name, x in self._floaters.items()) if self._clean.value else ()
 
     @property
@@ -160,7 +151,7 @@ class CropPanel:
             if "outline" in self._nodes:
                 self._nodes.pop("outline").remove()
             return
-        lines = edges(crop) if isinstance(crop, Box) else circles(cast(Sphere, crop))
+        lines = edges(crop) if isinstance(crop, CropBox) else circles(cast(Sphere, crop))
         if "outline" in self._nodes:
             self._nodes["outline"].points = lines
         else:
@@ -172,12 +163,12 @@ class CropPanel:
         assert self._keep is not None
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", NAME_RULE)
+            self._notify("Not saved", NAME_RULE)
             return
         try:
             where = self._keep(name, self.crop, dict(self.floaters))
         except LumigraphError as error:
-            self._tell("Not saved", str(error))
+            self._notify("Not saved", str(error))
             return
         self._about.content = f"Saved as {code(where)}"
 
@@ -187,7 +178,7 @@ def vector(values: Any) -> Vector:
     return x, y, z
 
 
-def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
+def edges(box: CropBox) -> Float[np.ndarray, "12 2 3"]:
     """The two ends of each of a box's twelve edges."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]

@@ -1,17 +1,62 @@
-"""Painter: a thread that draws what one client asked for last, coarse while its camera moves, finer once it rests."""
+"""Painter: a thread that draws the last request of one client, coarse while its camera moves, finer once it rests.
+Pace: the size of a picture that can be rendered in a given time."""
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from .turns import NotWantedError, Turns
 
-MOVING_SECONDS, RESTING_SECONDS = (
-    0.1,
-    0.5,
-)  # seconds that a picture may take while the camera moves, and the first one at rest
+MIN_RESOLUTION = 80  # pixels along the longer side
+SMOOTHING = 0.7  # share of its weight that a picture keeps when the next has come
+
+
+class Pace:
+    """Rendering time as a line, a + b times the number of pixels, fitted to recent pictures."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros(5)  # of 1, n, n^2, t, n t over pictures of n pixels and t seconds, older ones fading
+        self._noted = False
+
+    def note(self, pixels: int, seconds: float) -> None:
+        """Take note of a picture's time. The first is ignored: something may have been compiled for it."""
+        if self._noted:
+            n, t = float(pixels), seconds
+            self._sums = SMOOTHING * self._sums + np.array([1, n, n * n, t, n * t])
+        self._noted = True
+
+    @property
+    def costs(self) -> tuple[float, float] | None:
+        """(a, b), neither below zero; None before the first measurement."""
+        one, n, nn, t, nt = self._sums
+        if one == 0:
+            return None
+        spread = one * nn - n * n
+        b = (one * nt - n * t) / spread if spread > 1e-3 * one * nn else 0.0
+        a = (t - b * n) / one
+        return (a, b) if a >= 0 and b > 0 else (0.0, t / n)
+
+    def pixels(self, seconds: float) -> float:
+        """Number of pixels that can be rendered in a time. Where most of that time is a picture's fixed
+        cost, half as much again is allowed: a smaller picture would hardly be quicker."""
+        if self.costs is None:
+            return 0.0
+        a, b = self.costs
+        return max(seconds - a, 0.5 * a) / max(b, 1e-12)
+
+    def size(self, full: tuple[int, int], seconds: float) -> tuple[int, int]:
+        """(width, height) with the aspect of `full` that can be rendered in a time; small at first."""
+        share = math.sqrt(self.pixels(seconds) / (full[0] * full[1]))
+        share = min(1.0, max(share, MIN_RESOLUTION / max(full)))
+        return max(1, round(full[0] * share)), max(1, round(full[1] * share))
+
+
+MOVING_SECONDS, RESTING_SECONDS = 0.1, 0.5  # for a picture while the camera moves, and for the first one at rest
 REST_SECONDS = 0.2  # seconds after the last request from which a client counts as resting
 MIN_FRAME_SECONDS = 1 / 30  # seconds between pictures
 NO_DEADLINE = float("inf")
@@ -22,28 +67,28 @@ Draw = Callable[[float, Callable[[], bool]], bool]
 class Painter:
     """A thread that draws. The last request counts; a picture at rest is abandoned when another request comes.
 
-    draw:  draw(seconds, wanted) shows the best picture that should take so many seconds and says whether that was the
-           best there is; it raises NotWantedError as soon as wanted() is false
-    fault: called with whatever goes wrong
-    step:  gives the step to which the method has been trained; pictures of an earlier step are stale
+    draw:  draw(seconds, wanted) shows the best picture that should take so many seconds and returns True if no better
+           one is possible; it raises NotWantedError as soon as wanted() is false
+    fault: called with each exception
+    step:  returns the step to which the method has been trained; pictures of an earlier step are stale
     """
 
     def __init__(
         self, draw: Draw, turns: Turns, fault: Callable[[Exception], None], step: Callable[[], int] = lambda: 0
     ):
         self._draw, self._turns, self._fault, self._step = draw, turns, fault, step
-        self._asked, self._when, self._stopped = 0, 0.0, False
+        self._requested, self._when, self._stopped = 0, 0.0, False
         self._wake = threading.Event()
-        self.settled = threading.Event()  # the best picture of what was asked last is shown
+        self.settled = threading.Event()  # the best picture of the last request is shown
         self._thread = threading.Thread(target=self._work, name="painter", daemon=True)
 
     def start(self) -> None:
         self._thread.start()
 
-    def ask(self) -> None:
+    def request(self) -> None:
         """Request a new picture; what is being drawn is out of date."""
         self.settled.clear()
-        self._asked, self._when = self._asked + 1, time.perf_counter()
+        self._requested, self._when = self._requested + 1, time.perf_counter()
         self._wake.set()
 
     def stop(self) -> None:
@@ -53,36 +98,36 @@ class Painter:
     def _work(self) -> None:
         drawn, best, step = 0, True, self._step()
         while not self._stopped:
-            asked, now = self._asked, time.perf_counter()
-            if asked != drawn:
-                step, drawn = self._step(), asked
+            requested, now = self._requested, time.perf_counter()
+            if requested != drawn:
+                step, drawn = self._step(), requested
                 best = self._try(MOVING_SECONDS, lambda: not self._stopped)
                 self._sleep(MIN_FRAME_SECONDS - (time.perf_counter() - now))
             elif now < self._when + REST_SECONDS:
                 self._sleep(self._when + REST_SECONDS - now)
             elif not best:
-                best = self._refine(asked)
+                best = self._refine(requested)
             elif self._step() != step and self._turns.claim_refresh():
                 step = self._step()
-                self._try(self._longest, self._while_asked(asked))
+                self._try(self._longest, self._while_current(requested))
                 self._turns.refreshed(time.perf_counter() - now)
             else:
-                if self._asked == asked:
+                if self._requested == requested:
                     self.settled.set()
                 self._sleep(1.0)
 
-    def _refine(self, asked: int) -> bool:
+    def _refine(self, requested: int) -> bool:
         """Draw better pictures one after the other; whether the best was reached before another request came."""
         for seconds in dict.fromkeys([RESTING_SECONDS, self._longest]):
-            if self._try(seconds, self._while_asked(asked)):
+            if self._try(seconds, self._while_current(requested)):
                 return True
-            if self._asked != asked:
+            if self._requested != requested:
                 return False
         return True
 
-    def _while_asked(self, asked: int) -> Callable[[], bool]:
-        """A function that says whether no other request has come since."""
-        return lambda: not self._stopped and self._asked == asked
+    def _while_current(self, requested: int) -> Callable[[], bool]:
+        """A function that returns True until another request comes."""
+        return lambda: not self._stopped and self._requested == requested
 
     @property
     def _longest(self) -> float:
@@ -94,7 +139,7 @@ class Painter:
             return self._draw(seconds, wanted)
         except NotWantedError:
             return False
-        except Exception as error:  # whatever it is, the others' pictures go on
+        except Exception as error:  # pictures of other clients go on
             if not self._stopped:
                 self._fault(error)
             return True

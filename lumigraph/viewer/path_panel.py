@@ -20,9 +20,9 @@ from ..errors import LumigraphError
 from ..files.names import natural
 from ..geometry import to_quaternion
 from ..paths.keyframes import CameraPath, Keyframe
-from .cameras import pose_of
-from .flight import Flight
-from .subject import NAME, NAME_RULE, Subject
+from .cameras import Flight, pose_of
+from .controls import MethodControls
+from .shared import NAME, NAME_RULE, Shared
 
 COLOUR = (200, 60, 150)
 POINTS_PER_LEG = 24  # points of the drawn path between two keyframes
@@ -39,32 +39,18 @@ class Stop:
 
 
 class PathPanel:
-    """The keyframes of one client.
-
-    size: of a frustum, in scene units
-    tell: says a title and a text to the client
-    time: gives the moment of a moving scene that the client sees, which a keyframe keeps
-    show_time: shows the client a moment
-    """
+    """The keyframes of one client. notify: shows the client a title and a text."""
 
     def __init__(
-        self,
-        client: Any,
-        tab: Any,
-        subject: Subject,
-        flight: Flight,
-        size: float,
-        tell: Callable[[str, str], None],
-        time: Callable[[], float | None],
-        show_time: Callable[[float], None],
+        self, client: Any, shared: Shared, flight: Flight, controls: MethodControls, notify: Callable[[str, str], None]
     ):
-        self._time, self._show_time = time, show_time
-        self._client, self._subject, self._flight, self._size, self._tell = client, subject, flight, size, tell
+        self._client, self._subject, self._size = client, shared.subject, shared.scenery.size
+        self._flight, self._controls, self._notify = flight, controls, notify
         self._stops: list[Stop] = []
         self._nodes: list[Any] = []
         self._filling = False  # while what the panel shows is set from here
         gui = client.gui
-        with tab:
+        with shared.tabs[2]:
             gui.add_button("Add keyframe here").on_click(lambda _: self._add())
             self._chosen = gui.add_dropdown("Keyframe", [NONE])
             self._actions = gui.add_button_group("This one", ("Go", "Set", "◀", "▶", "✕"))
@@ -113,7 +99,7 @@ class PathPanel:
         pose = torch.tensor([pose_of(camera.wxyz, camera.position)], dtype=torch.double)
         (rows,) = moved(pose, source_from_scene(self._subject.frame)).tolist()
         a, b, c = (tuple(row) for row in rows)
-        return Keyframe((a, b, c), math.degrees(angle), 0.0, self._time())
+        return Keyframe((a, b, c), math.degrees(angle), 0.0, self._controls.time)
 
     def _add(self) -> None:
         at = self._index + 1
@@ -151,21 +137,21 @@ class PathPanel:
             key = self._stops[self._index].key
             poses, angles, _ = self._views(CameraPath((key,)), 1)
             if key.time is not None:
-                self._show_time(key.time)
+                self._controls.show_time(key.time)
             self._flight.fly(poses[0], self._distance, angles[0])
 
     def _play(self) -> None:
         try:
             path = self.path()
         except LumigraphError as error:
-            self._tell("Nothing to play", str(error))
+            self._notify("Nothing to play", str(error))
             return
         seconds = max(path.duration, 0.1)
         poses, angles, moments = self._views(path, max(2, round(30 * seconds)))
 
         def shown(frame: int) -> None:
             if moments is not None:
-                self._show_time(moments[frame])
+                self._controls.show_time(moments[frame])
 
         self._flight.play(poses, self._distance, angles, seconds, shown)
 
@@ -241,13 +227,13 @@ class PathPanel:
     def _save(self) -> None:
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", NAME_RULE)
+            self._notify("Not saved", NAME_RULE)
             return
         file = self._subject.paths / f"{name}.json"
         try:
             self.path().save(file)
         except LumigraphError as error:
-            self._tell("Not saved", str(error))
+            self._notify("Not saved", str(error))
             return
         self._saved.options = self._names()
         self._saved.value = name
@@ -255,13 +241,13 @@ class PathPanel:
 
     def _open(self) -> None:
         self._saved.options, name = self._names(), self._saved.value
-        if name == NONE or name not in self._saved.options:  # a browser may say anything
-            self._tell("Nothing to open", f"No such path lies in {self._subject.paths}")
+        if name == NONE or name not in self._saved.options:  # a browser may send any name
+            self._notify("Nothing to open", f"No such path lies in {self._subject.paths}")
             return
         try:
             path = CameraPath.load(self._subject.paths / f"{name}.json")
         except LumigraphError as error:  # the keyframes that are set stay as they are
-            self._tell("Not opened", str(error))
+            self._notify("Not opened", str(error))
             return
         times = [key.seconds for key in path.keyframes]
         legs = [b - a for a, b in zip(times, times[1:], strict=False)]

@@ -31,7 +31,7 @@ class Scenery:
 
     server:   viser's
     cameras:  by split
-    clicked:  told of a client and the camera that it clicked on
+    clicked:  called with a client and the camera that it clicked on
     """
 
     def __init__(self, server: Any, cameras: dict[str, Camera], clicked: Callable[[Any, Camera], None]):
@@ -72,7 +72,7 @@ class Scenery:
             self._frusta[int(camera.image_index[0])] = frustum
 
     def fill(self, open_scene: Callable[[], Scene], done: Callable[[str | None], None]) -> None:
-        """Open the photographs in the background and show them. done: told the fault, None if there was none."""
+        """Open the photographs in the background and show them. done: called with the fault, or None."""
 
         def work() -> None:
             try:
@@ -80,7 +80,7 @@ class Scenery:
             except LumigraphError as error:
                 done(str(error))
             except RuntimeError:
-                if not self._stopped:  # otherwise it only says that Python is about to end
+                if not self._stopped:  # raised when Python is about to end
                     raise
             else:
                 done(None)
@@ -112,7 +112,7 @@ class Scenery:
 
 
 def frustum_size(cameras: Camera) -> float:
-    """Size of a frustum in scene units, at which neighbours do not cover each other where they stand apart."""
+    """Size of a frustum in scene units, at which neighbours do not cover each other."""
     position = cameras.position.cpu().double()
     distance = torch.cdist(position, position)
     spread = float((position - position.median(0).values).norm(dim=-1).median())

@@ -1,4 +1,4 @@
-"""viser's server, with a guard at its door: who may connect, and what they may say."""
+"""viser's server behind a guard, which checks connections and messages."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from websockets.http11 import Request, Response
 
 from ..errors import LumigraphError
 from .address import Address
-from .frames import MAX_MESSAGE_BYTES, understood
-from .guard import Answers, Guard
+from .guard import MAX_MESSAGE_BYTES, Answers, Guard, understood
 
 PAGE = "scene.html"  # where a scene that browsers draw by themselves is
 _patching = threading.Lock()
@@ -41,7 +40,7 @@ def start_server(address: Address, title: str, page: Callable[[], bytes] | None 
         with quiet():
             server.stop()
         raise LumigraphError(f"Port {address.port} has just been taken; start the viewer again")
-    server.request_share_url = lambda *_, **__: None  # viser would connect to the outside if a client asked it to
+    server.request_share_url = lambda *_, **__: None  # viser would connect to the outside if a client requested it
     return server
 
 
@@ -63,7 +62,7 @@ class Door:
             asyncio.get_running_loop().set_exception_handler(self._swallow)
             options |= {"max_size": MAX_MESSAGE_BYTES, "logger": silent_logger()}
             answer = self._guard.answering(beside(process_request, self._page))
-            return begin(self._hearing(handler), host, port, process_request=answer, **options)
+            return begin(self._filtering(handler), host, port, process_request=answer, **options)
 
         with _patching:
             module.serve = serve  # type: ignore[assignment, misc]
@@ -71,29 +70,29 @@ class Door:
                 yield
             finally:
                 module.serve = begin  # type: ignore[misc]
-        assert built, "viser does not start its server as it used to, so it would stand open"
+        assert built, "viser does not start its server as it used to, so it would be unguarded"
 
-    def _hearing(self, handler: Any) -> Any:
-        """viser's own function for a client, which hears what makes sense and nothing else."""
+    def _filtering(self, handler: Any) -> Any:
+        """viser's own function for a client, with accepted messages only."""
 
-        async def hear(connection: Any) -> None:
+        async def filtered(connection: Any) -> None:
             if connection.subprotocol != f"viser-v{viser.__version__}":
                 await connection.close(1002, "The viewer has been updated; load the page again")
                 return
             receive = connection.recv
 
-            async def sensible() -> bytes:
+            async def receive_accepted() -> bytes:
                 while (frame := understood(await receive(), self._handle)) is None:
                     pass
                 return frame
 
-            connection.recv = sensible
+            connection.recv = receive_accepted
             await handler(connection)
 
-        return hear
+        return filtered
 
     def _handle(self, number: str) -> Any:
-        """The part of somebody's panel that has this number."""
+        """The input of a client's panel with this number."""
         if self.server is None:
             return None
         for owner in (self.server, *self.server.get_clients().values()):
@@ -108,7 +107,7 @@ class Door:
 
 
 def beside(answer: Answers, page: Callable[[], bytes] | None) -> Answers:
-    """viser's answers, and at PAGE a page that is made when it is first asked for."""
+    """viser's answers, and at PAGE a page that is made at the first request."""
     if page is None:
         return answer
     once = functools.cache(page)
@@ -125,7 +124,7 @@ def beside(answer: Answers, page: Callable[[], bytes] | None) -> Answers:
 
 
 def silent_logger() -> logging.Logger:
-    """For what strangers do at the door: a scan of ports is no fault of ours."""
+    """A logger for faults of foreign connections, such as scans of ports."""
     logger = logging.getLogger("lumigraph.viewer")
     logger.propagate = bool(os.environ.get("LUMIGRAPH_DEBUG"))
     if not logger.handlers:
@@ -134,7 +133,7 @@ def silent_logger() -> logging.Logger:
 
 
 class quiet:  # noqa: N801
-    """viser greets on stdout, where our results go; inside this block it does not."""
+    """A block in which viser prints no greeting to stdout, where our results go."""
 
     def __enter__(self) -> None:
         self._before, rich.get_console().quiet = rich.get_console().quiet, True

@@ -1,21 +1,75 @@
-"""Shared: what all clients of a viewer have in common."""
+"""Subject: a scene as the viewer needs it. Shared: the state that all clients have in common."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+import torch
+from jaxtyping import Bool, Shaped
+from torch import Tensor
+
 from ..camera import Camera
-from ..camera.rays import Rendering
+from ..camera.crop import Crop
+from ..camera.rays import Rays, Rendering
+from ..datasets.scene import Frame, Scene
 from ..gaussians import Gaussians, splatting
-from ..gaussians.cleaning import cleaned
-from ..method import Method
+from ..gaussians.cloud import cleaned
+from ..method import Method, RayMethod
 from ..method.capabilities import HasGaussians, needs
-from .crop import render_inside
+from ..paths import Surroundings, best_centred, pivot
+from .cameras import ViewRequest
 from .scenery import Scenery
-from .subject import Subject
 from .turns import Turns
-from .view_request import ViewRequest
+
+NAME = re.compile(r"\w[\w .-]{0,80}")  # of a saved file or folder
+NAME_RULE = "A name is made of letters, digits, spaces, dots and dashes"
+Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A scene as the viewer needs it.
+
+    title:          shown above the controls
+    cameras:        of the photographs, by split, in the scene's frame
+    paths:          folder that camera paths are saved in
+    render_command: command line that renders films of the scene, without `--path`
+    open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
+    rows:           of metrics.jsonl, as far as the method has been trained
+    keep:           saves the cropped and cleaned cloud under a name, and returns its path; None where nothing
+                    can be saved
+    page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
+    """
+
+    title: str
+    frame: Frame
+    cameras: dict[str, Camera]
+    paths: Path
+    render_command: str
+    open_scene: Callable[[], Scene] | None = None
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    keep: Keep | None = None
+    page: Callable[[], bytes] | None = None
+
+    @cached_property
+    def around(self) -> Surroundings:
+        """Positions and directions of all cameras."""
+        return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
+
+    @cached_property
+    def first(self) -> Camera:
+        """The photograph's camera that every client begins with."""
+        return self.around.cameras[best_centred(self.around)]
+
+    def distance(self, camera: Camera) -> float:
+        """Distance from a camera to the point that it turns about, in scene units."""
+        position, forward = camera.position[0].double().cpu(), camera.forward[0].double().cpu()
+        return float((pivot(self.around, position, forward) - position).norm())
 
 
 @dataclass
@@ -38,10 +92,10 @@ class Shared:
     scenery: Scenery
     step: int = 0
     stopped: bool = False
-    _picked: tuple[Any, Gaussians] | None = None  # what was wanted last of part of the cloud, and that part
+    _picked: tuple[Any, Gaussians] | None = None  # the last part of the cloud, after the settings that it depends on
 
     def cloud(self, request: ViewRequest) -> Gaussians:
-        """The Gaussians of the method as a client told it, of which its crop and cleaning leave these. Raises
+        """Gaussians of the method with the controls, crop and cleaning of a client. Raises
         LumigraphError if it has none. Call it inside `turns.turn`."""
         if not request.part:
             return needs(self._given(request), HasGaussians).gaussians()
@@ -64,6 +118,66 @@ class Shared:
     def _given(self, request: ViewRequest) -> Method:
         return self.method.given(**dict(request.settings)) if request.settings else self.method
 
-    def knows(self, client: Any) -> bool:
+    def connected(self, client: Any) -> bool:
         """True if a client is still connected."""
         return not self.stopped and client.client_id in self.server.get_clients()
+
+
+TOLERANCE = 0.01  # of the crop's size: an expected depth may lie so far outside
+
+
+def render_inside(method: Method, camera: Camera, crop: Crop) -> Rendering:
+    """Rendering of the inside of a crop, for a method without Gaussians.
+
+    Rays of a RayMethod begin where they enter the crop, so nothing in front of it is seen. Pixels whose expected depth
+    lies behind the crop are removed; for all other methods, also those in front of it. Where something see-through
+    inside is in front of something solid outside, their mean depth decides.
+    """
+    frame = method.frame
+    rays = camera.rays(camera.pixels())
+    if isinstance(method, RayMethod):
+        rendering = from_entry(method, rays, crop)
+    else:
+        rendering = method.render(camera).cpu()
+    width, height = camera.size[0].tolist()
+    depth = rendering.depth.reshape(-1)
+    inside = crop.holds(rays.at(depth.nan_to_num(0, 0)), TOLERANCE) & depth.isfinite()
+    keep = inside.view(height, width)
+    rendering = rendering.reshape(height, width)
+    return replace(
+        rendering,
+        rgb=torch.where(keep[..., None], rendering.rgb, torch.tensor(frame.background)),
+        depth=torch.where(keep, rendering.depth, torch.inf),
+        opacity=torch.where(keep, rendering.opacity, 0.0),
+        extra={name: kept(values, keep) for name, values in rendering.extra.items()},
+    )
+
+
+def kept(values: Shaped[Tensor, "*all"], where: Bool[Tensor, "*pixels"]) -> Shaped[Tensor, "*all"]:
+    """An extra's values at the pixels of a mask, zeros elsewhere."""
+    where = where.reshape(*where.shape, *(1,) * (values.ndim - where.ndim))
+    return torch.where(where, values, torch.zeros_like(values))
+
+
+@torch.no_grad()
+def from_entry(method: RayMethod, rays: Rays, crop: Crop) -> Rendering:
+    """Rendering along rays from their entry into a crop; depth is measured from their origins."""
+    enter, hits = crop.entered(rays)
+    chosen = hits.clone()
+    chosen[0] = True  # so that a picture beside the crop has the method's extras too
+    begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[chosen]  # not nearer
+    moved = replace(rays[chosen], origins=rays[chosen].at(begin))
+    background = torch.tensor(method.frame.background)
+    behind = background.to(method.device)[None]
+    chunks = [slice(i, i + method.rays_per_chunk) for i in range(0, len(moved), method.rays_per_chunk)]
+    seen = Rendering.cat([method.render_rays(moved[c].to(method.device), behind).cpu() for c in chunks])
+
+    def spread(values: Tensor) -> Tensor:
+        return kept(values.new_zeros(len(rays), *values.shape[1:]).index_put((chosen,), values), hits)
+
+    return Rendering(
+        torch.where(hits[:, None], spread(seen.rgb), background),
+        torch.where(hits, spread(seen.depth + begin), torch.inf),
+        spread(seen.opacity),
+        {name: spread(values) for name, values in seen.extra.items()},
+    )

@@ -8,8 +8,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 
-RENDER_SHARE = 0.5  # of the time that renderings may take from training while someone moves
-IDLE_RENDER_SHARE = 0.03  # and while nobody does
+RENDER_SHARE = 0.5  # of the time that renderings may take from training while a camera moves
+IDLE_RENDER_SHARE = 0.03  # and while none does
 POLL_SECONDS = 0.1  # seconds between checks whether to stop waiting
 
 
@@ -18,7 +18,7 @@ class NotWantedError(Exception):
 
 
 class Turns:
-    """A queue of renderings, served in the order of asking. Training has the method by default and gives way between
+    """A queue of renderings, served in the order of requests. Training has the method by default and gives way between
     steps, never so often that renderings take more than their share of the time.
 
     training: whether someone trains; `give_way` must then be called between steps, until `end_training`
@@ -32,7 +32,7 @@ class Turns:
         self._busy = False  # a rendering has its turn
         self._served = 0
         self._own_until = 0.0  # until then training need not give way
-        self._idle_until = 0.0  # until then nobody at rest may ask for a newer picture
+        self._idle_until = 0.0  # until then no client at rest may request a newer picture
 
     @contextlib.contextmanager
     def turn(self, wanted: Callable[[], bool] = lambda: True) -> Iterator[None]:
@@ -41,7 +41,7 @@ class Turns:
         with self._condition:
             self._waiting.append(ticket)
             try:
-                while not self._free_for(ticket):
+                while self._busy or self._waiting[0] is not ticket or (self.training and not self._open):
                     self._condition.wait(POLL_SECONDS)
                     if not wanted():
                         raise NotWantedError
@@ -59,9 +59,6 @@ class Turns:
                 self._open = self._open and self.paused  # the next one has to wait until training gives way again
                 self._own_until = end + (end - begin) * (1 / RENDER_SHARE - 1)
                 self._condition.notify_all()
-
-    def _free_for(self, ticket: object) -> bool:
-        return not self._busy and (self._open or not self.training) and self._waiting[0] is ticket
 
     @property
     def asked(self) -> bool:

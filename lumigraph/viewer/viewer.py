@@ -1,25 +1,133 @@
-"""Viewer: a server that shows a scene to any number of browsers."""
+"""Viewer: a server that shows a scene to any number of browsers. TrainingPanel: its tab of training."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from html import escape
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
 
 from ..camera import Camera
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
-from . import window
+from ..system.progress import clock, short
 from .address import Address
 from .cameras import angles
 from .scenery import Scenery
 from .serving import quiet, start_server
-from .shared import Shared
-from .subject import Subject
-from .training_panel import TrainingPanel
+from .shared import Shared, Subject
 from .turns import Turns
 from .visitor import Visitor
+
+UPDATE_SECONDS = 1.0  # seconds between updates
+CURVE_POINTS = 200  # of the curve
+INK = "#5686d6"
+Measure = Literal["psnr", "loss"]
+TITLES: dict[Measure, str] = {"psnr": "PSNR of training batches", "loss": "Loss of training batches"}
+
+
+class TrainingPanel:
+    """The panel, made inside its tab. rows: of metrics.jsonl, from earlier sittings."""
+
+    def __init__(self, server: Any, turns: Turns, rows: list[dict[str, Any]]):
+        self._gui, self._turns = server.gui, turns
+        self._measure = measure_of(rows)
+        self._rows = [(row["seconds"], row[self._measure]) for row in rows if self._measure in row]
+        self._next, self._last = 0.0, ""
+        begins = turns.training or not rows
+        self._status = self._gui.add_markdown("About to begin" if begins else describe(rows[-1]["step"], rows[-1]))
+        self._plot = self._gui.add_uplot(
+            curve(self._rows),
+            series(self._measure),
+            title=TITLES[self._measure],
+            scales={"x": {"time": False}},
+            aspect=1.6,
+            visible=len(self._rows) > 1,
+        )
+        self._button = self._gui.add_button("Pause", visible=turns.training)
+        self._button.on_click(lambda _: self._toggle())
+
+    def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
+        """Take note of a step that is done. row: its line of metrics.jsonl, empty if it has none."""
+        if not row:
+            return
+        if not self._rows and self._measure != (measure := measure_of([row])):
+            self._measure = measure
+            self._plot.title, self._plot.series = TITLES[measure], series(measure)
+        if self._measure in row:
+            self._rows.append((row["seconds"], row[self._measure]))
+        self._last = describe(step, row)
+        if (now := time.perf_counter()) >= self._next:
+            self._next = now + UPDATE_SECONDS
+            self._status.content = f"{100 * progress:.0f} % · {self._last}"
+            self._draw()
+
+    def end(self) -> None:
+        """Show that training is over."""
+        self._button.visible = False
+        self._status.content = f"Done · {self._last}" if self._last else "Done"
+        self._draw()
+
+    def _draw(self) -> None:
+        self._plot.data = curve(self._rows)
+        self._plot.visible = len(self._rows) > 1
+
+    def _toggle(self) -> None:
+        self._turns.paused = self._turns.training and not self._turns.paused
+        self._button.label = "Resume" if self._turns.paused else "Pause"
+
+
+def measure_of(rows: list[dict[str, Any]]) -> Measure:
+    """Name of the plotted measure: the PSNR, or the loss for methods without one."""
+    return "psnr" if not rows or any("psnr" in row for row in rows) else "loss"
+
+
+def series(measure: Measure) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The axes of the plot, as uPlot takes them."""
+    return {"label": "seconds"}, {"label": "dB" if measure == "psnr" else "loss", "stroke": INK, "width": 2}
+
+
+def describe(step: int, row: dict[str, Any]) -> str:
+    quality = f"{row['psnr']:.2f} dB" if "psnr" in row else f"loss {short(row['loss'])}" if "loss" in row else ""
+    return " · ".join(part for part in (f"step {step}", quality, f"{clock(row['seconds'])} trained") if part)
+
+
+def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
+    """Seconds and PSNR or loss of the curve: means over stretches of steps, at most CURVE_POINTS of them."""
+    if not rows:
+        return np.zeros(1), np.zeros(1)
+    table = np.array(rows)
+    seconds, psnr = np.array([part.mean(0) for part in np.array_split(table, min(len(table), CURVE_POINTS))]).T
+    return seconds, psnr
+
+
+NARROW_WINDOW_PIXELS = 576  # pixels: viser's panel is a sheet at the bottom of windows up to this width
+
+# A click on the sheet's handle folds it; what is clicked is the text of the title, inside the handle. The mark keeps it
+# from folding again when a user opens it, which makes the picture anew.
+SCRIPT = """
+document.title = {title};
+const sheet = this.closest(".mantine-Paper-root");
+if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
+  window.sheetFolded = true;
+  const texts = [...sheet.querySelectorAll("*")].filter((part) => part.childElementCount === 0);
+  texts.find((part) => part.textContent === {title})?.click();
+}}
+"""
+
+
+def prepare_window(gui: Any, title: str) -> None:
+    """Name the tab after the scene, and fold the panel of small windows once. gui: viser's, of the server.
+
+    viser has no option for either. A hidden picture that fails to load runs a line of JavaScript instead.
+    """
+    script = SCRIPT.format(title=json.dumps(title), narrow=NARROW_WINDOW_PIXELS)
+    gui.add_html(f'<img hidden alt="" src="data:," onerror="{escape(script)}">', order=1e9)
 
 
 class Viewer:
@@ -36,14 +144,18 @@ class Viewer:
         self._visitors: dict[int, Visitor] = {}
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs
-        is_cloud = can(method, HasGaussians)
         self._server = start_server(address, subject.title, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
         own_tabs = tabs.add_tab("View"), tabs.add_tab("Crop"), tabs.add_tab("Path")
-        self._panel = self._add_training_panel(tabs)
+        self._panel: TrainingPanel | None = None
+        if subject.rows or training:
+            with tabs.add_tab("Training"):
+                self._panel = TrainingPanel(self._server, self.turns, subject.rows)
         self._scenery = Scenery(self._server, subject.cameras, self._clicked)
-        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, own_tabs, self._scenery)
+        self._shared = Shared(
+            method, can(method, HasGaussians), subject, self.turns, self._server, own_tabs, self._scenery
+        )
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
         if subject.open_scene is not None:
@@ -53,18 +165,11 @@ class Viewer:
         """Set the look of the page, and the camera that every client begins with."""
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        window.prepare(server.gui, subject.title)
+        prepare_window(server.gui, subject.title)
         pose, distance = subject.first.pose[0].double().numpy(), subject.distance(subject.first)
         server.initial_camera.position = pose[:, 3]
         server.initial_camera.look_at = pose[:, 3] + distance * pose[:, 2]
         server.initial_camera.fov = angles(subject.first)[1]
-
-    def _add_training_panel(self, tabs: Any) -> TrainingPanel | None:
-        """The tab `Training`; None where nothing has been or will be trained."""
-        if not (self.subject.rows or self.turns.training):
-            return None
-        with tabs.add_tab("Training"):
-            return TrainingPanel(self._server, self.turns, self.subject.rows)
 
     # What fit() calls
 
@@ -89,7 +194,7 @@ class Viewer:
         if self._panel is not None:
             self._panel.end()
         for visitor in self._everyone():
-            visitor.painter.ask()
+            visitor.painter.request()
 
     # Coming and going
 
@@ -122,7 +227,7 @@ class Viewer:
             visitor = Visitor(self._shared, client)
         with self._lock:
             self._visitors[client.client_id] = visitor
-        if not self._shared.knows(client):  # it left while its panel was being made
+        if not self._shared.connected(client):  # it left while its panel was being made
             self._farewell(client)
 
     def _farewell(self, client: Any) -> None:
@@ -140,6 +245,6 @@ class Viewer:
     def _filled(self, fault: str | None) -> None:
         for visitor in self._everyone():
             if fault is not None:
-                visitor.tell("Without photographs", fault)
+                visitor.notify("Without photographs", fault)
             elif self._scenery.has_points:
                 visitor.controls.offer_points()

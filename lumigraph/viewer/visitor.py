@@ -7,31 +7,31 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
+from .. import kernels
 from ..camera import Camera
 from ..camera.crop import Crop
 from ..camera.rays import Rendering
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..figures import to_bytes
-from .cameras import angle_for, angles, pose_of, rows
-from .controls import Controls
+from ..gaussians import Gaussians
+from ..geometry import to_matrix, unit
+from .cameras import Flight, ViewRequest, angle_for, angles, pose_of, rows
+from .controls import Controls, MethodControls
 from .crop_panel import CropPanel
-from .flight import Flight
-from .method_controls import MethodControls
 from .modes import along_axis, extra_modes, picture
-from .pace import Pace
-from .painter import MOVING_SECONDS, Painter
+from .painter import MOVING_SECONDS, Pace, Painter
 from .path_panel import PathPanel
 from .shared import Shared
-from .splats import UNIT_SCALE, colours, splats
 from .turns import NotWantedError
-from .view_request import ViewRequest
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
@@ -54,55 +54,30 @@ class Visitor:
         self._eye = torch.zeros(3)  # towards which their colours are
         self._flat: Vector | None = None  # the background behind splats
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
-        self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
+        self.painter = Painter(self._draw, shared.turns, self._report_fault, lambda: shared.step)
         self.flight = Flight(client)
-        view_tab, crop_tab, path_tab = shared.tabs
-        self.controls = Controls(
-            client,
-            view_tab,
-            shared.subject.frame,
-            shared.is_cloud,
-            self.painter.ask,
-            shared.subject.page is not None,
-        )
-        self.method_controls = MethodControls(client, view_tab, shared.method, self.painter.ask)
-        self.crop = CropPanel(
-            client,
-            crop_tab,
-            shared.subject.frame,
-            shared.is_cloud,
-            self.painter.ask,
-            self._keep if shared.is_cloud and shared.subject.keep is not None else None,
-            f"{shared.subject.title.partition('.')[0]}-part.ply",
-            self.tell,
-        )
-        self.path = PathPanel(
-            client,
-            path_tab,
-            shared.subject,
-            self.flight,
-            shared.scenery.size,
-            self.tell,
-            lambda: self.method_controls.time,
-            self.method_controls.show_time,
-        )
+        self.controls = Controls(client, shared, self.painter.request)
+        self.method_controls = MethodControls(client, shared, self.painter.request)
+        keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
+        self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify)
+        self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
         first = shared.subject.first
         angle, wide = angles(first)[1], angle_for(first, client.camera.aspect)
         if wide > angle + FIELD_OF_VIEW_TOLERANCE:  # a narrow window shows the whole photograph too
             client.camera.fov = angle = wide
-        self.controls.tell_angle(angle)  # what the client's camera says may be from before it was told any
+        self.controls.show_angle(angle)  # the client's camera may still have the angle from before this
         if shared.scenery.has_points:
             self.controls.offer_points()
-        self.painter.ask()
+        self.painter.request()
         self.painter.start()
 
     def stop(self) -> None:
         self.flight.stop()
         self.painter.stop()
 
-    def tell(self, title: str, text: str = "") -> None:
+    def notify(self, title: str, text: str = "") -> None:
         """Show the client a notification."""
         if self._here:
             self._client.add_notification(title, text, auto_close_seconds=8.0)
@@ -120,18 +95,18 @@ class Visitor:
 
     @property
     def _here(self) -> bool:
-        return self._shared.knows(self._client)
+        return self._shared.connected(self._client)
 
     async def _moved(self, camera: Any) -> None:
-        """Ask for a picture from the camera's new place. It runs in the server's thread, so it must be quick."""
+        """Request a picture from the camera's new position. It runs in the server's thread, so it must be quick."""
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
-            self.controls.tell_angle(camera.fov)
-            self.painter.ask()
+            self.controls.show_angle(camera.fov)
+            self.painter.request()
 
     def request(self) -> ViewRequest:
-        """The view that the client asks for now."""
+        """The current view of the client."""
         camera, controls = self._client.camera, self.controls
         return ViewRequest(
             pose_of(camera.wxyz, camera.position),
@@ -208,9 +183,12 @@ class Visitor:
         if self._splats is None or (seconds > MOVING_SECONDS and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye
-        elif seconds > MOVING_SECONDS and self._turned(eye):
-            self._recolour(request, eye, wanted)
-            self._eye = eye
+        elif seconds > MOVING_SECONDS:
+            middle = torch.tensor(self._shared.subject.frame.bounds).mean(0)
+            away = max(float((self._eye - middle).norm()), 0.1)
+            if float((eye - self._eye).norm()) > RECOLOUR_EYE_SHIFT * away:
+                self._recolour(request, eye, wanted)
+                self._eye = eye
         return seconds > MOVING_SECONDS
 
     def _send_splats(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
@@ -236,10 +214,6 @@ class Visitor:
         if self._here and len(rgb) == len(self._splats.buffer):
             self._splats.rgbs = rgb
 
-    def _turned(self, eye: torch.Tensor) -> bool:
-        middle = torch.tensor(self._shared.subject.frame.bounds).mean(0)
-        return float((eye - self._eye).norm()) > RECOLOUR_EYE_SHIFT * max(float((self._eye - middle).norm()), 0.1)
-
     def _step_out(self, eye: tuple[float, ...]) -> None:
         """Hide frusta that the eye is in, from this client alone, by nodes of its own in the same places."""
         near = self._shared.scenery.around(eye) if self._here else set(self._hidden)
@@ -253,9 +227,48 @@ class Visitor:
         if text != self._said and self._here:
             self._said = self.controls.status.content = text
 
-    def _tell_fault(self, error: Exception) -> None:
+    def _report_fault(self, error: Exception) -> None:
         text = str(error) if isinstance(error, LumigraphError) else f"{type(error).__name__}: {error}"
         print(f"lumigraph: a client's picture failed: {' '.join(text.split())}", file=sys.stderr, flush=True)
         if os.environ.get("LUMIGRAPH_DEBUG"):
             traceback.print_exception(error)
-        self.tell("This could not be drawn", text)
+        self.notify("This could not be drawn", text)
+
+
+# The browser's covariances are half-precision numbers: in units this much smaller, what is fine keeps its shape.
+UNIT_SCALE = 16.0
+MAX_SCALE = 250.0  # standard deviation in those units; its square still is a half-precision number
+
+
+@dataclass(frozen=True)
+class BrowserSplats:
+    """Arrays that viser sends to the browser, with lengths multiplied by UNIT_SCALE."""
+
+    centres: Float[np.ndarray, "gaussian 3"]
+    covariances: Float[np.ndarray, "gaussian 3 3"]
+    colours: Float[np.ndarray, "gaussian 3"]
+    opacities: Float[np.ndarray, "gaussian 1"]
+
+
+@torch.no_grad()
+def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> BrowserSplats:
+    """A cloud for the browser, coloured as seen from an eye; both in the scene's frame.
+
+    The browser takes one colour for each Gaussian and no harmonics; `colours` are sent again when the camera rests.
+    """
+    deviations = (UNIT_SCALE * cloud.log_scales.detach().exp()).clamp_max(MAX_SCALE)
+    axes = to_matrix(cloud.quaternions.detach()) * deviations[:, None, :]
+    return BrowserSplats(
+        (UNIT_SCALE * cloud.means.detach()).cpu().numpy(),
+        (axes @ axes.mT).cpu().numpy(),
+        colours(cloud, eye).cpu().numpy(),
+        cloud.opacities.detach().sigmoid()[:, None].cpu().numpy(),
+    )
+
+
+@torch.no_grad()
+def colours(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Float[Tensor, "gaussian 3"]:
+    """Colour of each Gaussian seen from one place, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
+    directions = unit(cloud.means.detach() - eye.to(cloud.means))
+    values = kernels.spherical_harmonics(directions, cloud.degree + 1)
+    return (0.5 + torch.einsum("nk,nkc->nc", values, cloud.harmonics.detach())).clamp(0, 1)

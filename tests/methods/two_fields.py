@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from lumigraph.components.fields.hash_field import TINY_TABLE, HashField, HashNumbers
-from lumigraph.components.sampling.occupancy_sampler import TINY_OCCUPANCY, TINY_STEPS, OccupancyNumbers, StepNumbers
-from lumigraph.components.sampling.proposal_sampler import ProposalNumbers
-from lumigraph.components.sampling.samplers import sampler_for
+from lumigraph.components.fields.hash_field import HashField, HashNumbers
+from lumigraph.components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from lumigraph.components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.files.ranges import LearningRate, Seed
 from lumigraph.method import Field, FieldMethod
@@ -47,7 +46,7 @@ class TwoFields(FieldMethod):
 
     @classmethod
     def smallest(cls):
-        return Config(TINY_TABLE, TINY_OCCUPANCY, TINY_STEPS, 2e-2)
+        return Config(**TINY_HASH, learning_rate=2e-2)
 
     def optimizers(self):
         fields, rate = (self.network.first, self.network.second), self.config.learning_rate

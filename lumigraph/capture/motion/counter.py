@@ -1,7 +1,7 @@
 """Write the number of rows of a table in COLMAP's database to standard output, at intervals.
 
 A process of its own, until its standard input ends. Python and COLMAP each bring an SQLite; two of them in one process
-break each other's locks on one file, and its shared memory is then cut off under whoever still reads it.
+break each other's locks on one file, and its shared memory is then truncated while the other reads it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ POLL_SECONDS = 0.2  # between reads of the database
 
 
 def watch(database: str, table: str) -> None:
-    """Tell the number of rows, for ever."""
+    """Print the number of rows, for ever."""
     where = f"{Path(database).as_uri()}?mode=ro"
     while True:
         time.sleep(POLL_SECONDS)

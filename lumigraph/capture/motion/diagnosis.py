@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from ...files.names import counted, natural
 from ...system.library import pycolmap
-from ..folds import in_steps, jumps
+from ..colmap import poses_of
 from ..normalise import where_axes_meet
+from ..oddities import in_steps, jumps
 from ..photos import Intake, Photo
 
 MIN_FEATURES = 100
@@ -49,43 +53,33 @@ class Matches:
         return self.shared.get((a, b)) or self.shared.get((b, a)) or 0
 
     def groups(self) -> list[set[str]]:
-        """Photographs that hang together, the largest group first."""
-        parent = {name: name for name in self.features}
-
-        def root(name: str) -> str:
-            while parent[name] != name:
-                parent[name] = name = parent[parent[name]]
-            return name
-
-        for a, b in self.shared:
-            parent[root(a)] = root(b)
-        found: dict[str, set[str]] = {}
-        for name in parent:
-            found.setdefault(root(name), set()).add(name)
-        return sorted(found.values(), key=len, reverse=True)
+        """Photographs connected by matches, the largest group first."""
+        number = {name: i for i, name in enumerate(self.features)}
+        pairs = np.array([(number[a], number[b]) for a, b in self.shared], int).reshape(-1, 2)
+        graph = coo_array((np.ones(len(pairs)), pairs.T), (len(number), len(number)))
+        count, group = connected_components(graph, directed=False)
+        found = [{name for name, i in number.items() if group[i] == k} for k in range(count)]
+        return sorted(found, key=len, reverse=True)
 
 
 def read_matches(database: Path) -> Matches:
-    opened = pycolmap.Database.open(database)
-    try:
+    shared, turned, flat = {}, 0, 0
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    with closing(pycolmap.Database.open(database)) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         features = {name: opened.num_keypoints_for_image(number) for number, name in names.items()}
-        shared, turned, flat = {}, 0, 0
-        kinds = pycolmap.TwoViewGeometryConfiguration
         for number, pair in zip(*opened.read_two_view_geometries(), strict=True):
             if len(pair.inlier_matches) >= MIN_MATCHES:
                 a, b = pycolmap.pair_id_to_image_pair(number)
                 shared[names[a], names[b]] = len(pair.inlier_matches)
                 turned += pair.config == kinds.PANORAMIC
                 flat += pair.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
-    finally:
-        opened.close()
     return Matches(features, shared, turned, flat)
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Directions that nobody looked from: so many degrees, between two photographs."""
+    """Directions without a photograph: so many degrees, between two photographs."""
 
     degrees: float
     between: tuple[str, str]
@@ -101,7 +95,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that a capture found out about itself.
+    """Outcome of a capture.
 
     given:        how many files there were;  used: those that cameras were looked for
     registered:   names of the photographs whose cameras were found
@@ -137,20 +131,27 @@ def diagnose(
     intake: Intake, used: Sequence[Photo], model: pycolmap.Reconstruction, others: list[list[str]], matches: Matches
 ) -> Diagnosis:
     """used: the photographs that cameras were looked for; others: names in other models; the model stands upright."""
-    by_name = {image.name: image for image in model.images.values() if image.has_pose}
-    registered = [photo.name for photo in used if photo.name in by_name]
-    poses = np.stack([by_name[name].cam_from_world().inverse().matrix() for name in registered])
+    placed = poses_of(model)
+    registered = [photo.name for photo in used if photo.name in placed]
+    poses = np.stack([placed[name] for name in registered])
     left_out = intake.unreadable | {
         photo.name: why_not(photo.name, registered, others, matches, photo.name in intake.blurred)
         for photo in used
-        if photo.name not in by_name
+        if photo.name not in placed
     }
     angle = triangulation_angle(model)
     error = float(model.compute_mean_reprojection_error())
-    warnings = [
-        *about_left_out(left_out, len(used)),
-        *about_blur({name: why for name, why in intake.blurred.items() if name in by_name}),
-        *about_exposure([photo for photo in used if photo.name in by_name], intake.in_order),
+    warnings = []
+    if len(left_out) > len(used) / 3:
+        warnings.append(
+            f"{len(left_out)} photographs have no place: take more between them and the rest, each overlapping the "
+            f"next by two thirds"
+        )
+    if blurred := [name for name in intake.blurred if name in placed]:
+        number = counted(len(blurred), "blurred photograph")
+        warnings.append(f"{number}: {listed(blurred)}; remove or retake what is not needed")
+    warnings += [
+        *about_exposure([photo for photo in used if photo.name in placed], intake.in_order),
         *about_rotation(angle, matches),
         *about_jumps(registered, folds(registered, poses, matches, intake.in_order)),
     ]
@@ -228,9 +229,7 @@ def filled(model: pycolmap.Reconstruction) -> float:
 
 def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Coverage | None:
     """The coverage around the vertical through what the cameras look at; None where they look at no one thing.
-
-    Directions nearer to each other than 30 degrees cover what lies between them.
-    """
+    Directions nearer to each other than 30 degrees cover what lies between them."""
     subject, converging = where_axes_meet(poses[:, :, 3], poses[:, :, 2])
     if not converging:
         return None
@@ -253,21 +252,6 @@ def folds(
     return jumps(
         poses, [i for i in range(len(names) - 1) if matches.between(names[i], names[i + 1]) >= MIN_OVERLAP_MATCHES]
     )
-
-
-def about_left_out(left_out: Mapping[str, str], used: int) -> list[str]:
-    if len(left_out) <= used / 3:
-        return []
-    return [
-        f"{len(left_out)} photographs have no place: take more between them and the rest, each overlapping the next "
-        f"by two thirds"
-    ]
-
-
-def about_blur(blurred: Mapping[str, str]) -> list[str]:
-    if not blurred:
-        return []
-    return [f"{counted(len(blurred), 'blurred photograph')}: {listed(blurred)}; remove or retake what is not needed"]
 
 
 def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
@@ -308,7 +292,6 @@ def about_jumps(names: Sequence[str], leaps: Sequence[tuple[int, float]]) -> lis
     ]
 
 
-def listed(names: Mapping[str, str] | Sequence[str]) -> str:
-    found = list(names)
-    rest = f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
-    return ", ".join(found[:MAX_NAMES]) + rest
+def listed(names: Sequence[str]) -> str:
+    rest = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    return ", ".join(names[:MAX_NAMES]) + rest

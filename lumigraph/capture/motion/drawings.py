@@ -1,4 +1,4 @@
-"""Two pictures of a capture: cameras and points from above and from the side, and all photographs with their fate."""
+"""Two pictures of a capture: cameras and points from above and from the side, and all photographs with remarks."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from ...figures import RAMP, fit_into, save_picture
+from ...figures import RAMP, fit_into, ramp, save_picture
 from ...files.names import natural
 from ...system.library import pycolmap
 from ..photos import Intake
@@ -36,10 +37,6 @@ class Sketch:
     corners: Float[np.ndarray, "photo 4 3"]
     points: Float[np.ndarray, "point 3"]
     colours: UInt8[np.ndarray, "point 3"]
-
-    def seen_along(self, axis: int) -> tuple[int, int]:
-        """The axes that go right and up in a view from above (2) or from the side (1)."""
-        return (0, 1) if axis == 2 else (0, 2)
 
 
 def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosis, keep_axes: bool = False) -> None:
@@ -109,9 +106,9 @@ def interesting(sketch: Sketch) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarr
 
 
 def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size: tuple[int, int]) -> Image.Image:
-    """One view along an axis, with equal scales to the right and upwards."""
+    """One view along an axis, from above (2) or from the side (1), with equal scales to the right and upwards."""
     width, height = SUPERSAMPLING * size[0], SUPERSAMPLING * size[1]
-    right, up = sketch.seen_along(axis)
+    right, up = (0, 1) if axis == 2 else (0, 2)
     scale = min(width / (high[right] - low[right]), height / (high[up] - low[up]))
 
     def place(points: np.ndarray) -> np.ndarray:
@@ -151,16 +148,13 @@ def typical_gap(eyes: Float[np.ndarray, "photo 3"]) -> float:
 
 
 def ramp_at(share: float) -> str:
-    """Dark and cool for the first, bright and warm for the last; paler ends of the ramp do not show on paper."""
-    colours = [np.array(list(bytes.fromhex(c)), float) for c in reversed(RAMP[1:])]
-    position = share * (len(colours) - 1)
-    below = min(int(position), len(colours) - 2)
-    mixed = colours[below] + (position - below) * (colours[below + 1] - colours[below])
-    return f"#{bytes(mixed.round().astype(np.uint8)).hex()}"
+    """Dark and cool for the first, bright and warm for the last, without the pale end, which does not show on paper."""
+    place = torch.tensor(1 - share * (len(RAMP) - 2) / (len(RAMP) - 1), dtype=torch.float64)
+    return f"#{bytes((255 * ramp(place)).round().byte().tolist()).hex()}"
 
 
 def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
-    """Write a contact sheet: all photographs by name, those with something to say of them framed, and why."""
+    """Write a contact sheet: all photographs by name, those with a remark in a frame of its colour."""
     files = {photo.name: photo.path for photo in intake.photos}
     names = [*files, *sorted(intake.unreadable, key=natural)]
     cell = 220 if len(names) <= 60 else 150 if len(names) <= 200 else 110
@@ -188,15 +182,14 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
         for i, (name, image) in enumerate(row):
             x, mark = MARGIN + i * (cell + gap), remark(name, diagnosis)[1]
             left = x + (cell - image.width) // 2
-            faded = (
-                Image.blend(image, Image.new("RGB", image.size, PAPER_COLOUR), 0.35)
-                if mark == LEFT_OUT_COLOUR
-                else image
-            )
-            sheet.paste(faded, (left, y))
+            if mark == LEFT_OUT_COLOUR:
+                image = Image.blend(image, Image.new("RGB", image.size, PAPER_COLOUR), 0.35)
+            sheet.paste(image, (left, y))
             if mark:
                 draw.rectangle([left - 3, y - 3, left + image.width + 2, y + image.height + 2], None, mark, 4)
-            draw.text((x, y + height + 3), shortened(name, letters), INK_COLOUR, small)
+            draw.text(
+                (x, y + height + 3), name if len(name) <= letters else f"…{name[1 - letters :]}", INK_COLOUR, small
+            )
             for k, line in enumerate(notes.get(name, ())):
                 draw.text((x, y + height + 3 + text * (k + 1)), line, mark, small)
     save_picture(path, sheet, "capture")
@@ -219,7 +212,3 @@ def thumbnail(path: Path | None, cell: int) -> Image.Image:
     with Image.open(path) as image:
         image.draft("RGB", (2 * cell, 2 * cell))
         return fit_into(image.convert("RGB"), cell, cell)
-
-
-def shortened(name: str, letters: int) -> str:
-    return name if len(name) <= letters else f"…{name[1 - letters :]}"

@@ -19,7 +19,7 @@ from ...files.marks import is_ours
 from ...system.library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
-from ..photos.track import Track
+from ..photos.photo import Track
 from ..pictures import list_images, read_grey
 from ..raw import RAW_FILE
 from ..transforms import OPENCV_FROM_OPENGL, Made
@@ -39,10 +39,8 @@ NAMES = {
 
 
 def claim(folder: Path, sources: Sequence[Path]) -> Path:
-    """Make or recognise the folder of these photographs' scene; gives the folder to work in.
-
-    Raises LumigraphError for a folder that holds something else.
-    """
+    """Make or recognise the folder of these photographs' scene; gives the folder to work in. Raises LumigraphError for
+    a folder that holds something else."""
     work, wanted = folder / WORK_FOLDER, [str(path.resolve()) for path in sources]
     for path in sources:
         if (path / WORK_FOLDER / SOURCES_FILE).is_file():
@@ -96,7 +94,7 @@ def remove_copies(folder: Path, kept: Container[str]) -> None:
 
 
 def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | None:
-    """Masks as COLMAP wants them: image.jpg.png, black and white, of the photographs' size. None where there are none.
+    """Masks as COLMAP reads them: image.jpg.png, black and white, of the photographs' size. None where there are none.
 
     Raises LumigraphError for a mask that has not its photograph's shape.
     """

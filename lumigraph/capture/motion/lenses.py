@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
@@ -58,8 +59,7 @@ def prior(group: Sequence[Photo]) -> tuple[float, bool]:
 
 def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
     """A new database with a camera for each group and an image for each photograph."""
-    database = pycolmap.Database.open(path)
-    try:
+    with closing(pycolmap.Database.open(path)) as database:
         for group in groups:
             focal, known = prior(group)
             camera = pycolmap.Camera.create_from_model_name(1, MODEL, focal, *group[0].size)
@@ -75,5 +75,3 @@ def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
                 frame.rig_id = rig_id
                 frame.add_data_id(image.data_id)
                 database.write_frame(frame)
-    finally:
-        database.close()

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial import cKDTree
 
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
@@ -65,27 +66,27 @@ def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1)
     return pairs
 
 
-def aggregated(descriptors: Sequence[np.ndarray], seed: int = 0) -> Float[np.ndarray, "photo number"]:
+def aggregated(
+    descriptors: Callable[[int], np.ndarray], count: int, seed: int = 0
+) -> Float[np.ndarray, "photo number"]:
     """A vector for each photograph, by its features; the product of two is how alike they are, 1 at most.
 
     VLAD (Jégou 2010) over a vocabulary that is learnt from the photographs themselves. For each word the residuals of
     the descriptors nearest to it are added up; each sum is normalised (Arandjelović 2013), then the whole.
-    descriptors: of each photograph, (feature, 128); asked for one by one, twice, so that they may be in a file
+    descriptors: reads those of a photograph, (feature, 128); called twice for each
     """
 
     def sampled(photo: int) -> np.ndarray:
-        found = descriptors[photo]
-        return found[np.random.default_rng([seed, photo]).permutation(len(found))[:SAMPLED_DESCRIPTORS]].astype(
-            np.float32
-        )
+        found = descriptors(photo)
+        order = np.random.default_rng([seed, photo]).permutation(len(found))
+        return found[order[:SAMPLED_DESCRIPTORS]].astype(np.float32)
 
-    speakers = evenly(range(len(descriptors)), VOCABULARY_VIEWS)
-    joined = np.concatenate([sampled(photo) for photo in speakers])
+    joined = np.concatenate([sampled(photo) for photo in evenly(range(count), VOCABULARY_VIEWS)])
     if len(joined) <= VOCABULARY_SIZE:
-        return np.zeros((len(descriptors), 1), np.float32)
+        return np.zeros((count, 1), np.float32)
     learnt = joined[np.random.default_rng(seed).permutation(len(joined))[:VOCABULARY_DESCRIPTORS]]
     words, _ = kmeans2(learnt, VOCABULARY_SIZE, iter=10, minit="++", seed=seed)
-    vectors = np.zeros((len(descriptors), VOCABULARY_SIZE, joined.shape[1]), np.float32)
+    vectors = np.zeros((count, VOCABULARY_SIZE, joined.shape[1]), np.float32)
     for photo, vector in enumerate(vectors):
         if len(found := sampled(photo)):
             nearest, _ = vq(found, words)
@@ -96,7 +97,7 @@ def aggregated(descriptors: Sequence[np.ndarray], seed: int = 0) -> Float[np.nda
 
 
 def near(positions: Float[np.ndarray, "photo 3"], most: int = SEQUENTIAL_NEIGHBOURS) -> set[Pair]:
-    """Each photograph with the `most` taken nearest to it; NaN where nobody knows."""
+    """Each photograph with the `most` taken nearest to it; NaN where unknown."""
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
         return set()
@@ -118,31 +119,11 @@ def choose_pairs(
     if matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS:
         pairs = exhaustive(count)
     else:
-        with Descriptors(database, names) as descriptors:
-            similar = aggregated(descriptors)
+        with closing(pycolmap.Database.open(database)) as opened:
+            number = {image.name: image.image_id for image in opened.read_all_images()}
+            similar = aggregated(lambda photo: opened.read_descriptors(number[names[photo]]).data, count)
         if matching == "sequential":
             pairs = sequential(count) | alike(similar, LOOP_CANDIDATES, apart=SEQUENTIAL_NEIGHBOURS + 1)
         else:
             pairs = sequential(count, 2) | alike(similar, RETRIEVED_VIEWS) | near(positions)
     return sorted(pairs, key=lambda pair: (pair[1] // TILE_VIEWS, pair[0] // TILE_VIEWS, pair))
-
-
-class Descriptors(Sequence[np.ndarray]):
-    """The descriptors of photographs, (feature, 128), each read from COLMAP's database when it is asked for."""
-
-    def __init__(self, database: Path, names: Sequence[str]):
-        self._opened = pycolmap.Database.open(database)
-        numbers = {image.name: image.image_id for image in self._opened.read_all_images()}
-        self._numbers = [numbers[name] for name in names]
-
-    def __enter__(self) -> Descriptors:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._opened.close()
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def __getitem__(self, photo: Any) -> Any:
-        return self._opened.read_descriptors(self._numbers[photo]).data

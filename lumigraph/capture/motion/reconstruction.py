@@ -1,4 +1,4 @@
-"""reconstruct(): bare photographs or a video become a folder with poses, stage by stage."""
+"""Reconstruction: from bare photographs or a video to a folder with poses, stage by stage."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from ...files.names import counted, natural
 from ...files.ranges import typed
 from ...system.library import pycolmap
 from ...system.progress import counting
+from ..colmap import poses_of
 from ..photos import Intake, Photo, gather
-from ..photos.track import Track, untracked
+from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from .diagnosis import MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
@@ -49,7 +50,7 @@ MAX_FEATURES = 8192
 FEATURE_BUDGETS = (
     (80, MAX_FEATURES),
     (200, 4096),
-)  # (photographs, features each): up to so many photographs; matching costs the square of features
+)  # most photographs, and features of each; matching costs their square
 MIN_FEATURE_BUDGET = 2048
 MAX_SECOND_SIDE = 3200  # pixels of the longer side, for photographs that found no place
 SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
@@ -85,7 +86,7 @@ def reconstruct(
 
     sources: a folder, a list of image files, or one video; they are only read
     folder:  where the scene goes: images, sparse/0, transforms.json, points.ply, capture.json, two pictures, and a
-             folder `work` that nobody needs afterwards. What lies there of an earlier call for the same sources is used
+             folder `work`, not needed afterwards. What lies there of an earlier call for the same sources is used
     Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else or
     that another process works in.
     """
@@ -100,7 +101,7 @@ def reconstruct(
         try:
             intake, photos = taken_in(sources, work, options, track)
         except LumigraphError:
-            if fresh:  # nothing in it is anybody's, and nothing can go on from there
+            if fresh:  # it holds nothing to keep or to go on from
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
@@ -146,7 +147,7 @@ def with_safe_names(intake: Intake) -> Intake:
 def intake_identity(intake: Intake) -> list[Any]:
     """All of the intake that the result depends on, as JSON."""
     photos = [[p.name, *stamp(p.path), p.device, p.focal, p.gps, round(p.brightness, 3)] for p in intake.photos]
-    raw = [Remembered(intake.raw).to_json()] if intake.raw else []
+    raw = [asdict(Remembered(intake.raw))] if intake.raw else []
     return [photos, intake.in_order, intake.blurred, intake.duplicates, intake.unreadable, *raw]
 
 
@@ -173,13 +174,9 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         self.stages = Stages(self.work)
-        self.images, self.database, self.models = (
-            self.folder / "images",
-            self.work / "database.db",
-            self.work / "models",
-        )
-        self.unfolded, self.completed = self.work / "unfolded", self.work / "completed"
-        self.refined = self.work / "refined"
+        self.images, self.database = self.folder / "images", self.work / "database.db"
+        self.models, self.unfolded = self.work / "models", self.work / "unfolded"
+        self.completed, self.refined = self.work / "completed", self.work / "refined"
         self.near, self.second = self.work / "near.db", self.work / "second.db"
         self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
@@ -245,10 +242,9 @@ class Reconstruction:
         if self.stages.is_done("matching", key):
             return
         if not self.stages.was_begun("matching", key):
-            opened = pycolmap.Database.open(self.database)
-            opened.clear_matches()
-            opened.clear_two_view_geometries()
-            opened.close()
+            with closing(pycolmap.Database.open(self.database)) as opened:
+                opened.clear_matches()
+                opened.clear_two_view_geometries()
         with self.stages.working("matching", key):
             self.match(self.database)
 
@@ -279,10 +275,8 @@ class Reconstruction:
                 (partial / FALLBACK_MARK).touch()
 
     def unfold(self, key: str) -> None:
-        """If the model leaps between neighbours, make another from what near neighbours share alone.
-
-        Far ones that merely look alike, as the two sides of a can do, fold a model.
-        """
+        """If the model leaps between neighbours, make another from what near neighbours share alone. Far ones that
+        merely look alike, as the two sides of a can do, fold a model."""
         if self.stages.is_done("unfolding", key):
             return
         with self.stages.working("unfolding", key):
@@ -355,7 +349,7 @@ class Reconstruction:
                 )
 
     def leaps(self, model: pycolmap.Reconstruction, matches: Matches) -> int:
-        poses = {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values() if i.has_pose}
+        poses = poses_of(model)
         names = [name for name in self.names if name in poses]
         return len(folds(names, np.stack([poses[name] for name in names]), matches, self.intake.in_order))
 
@@ -390,12 +384,9 @@ class Reconstruction:
         return found, notes, database
 
     def colmap(self, description: str, total: int, database: Path, **job: Any) -> None:
-        done = self.stages.colmap(total, database=str(database), **job)
-        try:
+        with closing(self.stages.colmap(total, database=str(database), **job)) as done:
             for _ in self.track(done, description, total):
                 pass
-        finally:
-            done.close()
 
     def write(self, key: str) -> dict[str, Any]:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
@@ -410,20 +401,15 @@ class Reconstruction:
             remove(self.folder / name)
         model = found[0]
         place = self.turn_upright(model)
-        others = [
-            sorted((image.name for image in other.images.values() if image.has_pose), key=natural)
-            for other in found[1:]
-        ]
-        taken = {image.name for image in model.images.values() if image.has_pose}
-        others = [left for names in others if len(left := [name for name in names if name not in taken]) > 1]
-        diagnosis = diagnose(self.intake, self.photos, model, others, matches)
-        if place is not None and place.new_from_old is None:
+        others = [sorted(poses_of(other).keys() - poses_of(model).keys(), key=natural) for other in found[1:]]
+        diagnosis = diagnose(self.intake, self.photos, model, [names for names in others if len(names) > 1], matches)
+        known = place is not None and place.new_from_old is not None
+        if place is not None and not known:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
-        known = place is not None and place.new_from_old is not None
         write_model(self.folder, model, self.photos, z_up=known)
         if self.intake.raw:
-            write_json(self.folder / RAW_FILE, Remembered(self.intake.raw).to_json(), "capture")
+            write_json(self.folder / RAW_FILE, asdict(Remembered(self.intake.raw)), "capture")
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)
@@ -433,13 +419,12 @@ class Reconstruction:
 
     def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
         """Turn a model so that +z is up; by GPS, which also gives metres and the origin, where that can tell."""
-        poses = {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values() if i.has_pose}
+        poses = poses_of(model)
         photos = [photo for photo in self.photos if photo.name in poses]
         stacked = np.stack([poses[photo.name] for photo in photos])
         place = georeference(stacked[:, :, 3], photos)
-        known = place is not None and place.new_from_old is not None
         points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-        model.transform(place.new_from_old if place is not None and known else upright(stacked, points))
+        model.transform((place and place.new_from_old) or upright(stacked, points))
         return place
 
     def summary(
@@ -457,14 +442,8 @@ class Reconstruction:
             }
             for number, camera in sorted(model.cameras.items())
         ]
-        gps = None
-        if place is not None:
-            gps = {
-                "used": place.new_from_old is not None,
-                "say": place.say,
-                "origin": place.origin,
-                "error": place.error,
-            }
+        used = place is not None and place.new_from_old is not None
+        gps = place and {"used": used, "say": place.say, "origin": place.origin, "error": place.error}
         return {
             "key": key,
             "source": self.intake.source,
@@ -522,7 +501,7 @@ def forget(path: Path, names: Container[str]) -> None:
 
 
 def keep_near(path: Path, names: Sequence[str], reach: int) -> None:
-    """Forget what photographs share that are more than so many places apart."""
+    """Delete the matches of photographs that are more than so many places apart."""
     place = {name: i for i, name in enumerate(names)}
     shared = read_matches(path).shared
     with closing(pycolmap.Database.open(path)) as database:

@@ -17,7 +17,7 @@ from typing import Any
 from ...errors import LumigraphError
 from ...files import read_json, write_json
 from ...files.ranges import Lasted
-from ...system.processes import start
+from ...system.signals import start
 
 WORKER = Path(__file__).with_name("worker.py")
 
@@ -73,10 +73,8 @@ class Stages:
         write_json(self.path, {name: asdict(mark) for name, mark in self.marks.items()}, ours=True)
 
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
-        """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does.
-
-        Leaving the iterator early ends the work. Raises LumigraphError if COLMAP gives up.
-        """
+        """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does. Leaving
+        the iterator early ends the work. Raises LumigraphError if COLMAP gives up."""
         command = [sys.executable, "-P", str(WORKER), json.dumps(job)]
         with open(self.log, "ab") as log:
             pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}

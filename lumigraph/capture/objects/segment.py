@@ -1,42 +1,76 @@
-"""An object cut out of all its photographs at once, by its colours and by what one solid body can look like.
+"""Segmentation of an object in all its photographs at once, by its colours and as the silhouette of one solid body.
 
 After Campbell, Vogiatzis, Hernández and Cipolla 2010 ("Automatic object segmentation from calibrated images"): cameras
-that fixate on an object tell where it is; colours are learnt from there and from around; each photograph is cut; the
-cuts carve cells of space; what is left of these says where colours are learnt from next. Here cuts go through
+that fixate on an object determine its place; colours are learnt from there and from around; each photograph is cut;
+the cuts carve cells of space; colours are learnt from what is left of these next. Here cuts go through
 superpixels, and a table that sparse points show bounds the object from below.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from torch import Tensor
 
 from ...errors import LumigraphError
-from .colours import Mixture
-from .cut import MAX_COST, cut
-from .region import GRID_SIDE, Region, find_region
-from .view import ObjectView
+from ...system.progress import track
+from .view import GRID_SIDE, ObjectView, Region, find_region
 
 MAX_DISAGREEMENTS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
 CORE_RADIUS = 0.35  # of the region's radius: where colours are first learnt, without sparse points
-MIN_SHADOW_SHARE, SHADOW_BRIGHTNESS = (
-    0.25,
-    0.35,
-)  # share of surrounding colours that also count as shaded; brightness of the darkest shadow
+SHADOW_SHARE = 0.25  # share of surrounding colours that also count as shaded
+SHADOW_BRIGHTNESS = 0.35  # of the darkest shadow
 PLAIN_SHARE, PLAIN_DISTANCE = 0.8, 3.0  # share of a plain backdrop within this CIELAB distance of its median
 BODY_LOG_LIKELIHOOD = 2.5  # log-likelihood added to the pixels that a body covers
 MAX_COLOUR_LOG_LIKELIHOOD = 4.0  # limit of the evidence of colours alone
 MIN_CELLS = 20  # of a body
 MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the photograph
-
-
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
+COMPONENTS = 10  # Gaussians of a mixture
+MIN_PIXELS = 50  # per Gaussian
+MIN_DEVIATION = 2.0  # units of CIELAB by which colours of one surface differ at the least
+MAX_SAMPLES = 20_000  # pixels from which a mixture is learnt
+CAPACITY_SCALE = 1000  # of capacity to one of cost: the flow counts in whole numbers
+SMOOTHNESS = 3.0  # cost of an outline along one pixel where colours do not change
+MAX_COST = 30.0  # the largest of these costs
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of Gaussians over CIELAB colours; the object and its surroundings have one each (Rother 2004, 3.1)."""
+
+    weights: Float[np.ndarray, " kind"]
+    means: Float[np.ndarray, "kind 3"]
+    roots: Float[np.ndarray, "kind 3 3"]  # of the inverse covariances
+
+    @staticmethod
+    def of(colours: Float[np.ndarray, "pixel 3"]) -> Mixture:
+        """The mixture that k-means finds in some colours."""
+        chance = np.random.default_rng(0)
+        some = colours[chance.permutation(len(colours))[:MAX_SAMPLES]].astype(np.float64)
+        count = int(np.clip(len(some) // MIN_PIXELS, 1, COMPONENTS))
+        means, kinds = kmeans2(some, count, minit="++", seed=0)
+        found = [k for k in range(count) if (kinds == k).sum() > 3]
+        weights = np.array([(kinds == k).mean() for k in found])
+        spreads = [np.cov(some[kinds == k].T) + MIN_DEVIATION**2 * np.eye(3) for k in found]
+        roots = np.stack([np.linalg.cholesky(np.linalg.inv(spread)) for spread in spreads])
+        return Mixture(weights, means[found], roots)
+
+    def log_likelihood(self, colours: Float[np.ndarray, "*pixel 3"]) -> Float[np.ndarray, "*pixel"]:
+        """Natural logarithm of the density of each colour."""
+        likely = np.zeros(colours.shape[:-1])
+        for weight, mean, root in zip(self.weights, self.means, self.roots, strict=True):
+            away = (colours - mean) @ root
+            likely += weight * np.linalg.det(root) * np.exp(-0.5 * np.square(away).sum(-1))
+        return np.log(likely / (2 * np.pi) ** 1.5 + 1e-12)
 
 
 @dataclass(frozen=True)
@@ -63,11 +97,7 @@ class Segmentation:
         return [view.name for view, overlap in zip(self.views, self.overlaps, strict=True) if overlap < MIN_OVERLAP]
 
 
-def segment(
-    views: Sequence[ObjectView],
-    points: Float[Tensor, "point 3"] | None,
-    track: Callable[[Sequence[float], str, int], Iterable[float]],
-) -> Segmentation:
+def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None) -> Segmentation:
     """Cut the object that the views look at out of all of them.
 
     points: sparse points, in the scene's frame
@@ -127,12 +157,9 @@ def learn_colours(views: Sequence[ObjectView], inside: Sequence[Patches]) -> tup
 
 def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
     """Some colours as they are in the object's own shadow, which is seen nowhere else; none of a plain backdrop, which
-    is no surface that shadows fall on.
-
-    Of CIELAB all three numbers shrink together when light does.
-    """
+    is no surface that shadows fall on. Of CIELAB all three numbers shrink together when light does."""
     away = np.linalg.norm(colours - np.median(colours, 0), axis=-1)
-    some = colours[:: round(1 / MIN_SHADOW_SHARE)] if np.quantile(away, PLAIN_SHARE) > PLAIN_DISTANCE else colours[:0]
+    some = colours[:: round(1 / SHADOW_SHARE)] if np.quantile(away, PLAIN_SHARE) > PLAIN_DISTANCE else colours[:0]
     return some * np.random.default_rng(0).uniform(SHADOW_BRIGHTNESS, 1, (len(some), 1))
 
 
@@ -157,10 +184,8 @@ def carved(
     grid = np.zeros((GRID_SIDE,) * 3, bool)
     index = tuple(((region.cells.numpy() + 1) / region.size).astype(int).T)
     grid[index] = keep
-    pieces, count = ndimage.label(grid)
-    if not count:
-        raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
-    largest = 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    pieces, _ = ndimage.label(grid)
+    largest = 1 + int(np.argmax(np.bincount(pieces.ravel(), minlength=2)[1:]))
     body = region.cells[torch.from_numpy((pieces == largest)[index])]
     if len(body) < MIN_CELLS:
         raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
@@ -171,3 +196,32 @@ def overlap(view: ObjectView, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray,
     """Intersection over union of two sets of superpixels, by pixels; 1 where both are empty."""
     union = view.sizes[a | b].sum()
     return float(view.sizes[a & b].sum() / union) if union else 1.0
+
+
+def cut(view: ObjectView, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
+    """Mask of the superpixels that belong to the object: the outline of least cost, a minimum cut through a picture's
+    superpixels (Boykov and Jolly 2001).
+
+    costs: of taking each into it, in logarithms of likelihood; negative ones speak for it. They count by the width of a
+           superpixel rather than its area, for the pixels of one are no independent witnesses
+    An outline costs less where colours change: exp(-|a - b|^2 / 2 mean) to a pixel of its length.
+    """
+    count = len(costs)
+    weighed = np.clip(costs, -MAX_COST, MAX_COST) * np.sqrt(view.sizes)
+    a, b = view.edges.T
+    apart = np.square(view.colours[a] - view.colours[b]).sum(-1)
+    along = SMOOTHNESS * view.lengths * np.exp(-apart / (2 * apart.mean() + 1e-9))
+    source, sink = count, count + 1
+    every = np.arange(count)
+    tails = np.concatenate([np.full(count, source), every, a, b])
+    heads = np.concatenate([every, np.full(count, sink), b, a])
+    capacity = np.concatenate([np.maximum(-weighed, 0), np.maximum(weighed, 0), along, along])
+    whole = np.minimum(capacity * CAPACITY_SCALE, 2**30).astype(np.int32)
+    graph = csr_matrix((whole, (tails, heads)), (count + 2, count + 2))
+    left = graph - maximum_flow(graph, source, sink).flow
+    left.data = np.maximum(left.data, 0)
+    left.eliminate_zeros()
+    reached = breadth_first_order(left, source, return_predecessors=False)
+    inside = np.zeros(count + 2, bool)
+    inside[reached] = True
+    return inside[:count]

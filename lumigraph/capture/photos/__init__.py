@@ -1,4 +1,4 @@
-"""Bare photographs and videos: what there is to work with, before anybody knows where it was taken from."""
+"""Bare photographs and videos, whose poses are not known yet."""
 
 from .gather import gather, is_bare
 from .photo import Intake, Photo

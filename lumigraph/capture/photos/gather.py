@@ -1,4 +1,4 @@
-"""gather(): from what somebody points at to a list of pictures that cameras can be found for."""
+"""Pictures of a folder, of a list of files or of a video, judged before cameras are found for them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
@@ -18,25 +19,16 @@ from ...files.names import counted, natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
 from ..raw import Developed, is_raw
-from . import upright
-from .developed import develop
+from .copies import copy_upright, develop, is_current, is_plain, learn_formats, name_of_copy
 from .exif import read_facts
-from .judge import Judgement, blurred, duplicates, judge
-from .photo import Intake, Photo
-from .track import Track, untracked
+from .judge import blurred, duplicates, judge
+from .photo import Intake, Photo, Track, untracked
 from .video import extract, is_video
 
 HEIC_SUFFIXES = (".heic", ".heif")
-PHOTOGRAPHS = {
-    ".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif"
-}  # fmt: skip
+PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif"}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
-PROGRAM_FILES = (
-    "transforms.json",
-    "transforms_train.json",
-    "sparse",
-    "checkpoints",
-)  # a folder with these belongs to a program
+PROGRAM_FILES = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # in folders of programs
 
 
 def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track: Track = untracked) -> Intake:
@@ -54,7 +46,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
     if films:
         return of_video(films[0], source, work, frames, track)
-    upright.learn_formats()
+    learn_formats()
     files = named_files(list_photographs(sources, work))
     raw: dict[str, Developed] = {}
     unreadable: dict[str, str] = {}
@@ -119,7 +111,7 @@ def assess(intake: Intake, seen: Sequence[Candidate]) -> Intake:
     def worth(one: Candidate) -> tuple[bool, int, int, str]:
         return one.photo.name in bad, -math.prod(one.photo.size), -one.bytes, one.photo.name
 
-    signatures = {one.photo.name: one.judgement.signature for one in sorted(seen, key=worth)}
+    signatures = {one.photo.name: one.signature for one in sorted(seen, key=worth)}
     same = duplicates(signatures, sizes)
     return replace(intake, blurred=bad, duplicates={name: same[name] for name in sorted(same, key=natural)})
 
@@ -132,7 +124,7 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
 
 
 def is_bare(path: Path) -> bool:
-    """True for a video, or a folder with photographs but without poses that a reader knows."""
+    """True for a video, or a folder with photographs but without poses that a reader recognises."""
     from .. import READERS  # that package may import this one
 
     if not path.is_dir():
@@ -180,38 +172,38 @@ def named_files(files: list[Path]) -> dict[str, Path]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A photo, the judgement of its pixels, and how many bytes its source has."""
+    """A photo, the signature of its pixels, and how many bytes its source has."""
 
     photo: Photo
-    judgement: Judgement
+    signature: np.ndarray
     bytes: int
 
 
 def take(name: str, path: Path, copies: Path) -> Candidate | str:
-    """One photograph, copied where it has to be, and judged; or why it is none.
-
-    Raises LumigraphError where the disk refuses the copy.
-    """
+    """One photograph, copied where it has to be, and judged; or why it is none. Raises LumigraphError where the disk
+    refuses the copy."""
     if path.suffix.lower() not in PHOTOGRAPHS:
         return "its format is not read here; convert it to JPEG"
     try:
         with Image.open(path) as image:
             facts = read_facts(image.getexif(), image.size)
             upright_file = path
-            if not upright.is_plain(image, path):
-                name = upright.name_of_copy(name, image)
+            if not is_plain(image, path):
+                name = name_of_copy(name, image)
                 upright_file = copies / name
-                if not upright.is_current(upright_file, path):
-                    upright.copy(image, path, upright_file)
+                if not is_current(upright_file, path):
+                    copy_upright(image, path, upright_file)
         with Image.open(upright_file) as image:
             size, found = image.size, judge(image)
     except LumigraphError:
         raise
     except Exception as fault:  # image libraries raise anything for a damaged file
-        return unread(path, fault)
-    photo = Photo(name, upright_file, size, facts.device, facts.focal, facts.gps, facts.time)
-    photo = replace(photo, sharpness=found.sharpness, brightness=found.brightness, mask=mask_beside(path))
-    return Candidate(photo, found, path.stat().st_size)
+        if path.suffix.lower() in HEIC_SUFFIXES and isinstance(fault, UnidentifiedImageError):
+            return "HEIC can be read once pillow-heif is installed (pip install pillow-heif)"
+        return describe(fault)
+    known = facts.device, facts.focal, facts.gps, facts.time
+    photo = Photo(name, upright_file, size, *known, found.sharpness, found.brightness, mask_beside(path))
+    return Candidate(photo, found.signature, path.stat().st_size)
 
 
 def mask_beside(path: Path) -> Path | None:
@@ -219,12 +211,6 @@ def mask_beside(path: Path) -> Path | None:
     above = path.absolute().parents[:MASK_LEVELS]
     found = (find_mask(folder / MASKS, path.absolute().relative_to(folder).as_posix()) for folder in above)
     return next((mask for mask in found if mask is not None), None)
-
-
-def unread(path: Path, fault: Exception) -> str:
-    if path.suffix.lower() in HEIC_SUFFIXES and isinstance(fault, UnidentifiedImageError):
-        return "HEIC can be read once pillow-heif is installed (pip install pillow-heif)"
-    return describe(fault)
 
 
 def with_altitudes(photos: list[Photo]) -> list[Photo]:

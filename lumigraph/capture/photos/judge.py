@@ -66,9 +66,8 @@ def judge(image: Image.Image) -> Judgement:
     grey = eight_bits(image).convert("L")
     times = max(grey.size) / JUDGED_SIDE
     if times > 1:
-        grey = grey.resize(
-            (max(round(grey.width / times), 1), max(round(grey.height / times), 1)), Image.Resampling.BOX
-        )
+        size = max(round(grey.width / times), 1), max(round(grey.height / times), 1)
+        grey = grey.resize(size, Image.Resampling.BOX)
     luminance = np.asarray(grey, np.float32)
     return Judgement(sharpness(luminance), brightness(luminance), signature(grey))
 
@@ -134,7 +133,7 @@ def duplicates(
     """Names of duplicates, exact or nearly, with the name of the earlier picture.
 
     signatures: the one to keep comes first
-    Two are the same if their signatures correlate by more than SAME and their sides have the same ratio.
+    Two are the same if their signatures correlate by more than DUPLICATE_CORRELATION and they have one aspect ratio.
     """
     names = list(signatures)
     table = np.stack([signatures[name] for name in names]) if names else np.zeros((0, 1), np.float32)

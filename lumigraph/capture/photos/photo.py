@@ -1,11 +1,16 @@
-"""Photo and Intake: pictures whose poses nobody knows yet."""
+"""Pictures without known poses, and the interface by which long work on them reports its progress."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ..raw import Developed
+
+# (items, what is being done, how many there will be) -> the items one by one; display.track is one
+Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
 
 
 @dataclass(frozen=True)
@@ -56,3 +61,8 @@ class Intake:
     duplicates: dict[str, str] = field(default_factory=dict)
     unreadable: dict[str, str] = field(default_factory=dict)
     raw: dict[str, Developed] = field(default_factory=dict)
+
+
+def untracked(items: Iterable[Any], description: str, total: int) -> Iterator[Any]:
+    """The items, without a report."""
+    yield from items

@@ -1,9 +1,9 @@
-"""The frames of a video that are worth having: sharp, evenly spread over what the camera saw, no two the same.
+"""Selection of frames from a video: sharp, evenly spread over what the camera saw, no two the same.
 
-The film is watched twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
+The film is read twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
 and how far the picture has moved since the beginning. The film is then cut into as many stretches as frames are wanted,
 each with equal movement, so that a resting camera gives few frames and a quick turn many; a share of TIME goes by the
-clock, for what the eye does not see move. The sharpest frame of each stretch, rather in its middle, is written the
+clock, for movement that is not measured. The sharpest frame of each stretch, rather in its middle, is written the
 second time, unless it shows what a frame before it shows.
 """
 
@@ -22,14 +22,14 @@ from av.container import InputContainer
 from av.video.frame import VideoFrame
 from jaxtyping import Float
 from PIL import Image
+from scipy.fft import irfft2, rfft2
 
 from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
 from ...files.ranges import Lasted
+from .copies import save
 from .judge import DUPLICATE_CORRELATION, JUDGED_SIDE, sharpness, signature
-from .movement import Odometer
-from .track import Track, untracked
-from .upright import save
+from .photo import Track, untracked
 
 VIDEOS = {
     ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
@@ -39,8 +39,13 @@ JUDGED_PER_SECOND = 15.0  # frames per second that are judged, or
 CANDIDATES_PER_FRAME = 4  # for each selected frame, if that is more
 TIME_SHARE = 0.2  # weight of the clock in even spacing; the rest is movement
 EDGE_PENALTY = 0.3  # log sharpness that a frame at the end of its interval must have above one in the middle
+Row = Float[np.ndarray, " frame"]
 MIN_DURATION_SHARE = 0.9  # share of its length that a complete film must have
 MOVEMENT_SIDE = 192  # pixels, the longer side for measuring movement
+TILE_SIDE = 32  # pixels
+REFERENCE_STRIDE = 3  # pixels of movement after which a new reference is taken
+MIN_VARIANCE = 9.0  # of values 0 to 255, of a tile that can be tracked
+WINDOW_MEAN_SQUARE = (3 / 8) ** 2  # mean square of the window that fades out a tile's border
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ def is_video(path: Path) -> bool:
 def extract(path: Path, folder: Path, frames: int | None = None, track: Track = untracked) -> list[tuple[Path, float]]:
     """Frames of a video as upright JPEGs in `folder`, in order, and when each was seen, in seconds from the first on.
 
-    frames: how many; None: PER_SECOND, but at least FEWEST and at most MOST. There are fewer where the film is shorter
+    frames: how many; None: FRAMES_PER_SECOND, from MIN_FRAMES to MAX_FRAMES. There are fewer where the film is shorter
             or shows the same again
     The folder is used as it is if it was made of the same file and with the same options; else it is replaced.
     Raises LumigraphError where the film cannot be read or has no frames.
@@ -82,18 +87,14 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     return [(folder / name, seconds) for name, seconds in known.frames.items()]
 
 
-def judge(
-    path: Path, frames: int | None, track: Track
-) -> tuple[list[int], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"]]:
+def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row, Row, Row]:
     """Numbers of the judged frames, their seconds from the first on, sharpness, and how far the picture had moved."""
     rows: list[tuple[int, float, float, float]] = []
     odometer, end = Odometer(), 0.0
     with opened(path) as film:
         total = film.streams.video[0].frames or max(round(duration(film) * speed(film)), 1)
-        step = max(
-            int(min(speed(film) / JUDGED_PER_SECOND, total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf)),
-            1,
-        )
+        most = total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf
+        step = max(int(min(speed(film) / JUDGED_PER_SECOND, most)), 1)
         for number, (frame, end) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
             if number % step == 0:
                 luminance = grey(frame, JUDGED_SIDE)
@@ -108,13 +109,7 @@ def judge(
     return numbers, times - times[0], sharp, travelled
 
 
-def choose(
-    numbers: Sequence[int],
-    seconds: Float[np.ndarray, " frame"],
-    sharp: Float[np.ndarray, " frame"],
-    travelled: Float[np.ndarray, " frame"],
-    frames: int | None = None,
-) -> list[int]:
+def choose(numbers: Sequence[int], seconds: Row, sharp: Row, travelled: Row, frames: int | None = None) -> list[int]:
     """The numbers of the sharpest frames of equal stretches, ascending. Other arguments are as `judge` gives them."""
     length = float(seconds[-1])
     count = frames or min(max(round(FRAMES_PER_SECOND * length), MIN_FRAMES), MAX_FRAMES)
@@ -169,10 +164,8 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, and when each is shown, in seconds. What comes after damage is left out.
-
-    Raises LumigraphError where no frame can be decoded.
-    """
+    """Frames in order, and when each is shown, in seconds. What comes after damage is left out. Raises LumigraphError
+    where no frame can be decoded."""
     rate, count = speed(film), 0
     try:
         for frame in film.decode(video=0):
@@ -213,3 +206,48 @@ def upright(frame: VideoFrame) -> Image.Image:
 
 def why(fault: Exception) -> str:
     return (getattr(fault, "strerror", None) or str(fault)).lower()
+
+
+class Odometer:
+    """Sum of the movement of a picture, in pixels of small grey pictures that are given one by one.
+
+    Each is compared with a reference, which is exchanged only once the picture has moved by REFERENCE_STRIDE, so that
+    noise does not add up while the camera rests.
+    """
+
+    def __init__(self) -> None:
+        self.travelled = 0.0  # up to the reference
+        self._reference: np.ndarray | None = None
+
+    def show(self, picture: Float[np.ndarray, "height width"]) -> float:
+        """The distance so far."""
+        tiles = cut(picture)
+        if self._reference is None:
+            self._reference = tiles
+        distance = moved(self._reference, tiles)
+        if distance >= REFERENCE_STRIDE:
+            self.travelled, self._reference, distance = self.travelled + distance, tiles, 0.0
+        return self.travelled + distance
+
+
+def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile row column"]:
+    """Square tiles, faded out towards their borders; what does not fill a tile is left out."""
+    rows, columns = max(picture.shape[0] // TILE_SIDE, 1), max(picture.shape[1] // TILE_SIDE, 1)
+    whole = np.zeros((rows * TILE_SIDE, columns * TILE_SIDE), np.float32)
+    part = picture[: rows * TILE_SIDE, : columns * TILE_SIDE]
+    whole[: part.shape[0], : part.shape[1]] = part
+    tiles = whole.reshape(rows, TILE_SIDE, columns, TILE_SIDE).swapaxes(1, 2).reshape(-1, TILE_SIDE, TILE_SIDE)
+    window = np.hanning(TILE_SIDE).astype(np.float32)
+    return (tiles - tiles.mean((1, 2), keepdims=True)) * window[:, None] * window
+
+
+def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
+    """Mean length of the tiles' displacements, each where its cross-correlation peaks; 0 where nothing has texture.
+    Tiles are followed one by one, so that walking forward or turning about the line of sight counts as well."""
+    textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > MIN_VARIANCE * WINDOW_MEAN_SQUARE
+    if not textured.any():
+        return 0.0
+    correlation = irfft2(np.conj(rfft2(a[textured])) * rfft2(b[textured]), s=(TILE_SIDE, TILE_SIDE))
+    y, x = np.unravel_index(correlation.reshape(len(correlation), -1).argmax(1), (TILE_SIDE, TILE_SIDE))
+    wrapped = [(axis + TILE_SIDE // 2) % TILE_SIDE - TILE_SIDE // 2 for axis in (x, y)]
+    return float(np.hypot(*wrapped).mean())

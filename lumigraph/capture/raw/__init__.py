@@ -6,12 +6,12 @@ photo.developed(brightness)        an ordinary picture of it
 """
 
 from .library import exif_of as exif_of
-from .opening import is_raw as is_raw
-from .opening import open_raw as open_raw
 from .photo import RawPhoto as RawPhoto
 from .remembered import RAW_FILE as RAW_FILE
 from .remembered import Developed as Developed
 from .remembered import Remembered as Remembered
 from .remembered import facts as facts
+from .remembered import is_raw as is_raw
+from .remembered import open_raw as open_raw
 from .remembered import planes as planes
 from .remembered import with_raw as with_raw

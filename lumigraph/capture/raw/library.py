@@ -15,8 +15,7 @@ from PIL import ExifTags, Image
 
 from ...errors import LumigraphError
 from ..numbers import check_pixels
-from .demosaic import Pattern
-from .photo import RawPhoto, srgb_from_camera
+from .photo import Pattern, RawPhoto, srgb_from_camera
 
 RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw",
@@ -33,11 +32,8 @@ _silenced, _stderr = 0, -1  # threads that are silent, and where the others' wor
 
 
 def open_file(path: Path) -> RawPhoto:
-    """A camera's raw file, of which only what is said of the pixels is read.
-
-    Raises LumigraphError where rawpy is not installed, for a camera that LibRaw does not know, a file cut short, and
-    filters that are not Bayer's.
-    """
+    """A camera's raw file, of which only what is said of the pixels is read. Raises LumigraphError where rawpy is not
+    installed, for a camera that LibRaw does not know, a file cut short, and filters that are not Bayer's."""
     with opened(path) as raw:
         width, height = raw.sizes.width, raw.sizes.height
         try:
@@ -72,7 +68,7 @@ def read_light(path: Path, turns: int) -> np.ndarray:
 
 
 def colours_of(raw: Any) -> np.ndarray:
-    """The way from white-balanced camera colours to linear sRGB: as the file says, else as LibRaw knows the camera."""
+    """Matrix from white-balanced camera colours to linear sRGB: the file's, else from LibRaw's table of cameras."""
     own = np.array(raw.color_matrix, np.float64)[:3, :3]
     if np.allclose(own.sum(-1), 1, atol=0.01):
         return own

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -72,7 +72,7 @@ def open_mosaic(path: Path) -> RawPhoto:
     listing = path.parent / LISTING_FILE
     found = listed(listing, listing.stat().st_mtime_ns)
     own, common = found.photographs[path.name], found.all
-    about = MosaicRecord(**{x.name: x_of(own, common, x.name) for x in fields(MosaicRecord)})
+    about = replace(common, **{name: value for name, value in vars(own).items() if value is not None})
     size = size_of(path, about)
     black, white, pattern = (needed(about, name, path) for name in ("black", "white", "pattern"))
     if white <= black:
@@ -89,11 +89,6 @@ def open_mosaic(path: Path) -> RawPhoto:
         about.exposure,
         partial(read_light, path, size, black, white),
     )
-
-
-def x_of(own: MosaicRecord, common: MosaicRecord, name: str):
-    value = getattr(own, name)
-    return getattr(common, name) if value is None else value
 
 
 def needed(about: MosaicRecord, name: str, path: Path):

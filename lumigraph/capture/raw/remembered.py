@@ -1,4 +1,4 @@
-"""Raw file of each photograph of a scene, and the layers and facts that it adds to the scene.
+"""Raw files of a scene's photographs, and the layers and facts that they add to the scene.
 
 raw.json in a scene's folder names the files, as `lumigraph capture` writes it. Without it, a folder `raw` beside the
 photographs may hold them, each called as its photograph is (RawNeRF's published captures have it so).
@@ -20,18 +20,27 @@ from ...files.ranges import Name, between
 from ..capture import Capture, PixelPlane, Shot
 from ..masks import inner_names
 from ..pictures import same_shape, stat
-from .demosaic import repeated
-from .opening import is_raw, open_raw
-from .photo import RawPhoto
+from . import library, mosaic_folder
+from .photo import RawPhoto, repeated
 
 RAW_FILE, RAW_FOLDER = "raw.json", "raw"
 FILTERS = ("red", "green", "blue")
 UNKNOWN_VALUE = -1
 
 
+def is_raw(path: Path) -> bool:
+    """True if a file is a camera's raw file by its name, or listed as a mosaic in its folder."""
+    return path.suffix.lower() in library.RAW_SUFFIXES or mosaic_folder.is_listed(path)
+
+
+def open_raw(path: Path) -> RawPhoto:
+    """A raw photograph, its pixels not yet read. Raises LumigraphError for what cannot be read, and why."""
+    return library.open_file(path) if path.suffix.lower() in library.RAW_SUFFIXES else mosaic_folder.open_mosaic(path)
+
+
 @dataclass(frozen=True)
 class Developed:
-    """The raw file of a picture, and the factor on its light with which it was developed; None where nobody knows."""
+    """The raw file of a picture, and the factor on its light with which it was developed; None where it is unknown."""
 
     file: Name
     brightness: Annotated[float, between(1e-9, 1e9)] | None = None
@@ -42,9 +51,6 @@ class Remembered:
     """raw.json: raw files by the names of their pictures."""
 
     photographs: dict[Name, Developed] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        return {"photographs": {k: {"file": v.file, "brightness": v.brightness} for k, v in self.photographs.items()}}
 
 
 def with_raw(capture: Capture, folder: Path) -> Capture:

@@ -17,18 +17,18 @@ from torch import Tensor
 
 from ... import kernels
 from ...datasets.scene import Scene
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.progress import track
 from .flat_view import FlatView, flat_view
 
-VIEWS, FEWEST_VIEWS = 48, 8  # photographs asked at most, and however short the time
-LONGEST, COARSE = 160, 80  # pixels of their longer side, and where no depth is known yet
+MAX_VIEWS, MIN_VIEWS = 48, 8  # photographs asked at most, and however short the time
+MAX_SIDE, COARSE_SIDE = 160, 80  # pixels of their longer side, and where no depth is known yet
 NEIGHBOURS, BEST = 4, 2  # of each photograph, and how many of them must see a place
 ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # at which rays should meet; deviations around it
 ANCHORS = 200  # places by which two views are asked whether they see the same
-FEWEST, MOST = 16, 80  # hypotheses
+MIN_HYPOTHESES, MAX_HYPOTHESES, MIN_POINTS = 16, 80, 16
 NEARER, FARTHER = 0.7, 2.0  # times the depths of known points: the range that is searched
-COST = 0.4  # at most: a correlation of 0.6
+MAX_COST = 0.4  # at most: a correlation of 0.6
 AGREEMENT = 0.02  # of its depth: how far apart two views may find a place
 WINDOW = 5  # pixels
 
@@ -55,11 +55,11 @@ def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
     seconds: that sweeping may take, about; fewer photographs are asked where all would take longer
     Depths are searched around the scene's sparse points; where there are none, around what smaller pictures tell.
     """
-    chosen = evenly(scene.splits["train"].tolist(), VIEWS)
-    views = [flat_view(scene.photograph(i), LONGEST) for i in chosen]
+    chosen = evenly(scene.splits["train"].tolist(), MAX_VIEWS)
+    views = [flat_view(scene.photograph(i), MAX_SIDE) for i in chosen]
     known = scene.points
     if known is None or len(known) < ANCHORS:
-        small = [flat_view(scene.photograph(i), COARSE) for i in chosen]
+        small = [flat_view(scene.photograph(i), COARSE_SIDE) for i in chosen]
         seconds = seconds / 2
         known = swept(small, [everywhere(view, scene) for view in small], "Looking for depth", seconds).positions
     ranges = [around(view, known) or everywhere(view, scene) for view in views]
@@ -81,14 +81,14 @@ def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:
 def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, float] | None:
     """The range of depths of the known points before a view, with some room; None if they are few."""
     seen, _, _, depth = view.sees(known)
-    if int(seen.sum()) < FEWEST:
+    if int(seen.sum()) < MIN_POINTS:
         return None
     near, far = depth[seen].quantile(torch.tensor([0.01, 0.99])).tolist()
     return NEARER * near, FARTHER * far
 
 
 def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str, seconds: float) -> Points:
-    """What the views find, where their neighbours agree: all views, or as many as can be swept in so many seconds."""
+    """Points of the views where their neighbours agree; of as many views as can be swept in so many seconds."""
     if seconds < math.inf:
         some = evenly(list(range(len(views))), affordable(views, ranges, seconds))
         views, ranges = [views[i] for i in some], [ranges[i] for i in some]
@@ -114,11 +114,11 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
 
 
 def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
-    """How many views can be swept in so many seconds, as one of them tells."""
+    """Number of views that can be swept in so many seconds, by the time of one."""
     begin, middle = time.perf_counter(), len(views) // 2
     positions = torch.stack([view.pose[:, 3] for view in views])
     sweep(views[middle], [views[j] for j in best_neighbours(middle, views, positions, ranges[middle])], ranges[middle])
-    return max(int(seconds / (time.perf_counter() - begin)), FEWEST_VIEWS)
+    return max(int(seconds / (time.perf_counter() - begin)), MIN_VIEWS)
 
 
 def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, float]) -> Float[Tensor, "height width"]:
@@ -127,7 +127,7 @@ def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, flo
         return torch.zeros_like(view.trust)
     warps = torch.stack([view.warp_to(other) for other in neighbours])
     near, far = 1 / span[0], 1 / span[1]
-    count = min(max(math.ceil(disparity(view, warps, near, far)) + 1, FEWEST), MOST)
+    count = min(max(math.ceil(disparity(view, warps, near, far)) + 1, MIN_HYPOTHESES), MAX_HYPOTHESES)
     hypotheses = torch.linspace(far, near, count)
     pictures, trust = (padded([getattr(x, name) for x in neighbours]) for name in ("grey", "trust"))
     best = min(BEST, len(neighbours))
@@ -137,13 +137,12 @@ def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, flo
     beside = [cost.gather(0, (plane + k).clamp(0, count - 1)[None])[0] for k in (-1, 1)]
     bend = (beside[0] + beside[1] - 2 * least).clamp_min(1e-6)
     inverse = far + (plane + 0.5 * (beside[0] - beside[1]) / bend) * ((near - far) / (count - 1))
-    sure = (least < COST) & (plane > 0) & (plane < count - 1) & (view.trust > 0.99)
+    sure = (least < MAX_COST) & (plane > 0) & (plane < count - 1) & (view.trust > 0.99)
     return torch.where(sure, 1 / inverse, 0)
 
 
 def disparity(view: FlatView, warps: Float[Tensor, "neighbour 3 4"], near: float, far: float) -> float:
-    """Pixels that the middle of a view travels in its neighbours from the nearest to the farthest hypothesis, at most
-    as far as their pictures are wide."""
+    """Pixels between the nearest and farthest hypothesis of a view's middle in its neighbours, within their width."""
     height, width = view.trust.shape
     middle = torch.tensor([width / 2, height / 2, 1.0])
     places = [warps[:, :, :3] @ middle + h * warps[:, :, 3] for h in torch.linspace(far, near, 64).tolist()]

@@ -14,7 +14,7 @@ from torch.nn.functional import grid_sample
 from ...camera.lens import Pinhole
 from ...datasets.scene import Photograph
 
-WIDEST = math.radians(50.0)  # from the axis to the left and right border, where a lens sees further
+MAX_ANGLE = math.radians(50.0)  # from the axis to the left and right border, where a lens sees further
 GREY = (0.299, 0.587, 0.114)
 
 
@@ -52,7 +52,7 @@ class FlatView:
         return homogeneous[:, :2] / depth.clamp_min(1e-9)[:, None], depth
 
     def sees(self, points: Float[Tensor, "point 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of points before the picture: whether they are, their row, their column, how far along the axis they lie."""
+        """Mask of points inside the picture, their row, their column, their distance along the axis."""
         pixels, depth = self.project(points)
         column, row = pixels.clamp(-1, 1e6).floor().long().unbind(-1)
         height, width = self.trust.shape
@@ -84,7 +84,7 @@ def flat_view(photograph: Photograph, longest: int) -> FlatView:
         intrinsics[:2, 2] = centre[0]
         return FlatView(pose, intrinsics, small.rgb, trust)
     focal = 1 / float(lens.solid_angle(centre, axis).sqrt())
-    reach = focal * math.tan(WIDEST)
+    reach = focal * math.tan(MAX_ANGLE)
     size = torch.tensor([width, height])
     first = (centre[0] - reach).clamp_min(0).floor()
     last = torch.minimum(centre[0] + reach, size).ceil().maximum(first + 1)

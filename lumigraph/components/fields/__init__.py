@@ -1,1 +1,1 @@
-"""What representations are made of: encodings, networks, how points turn into coordinates."""
+"""Representations: encodings, networks, fields, codes of photographs, teachers."""

@@ -14,13 +14,48 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...datasets.scene import Batch, Photograph
+from ... import kernels
+from ...camera.rays import Rays
+from ...datasets.scene import Batch, Frame, Photograph
 from ...errors import LumigraphError
 from ...files.ranges import between
 from ...method import Part
 from ...method.controls import Control, blend
 from ...volume import composite, weights_of
-from .code_space import axes_of, fitted
+from .hash_field import side_by_side
+from .layers import MLP
+
+
+def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Tensor, "axis code"]:
+    """Along which codes differ, each as long as their deviation along it: their mean plus `w @ axes` is distributed as
+    the Gaussian that fits them, where w is of the standard normal distribution. None for fewer than two codes.
+
+    least: deviation that every axis has besides; above 0 there are as many axes as numbers
+    """
+    if len(codes) < 2:
+        return codes[:0]
+    off = (codes - codes.mean(0)) / (len(codes) - 1) ** 0.5
+    _, found, along = torch.linalg.svd(off, full_matrices=least > 0)
+    deviation = (torch.cat([found, found.new_zeros(len(along) - len(found))]).square() + least**2).sqrt()
+    return (deviation[:, None] * along)[deviation > 1e-4 * deviation[:1].clamp_min(1e-9)]
+
+
+def fitted(
+    start: Float[Tensor, " width"], error: Callable[[Float[Tensor, " width"]], Tensor], steps: int, learning_rate: float
+) -> Float[Tensor, " width"]:
+    """The numbers that make an error small, by so many steps of Adam from a start, with all else as it is.
+
+    error: a number that is differentiable in them
+    """
+    with torch.enable_grad():
+        code = start.detach().clone().requires_grad_()
+        adam = torch.optim.Adam([code], learning_rate)
+        for step in range(steps):
+            (code.grad,) = torch.autograd.grad(error(code), [code])
+            adam.param_groups[0]["lr"] = learning_rate * (1 - step / steps)
+            adam.step()
+    return code.detach()
+
 
 CodeWidth = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
 APPEARANCE = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
@@ -98,8 +133,7 @@ class PhotographCodes(Part):
         return average + fitted(there, likely, FIT_STEPS, FIT_RATE) @ axes
 
     def code_of(self, value: str) -> Float[Tensor, " width"]:
-        """The code that a value of `control` stands for: a photograph's, the average, or one between two. A photograph
-        that nobody learnt from has the average."""
+        """Code of a control's value: a photograph's (the average if not learnt), the average, or one between two."""
         first, second, share = blend(value)
         return torch.lerp(self._of(first), self._of(second), share)
 
@@ -181,11 +215,34 @@ class AppearanceCodes(PhotographCodes):
 
 
 def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Batch:
-    """Random pixels of a photograph that are to be trusted, no two the same; all of them where there are fewer. None
-    where there is none."""
+    """Random trusted pixels of a photograph, without repetition; all where there are fewer; maybe none."""
     trusted = torch.ones(len(photograph), dtype=torch.bool) if photograph.mask is None else photograph.mask.flatten()
     there = trusted.nonzero()[:, 0]
     chosen = there[torch.randperm(len(there), generator=generator)[:count]]
     rays = photograph.camera.rays(photograph.camera.pixels()[chosen])
     alpha = None if photograph.alpha is None else photograph.alpha.flatten()[chosen]
     return Batch(rays, photograph.rgb.flatten(0, 1)[chosen], alpha)
+
+
+class SkyField(Part):
+    """Colours behind everything (as in Rematas 2022, beside the code).
+
+    Photographs do not agree on the weather. Without a sky, a transient head would explain all of it, and nothing would
+    be left for the scene.
+    """
+
+    def __init__(self, bands: int, code: int, hidden_width: int):
+        super().__init__()
+        self.bands, self.network = bands, MLP(bands**2 + code, hidden_width, 3)
+
+    def behind(
+        self, rays: Rays, code: Float[Tensor, "#ray code"] | None, background: Float[Tensor, "#ray 3"]
+    ) -> Float[Tensor, "ray 3"]:
+        codes = [] if code is None else [code.expand(len(rays), -1)]
+        harmonics = kernels.spherical_harmonics(rays.directions, self.bands)
+        return self.network(side_by_side(harmonics, *codes)).sigmoid()
+
+
+def sky_for(frame: Frame, wanted: bool, bands: int, code: int, hidden_width: int) -> SkyField | None:
+    """A sky where a scene without bounds shows one, and it is wanted."""
+    return SkyField(bands, code, hidden_width) if wanted and frame.is_open and not frame.has_alpha else None

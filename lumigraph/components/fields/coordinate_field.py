@@ -1,21 +1,24 @@
-"""A field in the weights of a coordinate network (Mildenhall et al. 2020)."""
+"""Fields in the weights of a coordinate network: of points (Mildenhall 2020), of frustums of cones (Barron 2021)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
 from ...files.ranges import Depth, Layers, Octaves
 from ...method import Field
+from ...method.field import Codes, Colours, Densities, Directions, Points
 from ..sampling.spaces import Space
 from .coordinate_network import CoordinateNetwork
-from .dense import in_chunks
-from .encodings import FrequencyEncoding
+from .encodings import FrequencyEncoding, IntegratedEncoding
 from .hash_field import Joining
+from .layers import in_chunks
 
 Places = tuple[Tensor, ...]  # what is encoded: coordinates of points, or means and variances of frustums
 Activation = Callable[[Tensor], Tensor]
@@ -138,9 +141,7 @@ class CoordinateField(Field):
 
     # At points
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Tensor | Places]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Tensor | Places]:
         """Density per scene unit; features, without a code the places themselves."""
         coordinates = self.space.warp(points)
         if self.joint:
@@ -148,12 +149,7 @@ class CoordinateField(Field):
         density, features = self.features_at(coordinates)
         return density * self.space.stretch(points), features
 
-    def colour(
-        self,
-        features: Tensor | Places,
-        directions: Float[Tensor, "point 3"],
-        code: Float[Tensor, "point code"] | None = None,
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Tensor | Places, directions: Directions, code: Codes | None = None) -> Colours:
         if self.joint:
             assert isinstance(features, tuple)
             return self.colours_at(features, torch.arange(len(directions), device=directions.device), directions)[1]
@@ -165,12 +161,7 @@ class CoordinateField(Field):
     def density(self, points: Float[Tensor, "point 3"], code: Tensor | None = None) -> Float[Tensor, " point"]:
         return self.density_at(self.space.warp(points)) * self.space.stretch(points)
 
-    def forward(
-        self,
-        points: Float[Tensor, "point 3"],
-        directions: Float[Tensor, "point 3"],
-        code: Float[Tensor, "point code"] | None = None,
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def forward(self, points: Points, directions: Directions, code: Codes | None = None) -> tuple[Densities, Colours]:
         def answer(x: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
             raw, feature = self.network.geometry(self.encode(x))
             return self.activation(raw), self._seen(feature, *seen)
@@ -184,3 +175,36 @@ class CoordinateField(Field):
 
     def _coloured(self, feature: Tensor, view: Tensor, *code: Tensor) -> Float[Tensor, "point 3"]:
         return self.activated(self.network.seen(feature, torch.cat([view, *code], -1)))
+
+
+POINT_VARIANCE = (2 / 128) ** 2 / 12  # of points, a cell's of a grid of 128: photographs show nothing smaller
+COLOUR_PADDING = 0.001  # by which colours may exceed 0 and 1, so that both are within reach of the sigmoid
+
+
+def shifted_softplus(raw: Tensor) -> Tensor:
+    """Density of the network's output (Barron 2021, section 3.3)."""
+    return softplus(raw - 1)
+
+
+class FrustumField(CoordinateField):
+    """Density and colour of frustums; of points, as of a small volume around each.
+
+    padding: by which colours may exceed 0 and 1
+    """
+
+    def __init__(self, *arguments: Any, padding: float = COLOUR_PADDING, **named: Any):
+        super().__init__(*arguments, **named)
+        self.activation, self.padding = shifted_softplus, padding
+
+    def encodings(self, keep_input: bool) -> tuple[IntegratedEncoding, FrequencyEncoding]:
+        n = self.numbers
+        return IntegratedEncoding(3, n.position_frequencies), FrequencyEncoding(3, n.direction_frequencies, base=1.0)
+
+    def encode(
+        self, means: Float[Tensor, "place 3"], variances: Float[Tensor, "place 3"] | None = None
+    ) -> Float[Tensor, "place width"]:
+        variances = torch.full_like(means, POINT_VARIANCE) if variances is None else variances
+        return self.encode_position(means, variances, self.octave_weights())
+
+    def activated(self, raw: Float[Tensor, "place 3"]) -> Float[Tensor, "place 3"]:
+        return raw.sigmoid() * (1 + 2 * self.padding) - self.padding if self.padding else raw.sigmoid()

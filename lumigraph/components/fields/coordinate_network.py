@@ -1,42 +1,60 @@
-"""The network of NeRF: density from position, colour from position and viewing direction."""
+"""Networks of NeRF: density from position, colour from position and viewing direction; and several numbers from a
+position alone."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .dense import Dense
+from .encodings import FrequencyEncoding
+from .layers import Dense, in_chunks
 
 Encoded = Float[Tensor, "sample position"]
 
 
-class CoordinateNetwork(nn.Module):
+class SkipNetwork(nn.Module):
+    """Hidden layers of Mildenhall 2020, figure 7, up to the density.
+
+    inputs:       width of the encoded position
+    depth, width: hidden layers, and their channels
+    skip_layer:   the layer whose activation the input joins again, counted from 1
+    layer:        makes a layer from its inputs, outputs and whether it has a ReLU
+    """
+
+    def __init__(self, inputs: int, depth: int, width: int, skip_layer: int, layer: Callable[[int, int, bool], Dense]):
+        super().__init__()
+
+        def layers(first: int, count: int) -> nn.Sequential:
+            return nn.Sequential(*(layer(width if i else first, width, True) for i in range(count)))
+
+        skip_layer = min(skip_layer, depth - 1)
+        self.before, self.after = layers(inputs, skip_layer), layers(width + inputs, depth - skip_layer)
+
+    def trunk(self, position: Encoded, last: Dense) -> Float[Tensor, "sample width"]:
+        """Input of the last layers. last: one of them"""
+        position = position.to(last.type_of_products(position))
+        return self.after(torch.cat([position, self.before(position)], -1))
+
+
+class CoordinateNetwork(SkipNetwork):
     """The network of Mildenhall 2020, figure 7. Density does not depend on direction, so geometry is the same from all.
 
     position, direction: widths of the encoded inputs
-    depth, width: hidden layers before density, and their channels
-    skip_layer:   the layer whose activation the input joins again, counted from 1
-    exact:        multiply in float32 even where bfloat16 is faster
+    exact: multiply in float32 even where bfloat16 is faster
     Both outputs are raw; activations are the method's.
     """
 
     def __init__(
         self, position: int, direction: int, depth: int = 8, width: int = 256, skip_layer: int = 5, exact: bool = False
     ):
-        super().__init__()
-
-        def layers(inputs: int, count: int) -> nn.Sequential:
-            return nn.Sequential(*(Dense(width if i else inputs, width, True, exact) for i in range(count)))
-
-        skip_layer = min(skip_layer, depth - 1)
-        self.before = layers(position, skip_layer)
-        self.after = layers(width + position, depth - skip_layer)
-        self.density_layer = Dense(width, 1, False, exact)
-        self.feature = Dense(width, width, False, exact)
-        self.colour = nn.Sequential(
-            Dense(width + direction, width // 2, True, exact), Dense(width // 2, 3, False, exact)
-        )
+        dense = partial(Dense, exact=exact)
+        super().__init__(position, depth, width, skip_layer, dense)
+        self.density_layer, self.feature = dense(width, 1), dense(width, width)
+        self.colour = nn.Sequential(dense(width + direction, width // 2, True), dense(width // 2, 3))
 
     def forward(
         self, position: Encoded, direction: Float[Tensor, "sample direction"]
@@ -47,7 +65,7 @@ class CoordinateNetwork(nn.Module):
 
     def geometry(self, position: Encoded) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample width"]]:
         """Raw density, and what the colour layers take of each place."""
-        h = self._trunk(position)
+        h = self.trunk(position, self.feature)
         return self.density_layer(h).float()[:, 0], self.feature(h)
 
     def seen(
@@ -58,8 +76,16 @@ class CoordinateNetwork(nn.Module):
 
     def density(self, position: Encoded) -> Float[Tensor, " sample"]:
         """Raw density alone, in two thirds of the time."""
-        return self.density_layer(self._trunk(position)).float()[:, 0]
+        return self.density_layer(self.trunk(position, self.feature)).float()[:, 0]
 
-    def _trunk(self, position: Encoded) -> Float[Tensor, "sample width"]:
-        position = position.to(self.feature.type_of_products(position))
-        return self.after(torch.cat([position, self.before(position)], -1))
+
+class PositionNetwork(SkipNetwork):
+    """Raw outputs from a position. octaves: of its frequency encoding"""
+
+    def __init__(self, octaves: int, depth: int, width: int, skip_layer: int, outputs: int, layer: type[Dense] = Dense):
+        encoding = FrequencyEncoding(3, octaves)
+        super().__init__(encoding.width, depth, width, skip_layer, layer)
+        self.encoding, self.last = encoding, layer(width, outputs)
+
+    def forward(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, "point output"]:
+        return in_chunks(lambda x: (self.last(self.trunk(self.encoding(x), self.last)).float(),), coordinates)[0]

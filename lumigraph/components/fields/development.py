@@ -10,7 +10,7 @@ from ...method.controls import Control
 
 STOPS = 8.0  # that exposure can be turned up or down
 DAYLIGHT = 6500.0  # kelvin, of the white that sRGB has
-WARMEST, COLDEST = 2000.0, 12_000.0  # kelvin
+MIN_KELVIN, MAX_KELVIN = 2000.0, 12_000.0  # kelvin
 XYZ_TO_SRGB = (
     (3.2404542, -1.5371385, -0.4985314),
     (-0.9692660, 1.8760108, 0.0415560),
@@ -19,21 +19,12 @@ XYZ_TO_SRGB = (
 
 Light = Float[Tensor, "*pixels 3"]
 
+WHITE = "The temperature of the light that is shown as white; 6500 is as shot, less is bluer."
+TONE = "How light becomes brightness: sRGB's curve, one that keeps highlights as film does, or none."
 CONTROLS = (
     Control("exposure", 0.0, (-STOPS, STOPS), unit="stops", about="Each stop doubles the light."),
-    Control(
-        "white_balance",
-        DAYLIGHT,
-        (WARMEST, COLDEST),
-        unit="kelvin",
-        about="The temperature of the light that is shown as white; 6500 is as shot, less is bluer.",
-    ),
-    Control(
-        "tone",
-        "srgb",
-        choices=("srgb", "filmic", "linear"),
-        about="How light becomes brightness: sRGB's curve, one that keeps highlights as film does, or none.",
-    ),
+    Control("white_balance", DAYLIGHT, (MIN_KELVIN, MAX_KELVIN), unit="kelvin", about=WHITE),
+    Control("tone", "srgb", choices=("srgb", "filmic", "linear"), about=TONE),
 )
 
 

@@ -34,7 +34,7 @@ class FrequencyEncoding(nn.Module):
     def forward(
         self, points: Float[Tensor, "sample input"], weights: Float[Tensor, " octave"] | None = None
     ) -> Float[Tensor, "sample feature"]:
-        """weights: of the octaves, where not all count fully; see `training.coarse_to_fine`"""
+        """weights: of the octaves, where not all count fully; see `training.schedules.band_weights`"""
         angles = self.octaves[:, None] * points[:, None]  # (sample, octave, input)
         waves = weighted(torch.stack([angles.sin(), angles.cos()], 2), weights).flatten(1)
         return torch.cat([points, waves], 1) if self.keep_input else waves
@@ -63,7 +63,7 @@ class IntegratedEncoding(nn.Module):
         variances: Float[Tensor, "sample input"],
         weights: Float[Tensor, " octave"] | None = None,
     ) -> Float[Tensor, "sample feature"]:
-        """weights: of the octaves, where not all count fully; see `training.coarse_to_fine`"""
+        """weights: of the octaves, where not all count fully; see `training.schedules.band_weights`"""
         angles = self.octaves[:, None] * means[:, None]  # (sample, octave, input)
         left = torch.exp(-0.5 * self.octaves.square()[:, None] * variances[:, None])
         return weighted(torch.stack([angles.sin() * left, angles.cos() * left], 2), weights).flatten(1)
@@ -75,7 +75,7 @@ def weighted(
     return waves if weights is None else waves * weights[:, None, None]
 
 
-class FourierFeatures(nn.Module):
+class FourierEncoding(nn.Module):
     """Waves in the directions and at the frequencies that the rows of B hold (Tancik 2020, section 4).
 
         gamma(p) = (cos(2 pi B p), sin(2 pi B p))

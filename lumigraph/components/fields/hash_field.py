@@ -15,14 +15,12 @@ from ...errors import LumigraphError
 from ...exchange.packing import Stored
 from ...files.ranges import Layers, between
 from ...method import Field
+from ...method.field import Codes, Colours, Densities, Directions, Points
 from ..sampling.spaces import Space
-from ..training.lazy_adam import LazyAdam
-from .activations import truncated_exp
-from .mlp import MLP
+from ..training.row_optimizers import LazyAdam
+from .layers import MLP, truncated_exp
 
-OPEN_RATE = (
-    0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
-)
+OPEN_RATE = 0.5  # of the table's learning rate, for networks in the open: at 1, one seed in three never learns a hue
 CODES_RATE = 0.25  # of the learning rate, that of codes beside a hash table
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 
@@ -123,9 +121,7 @@ class HashField(Field):
         weights = self.joining(self.levels.levels) if self.joining else None
         return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point geometry"]]:
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:
         return self.decode(points, self.encode(points))
 
     def decode(
@@ -136,11 +132,8 @@ class HashField(Field):
         return truncated_exp(geometry[:, 0]) * self.space.stretch(points), geometry
 
     def colour(
-        self,
-        features: Float[Tensor, "point geometry"],
-        directions: Float[Tensor, "point 3"],
-        code: Float[Tensor, "point code"] | None = None,
-    ) -> Float[Tensor, "point 3"]:
+        self, features: Float[Tensor, "point geometry"], directions: Directions, code: Codes | None = None
+    ) -> Colours:
         harmonics = kernels.spherical_harmonics(directions, self.bands)
         codes = [] if code is None else [code]
         return self.activated(self.colour_network(side_by_side(features, harmonics, *codes)))

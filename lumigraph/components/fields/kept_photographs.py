@@ -1,18 +1,21 @@
-"""Photographs that a method keeps, as bytes among its tensors: so that a run opens where they are gone."""
+"""Photographs of a collection's members to learn from, and photographs that a method keeps among its tensors."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from ...camera import Camera
 from ...camera.lens import Lens
-from ...datasets.scene import Photograph, Vector
+from ...camera.rays import Rays
+from ...datasets.dataset import Dataset
+from ...datasets.scene import Batch, Photograph, Scene, Vector
 from ...errors import LumigraphError
 from ...files import from_json
 from ...files.ranges import Row, Side, typed
@@ -22,7 +25,7 @@ WHERE = "what a checkpoint says of its photographs"
 
 @dataclass(frozen=True)
 class Taken:
-    """Where photographs were taken from, a row for each. lens: see `Lens.to_json`."""
+    """Cameras of photographs, a row for each. lens: see `Lens.to_json`."""
 
     pose: list[tuple[Row, Row, Row]]
     lens: dict[str, Any]
@@ -67,7 +70,7 @@ class KeptPhotographs(nn.Module):
         return kept
 
     def cameras(self) -> Camera:
-        """Where they were taken from, on the CPU. Raises LumigraphError for what are no cameras."""
+        """Cameras of the photographs, on the CPU. Raises LumigraphError for a damaged description."""
         said = typed(Taken, from_json(self.taken.rows.cpu().numpy().tobytes(), WHERE), WHERE)
         lens, pose, size = Lens.from_json(said.lens, WHERE), torch.tensor(said.pose), torch.tensor(said.size)
         if not len(lens) == len(pose) == len(size) or 3 * int(size.prod(-1).sum()) != len(self.pixels.rows):
@@ -89,3 +92,44 @@ def padded(pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view 3 heig
         return nn.functional.pad(picture.permute(2, 0, 1)[None], rest, mode="replicate")[0]
 
     return torch.stack([grown(picture) for picture in pictures])
+
+
+def photographed(member: Dataset, method: str) -> Scene:
+    """A member as photographs. Raises LumigraphError for any other kind. method: to name"""
+    if not isinstance(member, Scene):
+        raise LumigraphError(
+            f"{method} learns from collections of photographs, and {member.source} holds {member.kind}; "
+            "name a folder of scenes"
+        )
+    return member
+
+
+def rays_through(photographs: Sequence[Photograph], count: int, boxed: bool, generator: torch.Generator) -> Batch:
+    """Random pixels of photographs, about as many of each. boxed: see `pixels_of`"""
+    parts = []
+    counts = [len(x) for x in torch.arange(count).tensor_split(len(photographs))]
+    for photograph, wanted in zip(photographs, counts, strict=True):
+        places = pixels_of(photograph, boxed)
+        x, y = places[torch.randint(len(places), (wanted,), generator=generator)].unbind(-1)
+        alpha = None if photograph.alpha is None else photograph.alpha[y, x]
+        parts.append(Batch(photograph.camera.rays(torch.stack([x, y], -1) + 0.5), photograph.rgb[y, x], alpha))
+    names = ("origins", "directions", "radius")
+    rays = Rays(*(torch.cat([getattr(part.rays, name) for part in parts]) for name in names))
+    known = [part.alpha for part in parts if part.alpha is not None]
+    return Batch(rays, torch.cat([part.rgb for part in parts]), torch.cat(known) if len(known) == len(parts) else None)
+
+
+def pixels_of(photograph: Photograph, boxed: bool) -> Int[Tensor, "pixel 2"]:
+    """Pixels (x, y) to be trusted; boxed: within the box around what is opaque, where anything is."""
+    height, width = photograph.rgb.shape[:2]
+    there = torch.ones(height, width, dtype=torch.bool) if photograph.mask is None else photograph.mask.clone()
+    if boxed and photograph.alpha is not None and (opaque := photograph.alpha > 0.5).any():
+        rows, columns = opaque.any(1).nonzero(), opaque.any(0).nonzero()
+        box = torch.zeros_like(there)
+        box[int(rows.min()) : int(rows.max()) + 1, int(columns.min()) : int(columns.max()) + 1] = True
+        there = there & box if (there & box).any() else there
+    return there.nonzero().flip(-1)
+
+
+def chance(count: int, generator: torch.Generator) -> int:
+    return int(torch.randint(count, (), generator=generator))

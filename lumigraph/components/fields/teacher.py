@@ -1,4 +1,4 @@
-"""What a method takes over from another one: density and colour at points, as far as cameras see them.
+"""Teachers: density and colour of another method at points, as far as cameras see them, and distillation from these.
 
 A teacher that has a `field` is asked for it. One without, such as a cloud of Gaussians, is rendered into depth maps,
 which are fused into a shell of density around its surfaces (Curless and Levoy 1996). Of either nothing is taken where
@@ -18,12 +18,13 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...depth_maps import DEPTH_EDGE, TSDF, DepthMap, SurfacePoints, Tolerance, free, render_depth_maps, surface_points
-from ...geometry import unit
-from ...geometry.choice import evenly
+from ...geometry import evenly, unit
 from ...kernels import spherical_harmonics
 from ...method.capabilities import HasDensity, HasField, can
+from ...method.field import Colours, Densities, Directions, Points
 from ...system.progress import track
 from ..sampling.spaces import Space
+from ..training.schedules import held
 
 AT_ONCE = 1 << 17  # points
 VIEWS, SIZE = 24, 128  # depth maps of a teacher at most, and pixels of their longer side
@@ -38,8 +39,7 @@ EDGE = 2e-3  # coordinates by which a place may miss its own and still be one
 
 
 def teacher_of(teacher: Any, cameras: Camera) -> Teacher:
-    """A teacher, looked at by cameras around it, ready to be taken over. Raises LumigraphError where they see nothing
-    solid."""
+    """A teacher with depth maps of cameras around it. Raises LumigraphError where they see nothing solid."""
     depth_maps = render_depth_maps(teacher.render, cameras, teacher.frame.background, VIEWS, SIZE)
     return FieldTeacher(depth_maps, teacher) if can(teacher, HasField) else DepthTeacher(depth_maps)
 
@@ -114,8 +114,8 @@ class Teacher(ABC):
     def occupied(
         self, space: Space, cells: int, thickness: float, chance: torch.Generator
     ) -> Bool[Tensor, "cell cell cell"]:
-        """Which cells of a space's [-1, 1]^3, so many along each axis, hold something, or are beside one that does:
-        looked at coarsely first, then half as large, and so on.
+        """Mask of the cells of a space's [-1, 1]^3, so many along each axis, that hold something or are beside one
+        that does: from coarse to fine.
 
         thickness: optical thickness across a cell from which on there is something in it
         """
@@ -164,10 +164,7 @@ class FieldTeacher(Teacher):
         self.teacher = teacher
 
     def _density(self, points):
-        there = points.to(self.teacher.device)
-        if can(self.teacher, HasDensity):
-            return self.teacher.density(there).cpu().float()
-        return self.teacher.field(there, torch.nn.functional.normalize(there + 1e-6, dim=-1))[0].cpu().float()
+        return density_of(self.teacher)(points.to(self.teacher.device)).cpu().float()
 
     def glance(self, points, depth_map):
         there, directions = points, unit(points - depth_map.camera.position)
@@ -190,9 +187,7 @@ class DepthTeacher(Teacher):
         return ((0.5 - distance).clamp(0, 1) * SPENT / truncation).nan_to_num(0.0)
 
     @torch.no_grad()
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and the colour in that picture which sees the point most nearly along a direction."""
         best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
         for depth_map in self.depth_maps:
@@ -207,11 +202,93 @@ class DepthTeacher(Teacher):
         return torch.where(inside, depth_map.at_pixels(depth_map.rgb, pixels), 0.5)
 
 
+def density_of(teacher: Any) -> Callable[[Points], Densities]:
+    """Density at points, of a teacher with a `field`."""
+    if can(teacher, HasDensity):
+        return teacher.density
+    return lambda points: teacher.field(points, torch.nn.functional.normalize(points + 1e-6, dim=-1))[0]
+
+
 def logit(rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-    """What a sigmoid makes these colours of, kept from black and white, which it never reaches."""
+    """Logit of colours, clamped off black and white."""
     return rgb.clamp(0.01, 0.99).logit()
 
 
 def cells_of(coordinates: Float[Tensor, "point 3"], n: int) -> Tensor:
     """The cells, of n along each axis of [-1, 1]^3, that coordinates lie in."""
     return ((coordinates + 1) * (n / 2)).long().clamp(0, n - 1)
+
+
+STEPS = 240
+POINTS_PER_RAY = 8  # of a step of a coordinate network: as many points are learnt from
+POOL = 16  # times as many places as a step learns from: the teacher is asked about these alone
+CELL = 1 / 16  # of the coordinates: a length over which densities are compared by what they stop
+CLEAR = 1 / 2  # the same where the teacher holds nothing: a little fog there is much along a ray
+NOTHING = 0.01  # optical thickness of CELL up to which that is so
+SOLID = 8.0  # and from which on all is solid alike
+FINAL = 0.1  # of the learning rates, at the end
+START = 0.3  # share of the steps before they fall
+
+Field = Callable[
+    [Float[Tensor, "point 3"], Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]
+]
+
+
+def distil(
+    field: Field,
+    held_by: Teacher,
+    space: Space,
+    optimizers: Sequence[torch.optim.Optimizer],
+    points: int,
+    chance: torch.Generator,
+    device: torch.device | str = "cpu",
+) -> None:
+    """Teach a field what another one holds.
+
+        L = mean (log(1 + sigma d) - log(1 + sigma' d))^2 + mean a' |c - c'|^2,    a' = 1 - exp(-sigma' d)
+
+    over places near surfaces, before them and anywhere, colours along the way from a camera that sees the place.
+    d is CELL of the coordinates, or CLEAR where the teacher holds nothing; where it is solid, it is enough to be solid
+    too. The optimizers go at the rates that they have, which fall.
+    points: that a step learns from
+    """
+    places = held_by.places(space, POOL * points, chance)
+    directions, rgb, seen = glances(held_by, places, chance)
+    length = CELL / space.stretch(places)
+    thickness = (held_by.density(places) * length).clamp_max(SOLID)
+    length = torch.where(thickness > NOTHING, length, length * (CLEAR / CELL))
+    lessons = [x.to(device) for x in (places, directions, rgb, seen, thickness, length)]
+    rates = [(group, group["lr"]) for optimizer in optimizers for group in optimizer.param_groups]
+    with torch.enable_grad():
+        for step in track(range(STEPS), "Teaching points", STEPS):
+            for group, rate in rates:
+                group["lr"] = rate * held(1.0, FINAL, step, step / STEPS, START)
+            chosen = torch.randint(len(places), (points,), generator=chance).to(device)
+            place, direction, colour, sees, wanted, d = (x[chosen] for x in lessons)
+            density, found = field(place, direction)
+            off = torch.log1p(density * d) - torch.log1p(wanted)
+            dense = torch.where(wanted < SOLID, off, off.clamp_max(0)).square().mean()
+            weight = sees * -torch.expm1(-wanted)
+            coloured = (weight[:, None] * (found - colour).square()).mean()
+            for optimizer in optimizers:
+                optimizer.zero_grad(set_to_none=True)
+            (dense + coloured).backward()
+            for optimizer in optimizers:
+                optimizer.step()
+    for optimizer in optimizers:
+        optimizer.zero_grad(set_to_none=True)
+
+
+@torch.no_grad()
+def glances(
+    held_by: Teacher, places: Float[Tensor, "point 3"], chance: torch.Generator
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+    """For each place the direction from a random camera, the colour from there, and whether (0 or 1) it is seen."""
+    directions, rgb, seen = torch.zeros_like(places), torch.full_like(places, 0.5), torch.zeros(len(places))
+    camera = torch.randint(len(held_by.depth_maps), (len(places),), generator=chance)
+    for i, depth_map in enumerate(track(held_by.depth_maps, "Asking the teacher", len(held_by.depth_maps))):
+        own = (camera == i).nonzero()[:, 0]
+        directions[own] = unit(places[own] - depth_map.camera.position)
+        own = own[depth_map.sees(places[own], edge=None)]
+        seen[own], rgb[own] = 1.0, held_by.glance(places[own], depth_map)
+    return directions, rgb, seen

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ..training.exchange import exchange
+from ..training.row_optimizers import exchange
 
-LARGEST = 1 << 20  # corners that are looked up at a time where a grid is made anew
+CORNERS_PER_CHUNK = 1 << 20  # corners that are looked up at a time where a grid is made anew
 
 Finer = tuple[float, float, float]
 Box = Float[Tensor, "2 3"]  # the lower corner and the upper
@@ -90,7 +90,7 @@ class VoxelGrid(nn.Module):
         """About so many voxels in a box within one's own, that blend as those before do. A new parameter takes the old
         one's place; what an optimizer remembered of that is forgotten."""
         shape = self._shape(box, voxels)
-        values = torch.cat([self(part) for part in corners(box, shape).split(LARGEST)])
+        values = torch.cat([self(part) for part in corners(box, shape).split(CORNERS_PER_CHUNK)])
         self.size.copy_(torch.tensor(shape))
         self.box.copy_(box)
         self.replace(values.contiguous(), optimizer)

@@ -1,1 +1,1 @@
-"""Where along rays to look: spaces, samplers, and what is known to be empty."""
+"""Sampling along rays: spaces, samplers, empty space."""

@@ -7,13 +7,13 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import max_pool1d, pad
 
 from ...camera.rays import Rays, Samples
 from ..fields.coordinate_field import Places
-from .frustums import blurred, frustums_between
 from .hierarchical_sampler import HierarchicalSampler
 from .sampling import inverse_transform, stratified
+from .spaces import Space
 
 
 class ConeSampler(HierarchicalSampler):
@@ -42,3 +42,42 @@ class ConeSampler(HierarchicalSampler):
     def places(self, shares: Float[Tensor, "ray edge"], rays: Rays) -> tuple[Samples, Places, Float[Tensor, " sample"]]:
         samples, means, variances = frustums_between(shares, rays, self.space)
         return samples, (means, variances), variances.amax(-1).sqrt()
+
+
+def frustum_moments(
+    start: Float[Tensor, "*n"], end: Float[Tensor, "*n"], radius: Float[Tensor, "*n"]
+) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+    """Mean distance, variance along the axis, variance across it of a uniformly filled conical frustum.
+
+    start, end: distances from the apex
+    radius:     of the cone at distance one
+    Barron 2021, eq. 7, in terms of the middle and the half-length: differences of high powers of start and end, as one
+    would first write it, lose all their digits where the frustum is thin.
+    """
+    middle, half = 0.5 * (start + end), 0.5 * (end - start)
+    both = (3 * middle.square() + half.square()).clamp_min(torch.finfo(middle.dtype).tiny)
+    mean = middle + 2 * middle * half.square() / both
+    along = half.square() / 3 - 4 / 15 * half**4 * (12 * middle.square() - half.square()) / both.square()
+    across = radius.square() * (middle.square() / 4 + 5 / 12 * half.square() - 4 / 15 * half**4 / both)
+    return mean, along.clamp_min(0), across.clamp_min(0)
+
+
+def frustums_between(
+    edges: Float[Tensor, "ray edge"], rays: Rays, space: Space
+) -> tuple[Samples, Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
+    """Frustums between edges, which are shares of the way along each ray, and their means and variances in a space."""
+    with torch.no_grad():  # where samples lie tells nothing of a pose
+        near, far = space.interval(rays)
+        t = space.distance(edges, rays, near, far)
+    samples = Samples.rows(t[:, :-1], t[:, -1])
+    ray = samples.ray_index
+    distance, along, across = frustum_moments(samples.t_start, samples.t_end, rays.radius[ray])
+    directions = rays.directions[ray]
+    points = rays.origins[ray] + distance[:, None] * directions
+    return samples, *space.warp_gaussians(points, directions, along, across)
+
+
+def blurred(weights: Float[Tensor, "ray bin"]) -> Float[Tensor, "ray bin"]:
+    """Weights blurred a little, so that the fine samples surround what the coarse ones found (Barron 2021, eq. 17)."""
+    larger = max_pool1d(pad(weights, (1, 1)), 2, 1)  # of each two neighbours
+    return 0.5 * (larger[:, 1:] + larger[:, :-1])

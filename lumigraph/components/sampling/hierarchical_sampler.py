@@ -14,7 +14,7 @@ from ...files.ranges import BatchSize, RaySamples
 from ...method import Pass, Sampler
 from ...volume import weights_of
 from ..fields.coordinate_field import CoordinateField, Places
-from .occupancy_mask import MaskNumbers, OccupancyMask
+from .occupancy import MaskNumbers, OccupancyMask
 from .sampling import inverse_transform, midpoints, stratified
 from .spaces import Space
 
@@ -33,6 +33,14 @@ class RayNumbers:
     def samples_per_step(self) -> int:
         """Number of samples of both passes."""
         return self.rays_per_step * (self.coarse_samples + self.fine_samples)
+
+
+# A Config's numbers for a plain CPU, and for tests.
+CPU_NETWORK: dict[str, Any] = {"rays": RayNumbers(32, 16, rays_per_step=1024), "mask": MaskNumbers(128)}
+CPU_NETWORK |= {"hidden_width": 128, "learning_rate": 4e-3, "final_learning_rate": 2e-4, "warmup": 0.02}
+CPU_NETWORK |= {"coarse_loss_weight": 0.0}
+TINY_NETWORK: dict[str, Any] = {"rays": RayNumbers(16, 12, rays_per_step=192), "mask": MaskNumbers(16)}
+TINY_NETWORK |= {"hidden_width": 32, "learning_rate": 5e-3, "final_learning_rate": 5e-4, "warmup": 0.1}
 
 
 class HierarchicalSampler(Sampler):

@@ -15,10 +15,9 @@ from ...datasets.scene import Frame, Scene
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
-from ...method.sampler import Density, codes_at
+from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import visible, weights_of
-from .carving import visual_hull
-from .occupancy import OccupancyGrid
+from .occupancy import OccupancyGrid, visual_hull
 from .spaces import Space
 
 FIRST_RAYS = 256  # rays of the first step, before the number of samples per ray is known
@@ -51,13 +50,6 @@ class StepNumbers:
 
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the diagonal, E.1; fewer are faster
     cone_angle: Share = 1 / 256  # growth of the step with distance, appendix E.1; higher: fewer samples far away
-
-
-# Numbers for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
-CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
-CPU_STEPS = StepNumbers(steps_per_diagonal=384, cone_angle=1 / 96)
-TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
-TINY_STEPS = StepNumbers(steps_per_diagonal=128)
 
 
 class Stage(NamedTuple):
@@ -139,11 +131,7 @@ class OccupancySampler(Sampler):
         )
 
     def sample(
-        self,
-        rays: Rays,
-        field: Field,
-        code: Float[Tensor, "ray code"] | None = None,
-        generator: torch.Generator | None = None,
+        self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
         jitter = None if generator is None else torch.rand(len(rays), generator=generator).to(rays.origins.device)
         code_of = code if field.deforms else None

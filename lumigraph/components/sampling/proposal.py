@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ... import kernels
 from ...camera.rays import Rays, Samples
 from ...volume import weights_of
-from ..fields.activations import LIMIT, truncated_exp
+from ..fields.layers import LIMIT, truncated_exp
 from ..fields.voxels import VoxelGrid
 from .sampling import FAINT, inverse_transform
 from .spaces import NDC, Contraction, Space, fits_kernels
@@ -26,7 +26,7 @@ SPARE = 0.01  # share of samples that lie anywhere, however little was found the
 
 @dataclass(frozen=True)
 class Proposed:
-    """What a grid proposes for a batch of rays.
+    """Proposals for a batch of rays.
 
     samples: intervals to ask a field about, as many on each ray
     edges:   where they begin and end, as shares of the way from near to far

@@ -1,14 +1,199 @@
-"""The choice of a sampler: an occupancy grid for bounded scenes, proposals for scenes without bounds."""
+"""Samplers: the choice between an occupancy grid and proposals by the space, and the proposal sampler.
+
+Proposals: samples along rays without an end, where a grid of density proposes (Barron 2022, section 3.1). Every ray
+gets the same number of samples. Terms of the loss keep the air clear: the distortion loss (Barron 2022, eq. 15),
+gradients scaled near cameras (Philip 2023), and at first depth from plane sweeps over neighbouring photographs.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
-from ...datasets.scene import Frame
-from ...method import Sampler
-from .occupancy_sampler import NGP_SCHEDULE, GridSchedule, OccupancyNumbers, OccupancySampler
-from .proposal_sampler import ProposalNumbers, ProposalSampler
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...camera.rays import Rays
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, between
+from ...method import Field, Pass, Sampler
+from ...method.sampler import Density, RayCodes, codes_at
+from ...volume import weights_of
+from ..clouds.dense_points import Points, compile_sweep, seen_points
+from ..fields.hash_field import CPU_TABLE, TINY_TABLE
+from ..training.regularizers import depth_loss, distortion_loss, scale_gradients
+from ..training.row_optimizers import LazyAdam
+from ..training.schedules import falling
+from .occupancy_sampler import NGP_SCHEDULE, GridSchedule, OccupancyNumbers, OccupancySampler, StepNumbers, rows_of
+from .proposal import Proposal, proposal_loss
 from .spaces import Space
+
+CELLS = 96  # of the proposal grid, along each axis
+LEARNING_RATES = 0.1, 0.01  # of the proposal grid, at first and in the end
+SWEEP_SHARE = 0.1  # share of a budget of seconds that plane sweeps may take
+MAX_POINTS = 1 << 16  # surface points that are kept
+DEPTH_RAYS = 128  # rays of a step with known depth
+DEPTH_MARGIN = 0.005  # of distances t / (1 + t): accuracy of a surface point
+DEPTH_UNTIL = 0.5  # share of the budget after which photographs alone supervise depth
+RAYS_PER_CHUNK = 4096  # rendered at once: the activations of their samples fit into a cache
+MIN_WEIGHT = 5e-4  # weight in a ray's colour up to which a rendering omits a sample
+
+
+@dataclass(frozen=True)
+class ProposalNumbers:
+    """A Config's numbers of the proposal sampler, for scenes without bounds."""
+
+    proposal_samples: Annotated[int, between(4, 1024)] = 64  # samples of a ray in the proposal grid; more cost time
+    samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray in the field; more are sharper, slower
+    distortion_weight: NonNegative = 0.01  # distortion loss's weight (Barron 2022, eq. 15); higher: fewer floaters
+    depth_weight: NonNegative = 0.03  # weight of plane-sweep depth at first, falling to 0; 0: off
+
+    def further_bytes(self, frame: Frame, learning: bool) -> int:
+        """Bytes of the proposal grid, with its gradient and moments while it learns."""
+        return 4 * CELLS**3 * (4 if learning else 1) * frame.is_open
+
+
+class ProposalSampler(Sampler):
+    """Samples where a proposal grid finds density.
+
+    surface, surface_from: points on surfaces, and the camera position that each was found from
+    progress:              share of the budget spent
+    """
+
+    is_open: ClassVar[bool] = True
+    grows: ClassVar[tuple[str, ...]] = ("surface", "surface_from")
+    rays_per_chunk = RAYS_PER_CHUNK
+    surface: Tensor
+    surface_from: Tensor
+
+    def __init__(self, space: Space, numbers: ProposalNumbers, samples_per_step: int, max_rays: int | None = None):
+        super().__init__()
+        self.numbers, self.progress = numbers, 1.0
+        rays = max(1, math.ceil(samples_per_step / numbers.samples_per_ray))
+        self.batch_size = self.expected_rays = min(rays, max_rays or rays)
+        self.proposal = Proposal(space, CELLS, numbers.proposal_samples, numbers.samples_per_ray)
+        for name in self.grows:
+            self.register_buffer(name, torch.zeros(0, 3))
+
+    def sample(
+        self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
+    ) -> list[Pass]:
+        if generator is None and not torch.is_grad_enabled():
+            return [self._visible(rays, field, code)]
+        jitter = None
+        if generator is not None:
+            jitter = torch.rand(len(rays), 2, generator=generator).to(rays.origins.device)
+        proposals = self.proposal.sample(rays, jitter)
+        samples = proposals.samples
+        points, directions = samples.along(rays)
+        own = codes_at(samples.ray_index, code) if code is not None and field.deforms else None
+        rgb = None
+        if field.joint:
+            density, rgb = field(points, directions, own)
+            features: Any = ()
+        else:
+            density, features = field.geometry(points, own)
+        count, scale = len(samples), None
+        if generator is not None:
+            (density,) = scale_gradients(samples.t, density)
+            scale = partial(_scaled, samples.t)
+        return [Pass("samples", samples, density, features, directions, None, rgb, count, scale, proposals)]
+
+    def _visible(self, rays: Rays, field: Field, code: Float[Tensor, "ray code"] | None) -> Pass:
+        """A pass for pictures: samples of at most MIN_WEIGHT are left out, so those behind them get that weight."""
+        samples = self.proposal.places(rays)
+        points, directions = samples.along(rays)
+        own = codes_at(samples.ray_index, code) if code is not None and field.deforms else None
+        density, features = field.geometry(points, own)
+        kept = weights_of(samples, density) > MIN_WEIGHT
+        rows = kept.nonzero()[:, 0]
+        features, directions = rows_of(features, rows), directions.index_select(0, rows)
+        seen, count = samples.keep(kept), len(samples)
+        return Pass("samples", seen, density.index_select(0, rows), features, directions, evaluated=count)
+
+    def terms(self, density: Density, last: Pass, generator: torch.Generator) -> dict[str, Tensor]:
+        """The proposal loss, the distortion loss, and the depth loss of some more rays whose depth is known."""
+        weights = weights_of(last.samples, last.density)
+        terms = {"proposal": proposal_loss(last.proposals, weights)}
+        if self.numbers.distortion_weight:
+            terms["distortion"] = self.numbers.distortion_weight * distortion_loss(last.samples, weights)
+        weight = self.numbers.depth_weight * (1 - self.progress / DEPTH_UNTIL)
+        if weight > 0 and len(self.surface):
+            error, missed = self._depth_error(density, generator)
+            terms["depth"] = weight * error
+            terms["proposal"] = terms["proposal"] + missed * (DEPTH_RAYS / len(last.proposals.edges))
+        return terms
+
+    def _depth_error(self, density_at: Density, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """`elsewhere` of some rays with known depth, and the proposal loss of these."""
+        chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
+        origins, ways = self.surface_from[chosen], self.surface[chosen] - self.surface_from[chosen]
+        distance = ways.norm(dim=-1)
+        rays = Rays(origins, ways / distance[:, None], torch.zeros_like(distance))
+        proposals = self.proposal.sample(rays, torch.rand(DEPTH_RAYS, 2, generator=generator).to(distance))
+        samples = proposals.samples
+        (density,) = scale_gradients(samples.t, density_at(samples.along(rays)[0]))
+        weights = weights_of(samples, density)
+        return depth_loss(samples, weights, distance, DEPTH_MARGIN), proposal_loss(proposals, weights)
+
+    # Training
+
+    def compile_begin(self) -> None:
+        compile_sweep()
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        """Find points on surfaces by plane sweeps, unless poses are learnt."""
+        if not self.numbers.depth_weight or method.moves_cameras:
+            return
+        found = some(seen_points(data, SWEEP_SHARE * seconds), method.random(1))
+        self.surface, self.surface_from = (x.to(self.surface) for x in (found.positions, found.origins))
+        sparse = self.surface[:0] if data.points is None else data.points.to(self.surface)
+        if len(points := torch.cat([self.surface, sparse])):
+            self.proposal.begin(points)
+
+    def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
+        known = teacher.surface
+        points, origins = (x[:: max(1, len(x) // MAX_POINTS)] for x in (known.points, known.origins))
+        self.surface, self.surface_from = points.to(self.surface), origins.to(self.surface)
+        if len(self.surface):
+            self.proposal.begin(self.surface)
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        self.progress = progress
+        self.proposal.anneal(1.0 if len(self.surface) else progress)
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        return [LazyAdam([{"params": [self.proposal.grid.values], "name": "proposal"}], LEARNING_RATES[0])]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        return {"proposal": falling(*LEARNING_RATES, progress)}
+
+    def storage(self) -> dict[str, Stored]:
+        """Rendering needs the grid of proposals alone."""
+        return {"proposal.grid.values": Stored("half"), "surface": Stored("nothing"), "surface_from": Stored("nothing")}
+
+
+def _scaled(t: Float[Tensor, " sample"], values: Float[Tensor, "sample _"]) -> Float[Tensor, "sample _"]:
+    return scale_gradients(t, values)[0]
+
+
+def some(points: Points, generator: torch.Generator) -> Points:
+    """At most MAX_POINTS of points, drawn at random."""
+    if len(points.positions) <= MAX_POINTS:
+        return points
+    chosen = torch.randperm(len(points.positions), generator=generator)[:MAX_POINTS]
+    return Points(*(x[chosen] for x in (points.positions, points.colours, points.sizes, points.origins)))
+
+
+# Numbers of a Config for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
+CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
+CPU_HASH: dict[str, Any] = {"table": CPU_TABLE, "occupancy": CPU_OCCUPANCY, "steps": StepNumbers(384, 1 / 96)}
+TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
+TINY_HASH: dict[str, Any] = {"table": TINY_TABLE, "occupancy": TINY_OCCUPANCY, "steps": StepNumbers(128)}
 
 
 def sampler_for(
@@ -31,3 +216,15 @@ def sampler_for(
     if space.is_open:
         return ProposalSampler(space, proposals, open_samples or occupancy.samples_per_step, max_rays)
     return OccupancySampler(frame, space, occupancy, schedule, max_rays=max_rays, **bounded)
+
+
+def sampling_bytes(frame: Frame, config: Any, learning: bool) -> int:
+    """`Method.further_bytes` of a coordinate network, or of a hash table with its grids, by the names in its Config:
+    activations that a step keeps for its gradients. With a mask the number of samples is not known beforehand."""
+    if getattr(config, "field", "hash" if hasattr(config, "table") else "network") == "network":
+        masked = hasattr(config, "mask") and config.mask.occupancy_resolution > 0
+        kept = config.network.activation_bytes(config.rays.samples_per_step, config.hidden_width)
+        return 0 if masked else kept * learning
+    width = getattr(config, "table_width", config.hidden_width)
+    kept = config.table.activation_bytes(config.occupancy.samples_per_step, width)
+    return kept * learning + sum(x.further_bytes(frame, learning) for x in (config.occupancy, config.proposals))

@@ -1,4 +1,4 @@
-"""Where along a ray to sample: evenly at first, then where the first samples found something."""
+"""Places of samples along a ray: stratified, and by inverse transform of the weights of earlier ones."""
 
 from __future__ import annotations
 
@@ -24,9 +24,7 @@ def stratified(
 
 
 def inverse_transform(
-    edges: Float[Tensor, "ray edge"],
-    weights: Float[Tensor, "ray bin"],
-    shares: Float[Tensor, "ray count"],
+    edges: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], shares: Float[Tensor, "ray count"]
 ) -> Float[Tensor, "ray count"]:
     """Numbers spread like a piecewise constant density: its inverse cumulative distribution (Mildenhall 2020, eq. 5).
 

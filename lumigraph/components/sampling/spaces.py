@@ -49,7 +49,7 @@ class Space(ABC):
 
     @abstractmethod
     def interval(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Where each ray's samples begin and end, in scene units: finite, and equal for rays that see nothing."""
+        """Near and far end of each ray's samples, in scene units: finite, and equal for rays that see nothing."""
 
     @abstractmethod
     def distance(
@@ -63,8 +63,7 @@ class Space(ABC):
 
     @abstractmethod
     def unwarp(self, coordinates: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """The points that have these coordinates: `warp` undone. Coordinates of [-1, 1]^3 that no point has give the
-        farthest one in about that direction."""
+        """Points with these coordinates; the farthest in about that direction for coordinates that no point has."""
 
     @abstractmethod
     def jacobian(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
@@ -272,5 +271,5 @@ def fits_kernels(points: Tensor) -> bool:
 
 
 def even_in_inverse(share: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """How much of the way from first to last lies behind x, once 1 / x has gone a share of its own way."""
+    """Share of the way from first to last at x, where 1 / x has gone a share of its own way."""
     return share * first / (share * first + (1 - share) * last)

@@ -1,1 +1,1 @@
-"""How methods learn: optimizers, schedules, losses, corrections of what photographs say."""
+"""Training: optimizers, schedules, losses, refinement of poses, exposures of photographs."""

@@ -57,7 +57,7 @@ def agreeing(
     m: Int[Tensor, "match 2"],
     gate: float,
 ) -> Tensor:
-    """Which matches of two views lie near their epipolar lines, as poses have these."""
+    """Mask of the matches of two views that lie near their epipolar lines."""
     i, j = pair
     a = seen[i].bearings[m[:, 0]].double() @ pose[i, :, :3].T
     b = seen[j].bearings[m[:, 1]].double() @ pose[j, :, :3].T
@@ -95,9 +95,8 @@ def step(
     two = torch.stack([sideways, torch.linalg.cross(bearing, sideways)], 1)  # T
     left = (two @ direction[:, :, None])[..., 0]
     ahead = (direction * bearing).sum(-1) > 0.5
-    weight = (ahead / (1 + left.square().sum(-1) / (2 * scale) ** 2) / scale)[
-        :, None, None
-    ]  # its root, as rows have it
+    weight = ahead / (1 + left.square().sum(-1) / (2 * scale) ** 2) / scale  # its root, as rows have it
+    weight = weight[:, None, None]
 
     eye = torch.eye(3).double()
     of_point = weight * (two @ (eye - direction[:, :, None] * direction[:, None]) / distance @ turns.mT)

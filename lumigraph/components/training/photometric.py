@@ -1,15 +1,203 @@
-"""Colours against photographs: what lies behind rays while a method learns, and by how much what it sees is wrong."""
+"""Colours against photographs: backdrops, residuals, the spread of light, a gain for each photograph."""
 
 from __future__ import annotations
 
+import copy
+import warnings
+from typing import Any, Literal
+
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 from torch.nn.functional import huber_loss
 
+from ...camera import Camera
 from ...camera.rays import Rendering
-from ...datasets.scene import Batch
-from .exposure import Exposure
+from ...datasets.scene import Batch, Photograph, Scene
+from ...errors import LumigraphWarning
+from ...geometry import evenly
+from ...method import Part
+from ...method.controls import Control, Value
+from ..clouds.flat_view import FlatView, flat_view
+from ..fields.appearance import AVERAGE, drawn
+
+MAX_PHOTOGRAPHS = 32  # photographs, each beside its neighbour
+MAX_SIDE = 200  # pixels along their longer side
+POINTS = 1 << 14  # places at most
+MIN_SHARED = 30  # places that two photographs must share to be compared
+MIN_COLOUR, MAX_COLOUR = 0.05, 0.95  # colours between which a ratio says something
+ENCODED = 2.2  # stops of light to one of sRGB-encoded colours
+
+
+@torch.no_grad()
+def spread_of_light(scene: Scene) -> float | None:
+    """How much brighter or darker, redder or bluer neighbouring photographs show the same places, in stops: the root
+    mean square over photographs and channels of the median log2 ratio. None where the scene has no points to tell by.
+
+    Neighbours see about the same side of things and the same things before others, so that what is left is the light
+    and the camera's reading of it.
+    """
+    if scene.points is None or len(train := scene.splits["train"]) < 2:
+        return None
+    points = scene.points[evenly(range(len(scene.points)), POINTS)]
+    beside = neighbours(scene.cameras[train])
+    chosen = evenly(range(len(train)), MAX_PHOTOGRAPHS)
+    views = {i: flat_view(scene.photograph(int(train[i])), MAX_SIDE) for i in {*chosen, *beside[chosen].tolist()}}
+    ratios = [ratio for i in chosen if (ratio := brighter(points, views[i], views[int(beside[i])])) is not None]
+    return float(torch.stack(ratios).square().mean().sqrt()) if ratios else None
+
+
+def spread_of_exposure(scene: Scene) -> float:
+    """The same, and where no points tell, what photographs say of their exposures (`Scene.about`): their deviation, in
+    stops of encoded colours. 0 where nothing is known. Those developed from raw files are as bright as `brightness`
+    made them."""
+    measured = spread_of_light(scene)
+    if measured is not None:
+        return measured
+    exposure = scene.about.get("exposure")
+    if exposure is None:
+        return 0.0
+    stops = (exposure * scene.about.get("brightness", torch.tensor(1.0))).log2()[scene.splits["train"]]
+    known = stops[stops.isfinite()]
+    return float(known.std()) / ENCODED if len(known) > 1 else 0.0
+
+
+def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
+    """For each camera the one that stands nearest and looks most alike: their distance, over how far all of them are
+    apart, plus one minus the cosine between them."""
+    position, forward = cameras.position, cameras.forward
+    apart = torch.cdist(position, position)
+    unlike = apart / apart.amax().clamp_min(1e-9) + 1 - forward @ forward.T
+    return unlike.fill_diagonal_(torch.inf).argmin(-1)
+
+
+def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, " 3"] | None:
+    """Stops by which one picture shows points brighter than another, for each channel; None if they share too few."""
+    colours, known = [], torch.ones(len(points), dtype=torch.bool)
+    for view in (one, other):
+        seen, row, column, _ = view.sees(points)
+        rgb = view.rgb[row, column]
+        colours.append(rgb)
+        known &= seen & (view.trust[row, column] > 0.5) & (rgb > MIN_COLOUR).all(-1) & (rgb < MAX_COLOUR).all(-1)
+    if int(known.sum()) < MIN_SHARED:
+        return None
+    return (colours[0][known] / colours[1][known]).log2().median(0).values
+
+
+Setting = Literal["auto", "yes", "no"]
+MIN_SPREAD = 0.15  # stops between neighbouring photographs, beyond which they are of different exposure
+MAX_STOPS = 4.0  # that exposure can be turned up or down
+RATE_SCALE = 0.05  # of the method's learning rate
+GAIN_PIXELS = 4096  # pixels of a photograph from which its gain is found
+SCENE = "scene"  # beside photographs and their average: a gain of 1
+
+
+class Exposure(Part):
+    """A gain per photograph and colour channel, 1 at first; photographs that were not trained on keep it.
+
+    A gain multiplies sRGB-encoded colours, as a photograph has them: photograph = gain x scene. So a stop doubles
+    them in this space, and not linear light.
+
+    differ: whether photographs are of different exposure; nothing is learnt where they are not
+    found:  gain of a photograph that was given as evidence
+    rate:   name of the learning rate that the gains follow
+    """
+
+    differ: Tensor
+    found: Tensor | None = None
+
+    def __init__(self, image_count: int, setting: Setting = "yes", rate: str = ""):
+        super().__init__()
+        self.setting, self.rate = setting, rate
+        self.log_gain = nn.Parameter(torch.zeros(image_count, 3))
+        self.register_buffer("differ", torch.tensor(setting == "yes"))
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        """Find out whether photographs differ, with the setting auto."""
+        if self.setting != "auto":
+            return
+        stops = spread_of_exposure(data)
+        self.differ.fill_(stops > MIN_SPREAD)
+        if bool(self.differ):
+            warnings.warn(
+                f"Neighbouring photographs differ by {stops:.1f} stops, so each has an exposure of its own; "
+                "`--exposure-correction no` takes all for the same",
+                LumigraphWarning,
+                stacklevel=3,
+            )
+
+    def forward(self, rgb: Float[Tensor, "ray 3"], image_index: Int[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
+        """Colours of the scene as photographs have them; unchanged where photographs do not differ."""
+        return rgb * self.log_gain[image_index].exp() if bool(self.differ) else rgb
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        group = {"params": [self.log_gain], "scale": RATE_SCALE} | ({"name": self.rate} if self.rate else {})
+        return [torch.optim.Adam([group], betas=(0.9, 0.99), eps=1e-15)]
+
+    # Settings
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """Brightness in stops, and the photograph whose exposure they count from. By default they count from the scene
+        as it was learnt, which is arbitrary: a gain that all photographs share can be the scene's own."""
+        if not bool(self.differ):
+            return ()
+        photographs = tuple(str(i) for i in range(len(self.log_gain)))
+        stops = (-MAX_STOPS, MAX_STOPS)
+        about = "The photograph, by number or name, whose brightness and tint are shown; or the average of all."
+        return (
+            Control("exposure", 0.0, stops, unit="stops", about="Each stop doubles the scene's colours."),
+            Control("exposed_as", SCENE, choices=(SCENE, AVERAGE, *photographs), about=about, of_photographs=True),
+        )
+
+    @property
+    def accepts(self) -> tuple[type, ...]:
+        """Photographs, where their exposures were learnt to differ."""
+        return (Photograph,) if bool(self.differ) else ()
+
+    def recoloured(self, method: Any, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Colours with the gain of the settings, or of a photograph given as evidence."""
+        if self.found is not None and "exposed_as" not in method.settings:
+            rgb = rgb * self.found
+        return rgb * self.gain(method.settings) if method.settings and bool(self.differ) else rgb
+
+    def gain(self, told: dict[str, Value]) -> Float[Tensor, " 3"]:
+        """The factor on colours that settings ask for: 1 without any."""
+        whose = told.get("exposed_as", SCENE)
+        if whose == SCENE:
+            log_gain = torch.zeros_like(self.log_gain[0])
+        elif whose == AVERAGE:
+            learnt = self.log_gain[(self.log_gain != 0).any(-1)]
+            log_gain = learnt.sum(0) / max(len(learnt), 1)
+        else:
+            log_gain = self.log_gain[int(whose)]
+        return log_gain.exp() * 2 ** float(told.get("exposure", 0.0))
+
+    @torch.no_grad()
+    def adapted(self, method: Any, evidence: Photograph) -> Exposure:
+        """The part with the gain of a photograph, found from its trusted pixels."""
+        batch = drawn(evidence, GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
+        method.settings.pop("exposed_as", None)
+        adapted = copy.copy(self)
+        if not len(batch):
+            return adapted
+        plain = copy.copy(method)
+        plain.settings = {}
+        parts = [
+            plain.render_rays(batch.rays[part], plain.background).rgb
+            for part in torch.arange(len(batch), device=self.log_gain.device).split(plain.rays_per_chunk)
+        ]
+        gain = gain_between(torch.cat(parts), batch.before(plain.background))
+        adapted.found = gain if self.found is None else gain * self.found
+        return adapted
+
+
+@torch.no_grad()
+def gain_between(rgb: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"]) -> Float[Tensor, " 3"]:
+    """Gain that turns colours into a photograph's: the median ratio of each channel, over pixels that are neither too
+    dark nor too bright; 1 where there are none."""
+    inside = ((rgb > MIN_COLOUR) & (target > MIN_COLOUR) & (target < MAX_COLOUR)).all(-1)
+    return (target[inside] / rgb[inside]).median(0).values if inside.any() else torch.ones_like(target[:1].sum(0))
 
 
 def backdrop(
@@ -27,12 +215,9 @@ def backdrop(
 
 
 def residuals(
-    rendering: Rendering,
-    batch: Batch,
-    background: Float[Tensor, "#ray 3"],
-    exposure: Exposure | None = None,
+    rendering: Rendering, batch: Batch, background: Float[Tensor, "#ray 3"], exposure: Exposure | None = None
 ) -> tuple[Float[Tensor, "row 3"], float]:
-    """What a rendering before a background has too much of each colour, and the mean square of that.
+    """Differences of a rendering before a background from photographs, and their mean square.
 
     Where photographs have alpha, as many rows again say the same before the opposite colours, 1 - background, where
     only what opacity lacks looks different; they are not in the mean.

@@ -16,9 +16,8 @@ from ...files.ranges import LearningRate
 from ...geometry import rotated
 from ...method import Part
 from .bundle_adjustment import adjusted, pixel_angle, rotation_vector
-from .coarse_to_fine import ENDS, band_weights
-from .pose_adam import PoseAdam
-from .schedules import falling
+from .row_optimizers import RowOptimizer
+from .schedules import ENDS, band_weights, falling
 from .shared_points import shared_points
 
 PLACES = 16  # along each side of a picture, and as many depths: where its motion is measured
@@ -86,8 +85,7 @@ class PoseRefinement(Part):
 
     @torch.no_grad()
     def find(self, scene: Scene, matching: bool = True) -> None:
-        """Begin at the poses as given, or, with matching, at those that points say which photographs share, where these
-        are enough; see `adjusted`."""
+        """Begin at the given poses or, with matching and enough shared points, at adjusted ones; see `adjusted`."""
         self.choose_axes(scene.cameras, scene.frame)
         if not matching:
             return
@@ -128,19 +126,15 @@ class PoseRefinement(Part):
         return replace(cameras, pose=torch.stack([*axes, cameras.position + shift], -1))
 
     def weights(self, bands: int) -> Float[Tensor, " band"] | None:
-        """Of an encoding's bands at this share of the budget; None once all count fully."""
+        """Weights of an encoding's bands at this share of the budget; None once all count fully."""
         progress = float(self.progress)
         return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        return [self.optimizer()]
+        return [PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)]
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         return {"poses": self.rate(progress)}
-
-    def optimizer(self) -> PoseAdam:
-        """Fresh; its group is called "poses", and its rate is that of `rate`."""
-        return PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the budget: it grows, then falls exponentially."""
@@ -185,3 +179,29 @@ def seen_places(camera: Camera, frame: Frame) -> tuple[Rays, Float[Tensor, "ray 
     first, last = enter[inside].clamp_min(frame.near), leave[inside]
     kept = Rays(rays.origins[inside], rays.directions[inside], rays.radius[inside])
     return kept, torch.lerp(first[:, None], last[:, None], share)
+
+
+class PoseAdam(RowOptimizer):
+    """Adam (Kingma and Ba 2015) with one second moment for each row, that of its gradient's length.
+
+    So a row moves as its gradient points, as far as `lr` at most. Adam's own second moments, one for each number, would
+    move directions that little is known of as fast as those that the photographs tell clearly. A row whose gradient is
+    all zero was not looked at: it stays, and its moments are those of the steps that did.
+    """
+
+    def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.95)):
+        super().__init__(params, {"lr": lr, "betas": betas})
+
+    def moments(self, p):
+        return {"mean": torch.zeros_like(p), "square": torch.zeros_like(p[:, 0]), "steps": torch.zeros_like(p[:, 0])}
+
+    def update(self, p, grad, state, group):
+        b1, b2 = group["betas"]
+        seen = grad.ne(0).any(-1).nonzero()[:, 0]
+        grad = grad[seen]
+        steps = state["steps"][seen] + 1
+        mean = torch.lerp(grad, state["mean"][seen], b1)
+        square = torch.lerp(grad.square().sum(-1), state["square"][seen], b2)
+        state["steps"][seen], state["mean"][seen], state["square"][seen] = steps, mean, square
+        length = (square / (1 - b2**steps)).sqrt().clamp_min(1e-30)
+        p[seen] -= group["lr"] * mean / ((1 - b1**steps) * length)[:, None]

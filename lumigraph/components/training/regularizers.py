@@ -1,12 +1,17 @@
-"""Against fog: what keeps rays from filling the air before a camera with what other photographs do not see."""
+"""Regularizers: against fog before cameras, and for patches of pictures that nobody took."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...camera.rays import Samples
+from ...camera import Camera
+from ...camera.rays import Rays, Samples
+from ...geometry import look_at, nearest_to_lines
 from ...kernels import distortion
 
 
@@ -16,16 +21,13 @@ def normalized_distance(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def distortion_loss(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
-    """How far apart along its ray the weight of what a ray sees lies, mean of all rays (Barron 2022, eq. 15)."""
+    """Spread of weights along each ray, mean of all rays (Barron 2022, eq. 15)."""
     start, end = normalized_distance(samples.t_start), normalized_distance(samples.t_end)
     return distortion(weights, 0.5 * (start + end), end - start, samples.ray_starts).mean()
 
 
 def depth_loss(
-    samples: Samples,
-    weights: Float[Tensor, " sample"],
-    distance: Float[Tensor, " ray"],
-    margin: float,
+    samples: Samples, weights: Float[Tensor, " sample"], distance: Float[Tensor, " ray"], margin: float
 ) -> Float[Tensor, ""]:
     """The share of rays that does not end where something is known to be, mean of all rays: light that is stopped too
     early or too late, or not at all (as Deng 2022 supervises depth; linear, for what is known may be wrong).
@@ -68,3 +70,54 @@ def scale_gradients(t: Float[Tensor, " sample"], *values: Float[Tensor, sample *
     without this, learning would be fastest where least is known.
     """
     return _Scaled.apply(t.square().clamp(max=1), *values)
+
+
+def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
+    """Sum of log(1 + 2 sigma^2) along a ray, mean of all (Hedman 2021, section 4.2; Fridovich-Keil 2022, eq. 4)."""
+    return torch.log1p(2 * density.square()).sum() / max(rays, 1)
+
+
+ASTRAY = 0.125  # deviation of the point that an unseen camera looks at, of the distance to it (section 3.3)
+
+
+def unseen_cameras(cameras: Camera, count: int, generator: torch.Generator) -> Camera:
+    """Cameras that stand anywhere in the box around the given ones, upright as these are on average, and look at about
+    the point that all of these look at, through the lens of one of them."""
+    position, forward = cameras.position.cpu(), cameras.forward.cpu()
+    low, high = position.amin(0), position.amax(0)
+    focus = nearest_to_lines(position.double(), forward.double(), (position + forward).mean(0).double()).float()
+    away = (focus - position).norm(dim=-1).mean()
+    stand = low + torch.rand(count, 3, generator=generator) * (high - low)
+    aim = focus + ASTRAY * away * torch.randn(count, 3, generator=generator)
+    lent = cameras[torch.randint(len(cameras), (count,), generator=generator).to(cameras.pose.device)]
+    pose = look_at(stand, aim - stand, -cameras.pose[:, :, 1].cpu().mean(0))
+    return replace(lent, pose=pose.to(lent.pose), image_index=None)
+
+
+def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch.Generator) -> Rays:
+    """Rays of one square patch of each camera, row by row: side * side of them.
+
+    strides: pixels between two rays of a patch; each patch has one of them, no larger than the picture allows
+    """
+    count, sizes = len(cameras), cameras.size.cpu()
+    chosen = torch.tensor(strides)[torch.randint(len(strides), (count,), generator=generator)]
+    stride = torch.minimum(chosen, (sizes.amin(-1) // side).clamp_min(1))[:, None]
+    corner = torch.rand(count, 2, generator=generator) * (sizes - stride * (side - 1) - 1).clamp_min(0)
+    rows, columns = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
+    steps = torch.stack([columns, rows], -1).view(-1, 2)
+    pixels = corner.floor()[:, None] + 0.5 + steps * stride[:, None]
+    index = torch.arange(count, device=cameras.pose.device).repeat_interleave(side * side)
+    rays = cameras.rays(pixels.view(-1, 2).to(cameras.pose), index)
+    wider = stride.expand(-1, side * side).flatten().to(rays.radius)
+    return replace(rays, radius=rays.radius * wider)
+
+
+def roughness(
+    depth: Float[Tensor, "patch row column"], opacity: Float[Tensor, "patch row column"]
+) -> Float[Tensor, ""]:
+    """Squared difference of each two neighbouring depths of a patch, where both are opaque, mean of all pairs
+    (Niemeyer 2022, eq. 6, which has no opacity: there everything is opaque)."""
+    counts = opacity.detach()
+    across = (depth[:, :, 1:] - depth[:, :, :-1]).square() * counts[:, :, 1:] * counts[:, :, :-1]
+    down = (depth[:, 1:] - depth[:, :-1]).square() * counts[:, 1:] * counts[:, :-1]
+    return 0.5 * (across.mean() + down.mean())

@@ -1,6 +1,16 @@
-"""Learning rates as functions of the share of the budget that is spent."""
+"""Schedules over the budget: learning rates, and bands of an encoding that join from coarse to fine."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...method import Part
 
 FIRST_SHARE = 0.01  # of the learning rate, at the very beginning of a warm-up
 RISE = 20  # steps in which a rate that is held rises
@@ -23,3 +33,61 @@ def held(first: float, last: float, step: int, progress: float, start: float) ->
     """
     fall = max(0.0, progress - start) / (1 - start)
     return falling(first, last, fall) * min(1.0, (step + 1) / RISE)
+
+
+def exponential_decay(method: Any, step: int, progress: float) -> float:
+    """`Method.learning_rate` that is `falling`, by the numbers of the Config."""
+    c = method.config
+    return falling(c.learning_rate, c.final_learning_rate, progress, getattr(c, "warmup", 0.0))
+
+
+def held_decay(method: Any, step: int, progress: float) -> float:
+    """`Method.learning_rate` that is `held`, by the numbers of the Config."""
+    c = method.config
+    return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+
+
+FIRST = 1 / 4  # share of the bands that are there from the beginning
+BEGINS, ENDS = 0.05, 0.4  # shares of the budget between which the others join
+
+
+def band_weights(count: int, progress: float, begins: float = BEGINS, ends: float = ENDS) -> Float[Tensor, " band"]:
+    """Weights in [0, 1] of an encoding's bands, the coarsest first (Lin 2021, BARF, eq. 14).
+
+        w_k = 0 for alpha < k,  (1 - cos((alpha - k) pi)) / 2 for alpha - k in [0, 1),  1 beyond
+
+    count:    of bands: octaves of waves, levels of a hash table
+    progress: share of the budget that is spent; alpha grows evenly with it, from FIRST of the bands to all of them,
+              between the shares `begins` and `ends`
+    """
+    grown = min(max((progress - begins) / (ends - begins), 0.0), 1.0)
+    first = max(1.0, FIRST * count)
+    alpha = first + grown * (count - first)
+    return (1 - torch.cos(math.pi * (alpha - torch.arange(count)).clamp(0, 1))) / 2
+
+
+class BandSchedule(Part):
+    """Bands of an encoding that join the coarsest over a share of the budget (Yang 2023, eq. 2).
+
+    joined: how far they have joined; it is saved, because a run that stopped early renders as it learnt
+    """
+
+    joined: Tensor
+
+    def __init__(self, share: float):
+        super().__init__()
+        self.share = share
+        self.register_buffer("joined", torch.zeros(()))
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        self.joined.fill_(max(float(self.joined), min(progress / self.share, 1.0)))
+
+    def weights(self, bands: int) -> Float[Tensor, " band"] | None:
+        """Weights of so many bands; None once all count fully."""
+        joined = float(self.joined)
+        return band_weights(bands, joined, 0.0, 1.0).to(self.joined.device) if joined < 1 else None
+
+
+def joining_of(*schedules: Any) -> Callable[[int], Float[Tensor, " band"] | None] | None:
+    """Weights of bands by the first part there is that has a schedule of them; None without one."""
+    return next((part.weights for part in schedules if part), None)

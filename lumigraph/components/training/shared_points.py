@@ -1,5 +1,4 @@
-"""Points that photographs share: scale-invariant features, compared, and kept where one motion between two views
-explains them."""
+"""Points that photographs share: SIFT features, matched, and kept where one motion of two views explains them."""
 
 from __future__ import annotations
 
@@ -23,19 +22,19 @@ from ...datasets.scene import Photograph, Scene
 from ...system.library import pycolmap
 from ...system.progress import track
 
-LONGEST = 800  # pixels of the longer side, to which larger photographs are reduced
-SHORTEST = 400  # to which smaller ones are enlarged: features have a size that pictures of 100 pixels lack
-MOST = 4.0  # times that a small one is enlarged
+MAX_SIDE = 800  # pixels of the longer side, to which larger photographs are reduced
+MIN_SIDE = 400  # to which smaller ones are enlarged: features have a size that pictures of 100 pixels lack
+MAX_ENLARGEMENT = 4.0  # times that a small one is enlarged
 FEATURES = 2000  # of a photograph, at most
 CONTRAST = 0.003  # of a feature's peak, at least
 RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
-FARTHEST = 0.7  # angle between descriptors that may be the same, radians
+MAX_ANGLE = 0.7  # angle between descriptors that may be the same, radians
 NEIGHBOURS = 16  # photographs that each one is compared with: those that look most alike by their poses
 SIDEWAYS = math.radians(75)  # between two views, beyond which they are not compared
 ERROR = 4.0  # of FOCAL, off the epipolar line that the two views' own best motion may leave
 FOCAL = 1000.0  # in which pixels of all lenses are compared
 FLAT = 0.1  # cosine off the axis, beyond which a picture has no flat plane
-FEWEST = 8  # matches of two views, fewer of which are chance
+MIN_MATCHES = 8  # matches of two views, fewer of which are chance
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def features(photograph: Photograph) -> Seen:
     camera, mask = photograph.camera, photograph.mask
     grey = (photograph.before(torch.full((3,), 0.5)) @ torch.tensor([0.299, 0.587, 0.114]))[None, None]
     longest = max(grey.shape[2:])
-    scale = min(1.0, LONGEST / longest) if longest > SHORTEST else min(MOST, SHORTEST / longest)
+    scale = min(1.0, MAX_SIDE / longest) if longest > MIN_SIDE else min(MAX_ENLARGEMENT, MIN_SIDE / longest)
     grey = interpolate(grey, scale_factor=scale, mode="bicubic", antialias=scale < 1)[0, 0].clamp(0, 1)
     places, found = finder().extract((255 * grey + 0.5).byte().contiguous().numpy())
     shrink = torch.tensor([camera.size[0, 0] / grey.shape[1], camera.size[0, 1] / grey.shape[0]])
@@ -106,9 +105,9 @@ def matched(a: Seen, b: Seen) -> Int[Tensor, "match 2"]:
     best, there = alike.topk(2, -1)
     angles = best.clamp(max=1).acos()
     mine = torch.arange(len(alike))
-    good = (angles[:, 0] < FARTHEST) & (angles[:, 0] < RATIO * angles[:, 1]) & (alike.argmax(0)[there[:, 0]] == mine)
+    good = (angles[:, 0] < MAX_ANGLE) & (angles[:, 0] < RATIO * angles[:, 1]) & (alike.argmax(0)[there[:, 0]] == mine)
     pairs = torch.stack([mine, there[:, 0]], -1)[good]
-    return one_motion(a, b, pairs) if len(pairs) >= FEWEST else none
+    return one_motion(a, b, pairs) if len(pairs) >= MIN_MATCHES else none
 
 
 def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "kept 2"]:
@@ -120,9 +119,11 @@ def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "
     options = pycolmap.RANSACOptions(max_error=ERROR, random_seed=0)
     flat = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, 1, 1)
     flat.params = [FOCAL, 0.0, 0.0]
-    found = pycolmap.estimate_essential_matrix(first, second, flat, flat, options) if len(pairs) >= FEWEST else None
+    found = (
+        pycolmap.estimate_essential_matrix(first, second, flat, flat, options) if len(pairs) >= MIN_MATCHES else None
+    )
     kept = pairs[torch.from_numpy(np.array(found["inlier_mask"]))] if found else pairs[:0]
-    return kept if len(kept) >= FEWEST else pairs[:0]
+    return kept if len(kept) >= MIN_MATCHES else pairs[:0]
 
 
 def neighbours(cameras: Camera) -> list[tuple[int, int]]:

@@ -10,12 +10,12 @@ from .layer import UNKNOWN_INDEX as UNKNOWN_INDEX
 from .layer import Layer as Layer
 from .layer import LayerSource as LayerSource
 from .layer import cosines as cosines
-from .order import Runs as Runs
-from .order import shuffled_order as shuffled_order
-from .order import spread as spread
 from .resize import resized as resized
 from .store import ImageSource as ImageSource
 from .store import ImageStore as ImageStore
 from .store import PixelBatch as PixelBatch
+from .store import Runs as Runs
+from .store import shuffled_order as shuffled_order
+from .store import spread as spread
 from .stream import ImageStream as ImageStream
 from .stream import load as load

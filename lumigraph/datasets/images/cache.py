@@ -36,8 +36,8 @@ def cache_folder() -> Path:
 
 
 def key(parts: Iterable[str | None]) -> str:
-    """A name for files that are made of these parts; with a part that has no name, one that nobody else will ask
-    for."""
+    """A name for files that are made of these parts; with a part that has no name, a name that
+    is used once."""
     digest = hashlib.sha256(f"{CACHE_FORMAT} {sys.byteorder}".encode())
     for number, part in enumerate(parts):
         digest.update(f"\n{part or f'{os.getpid()} {time.time_ns()} {number}'}".encode())
@@ -46,24 +46,33 @@ def key(parts: Iterable[str | None]) -> str:
 
 @contextmanager
 def filled(folder: Path, size: int) -> Iterator[Path]:
-    """A folder to fill with so many bytes and MARK; it appears complete under its name or not at all."""
+    """A folder to fill with so many bytes and MARK_FILE; it appears complete under its name or not at all."""
     part = folder.with_name(f"{folder.name}.{os.getpid()}.part")
-    with full_disk_told(part, size):
+    try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
-        try:
-            yield part
-            if not (folder / MARK_FILE).exists():  # else another process was quicker
-                os.replace(part, folder)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+        yield part
+        if not (folder / MARK_FILE).exists():  # else another process was quicker
+            os.replace(part, folder)
+    except OSError as fault:
+        raise LumigraphError(
+            f"{part.parent}: cannot keep {size / 1e9:.1f} GB of decoded images here ({fault.strerror or fault}); "
+            f"free some space, set LUMIGRAPH_CACHE to a folder on another disk, or use a larger --downscale"
+        ) from fault
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def new_file(path: Path, dtype: np.dtype | type, shape: tuple[int, ...]) -> np.memmap:
     """A mapped file to write to."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    with open(path, "wb") as file:
-        reserve(file, size)
+    with open(path, "wb") as file:  # claim the disk now: writing to a mapped file on a full disk kills the process
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            block = bytes(1 << 20)
+            for begin in range(0, size, len(block)):
+                file.write(block[: size - begin])
     return np.memmap(path, dtype, "r+", shape=shape)
 
 
@@ -80,27 +89,6 @@ def free_space(folder: Path) -> int:
         return shutil.disk_usage(there).free
     except OSError:
         return 1 << 60
-
-
-def reserve(file, size: int) -> None:
-    """Claim the disk now: writing to a mapped file on a full disk would kill the process."""
-    if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file.fileno(), 0, size)
-        return
-    block = bytes(1 << 20)
-    for begin in range(0, size, len(block)):
-        file.write(block[: size - begin])
-
-
-@contextmanager
-def full_disk_told(path: Path, size: int) -> Iterator[None]:
-    try:
-        yield
-    except OSError as fault:
-        raise LumigraphError(
-            f"{path.parent}: cannot keep {size / 1e9:.1f} GB of decoded images here ({fault.strerror or fault}); "
-            f"free some space, set LUMIGRAPH_CACHE to a folder on another disk, or use a larger --downscale"
-        ) from fault
 
 
 def in_parallel(

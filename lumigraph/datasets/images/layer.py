@@ -1,11 +1,11 @@
-"""Layer: one named plane of values that is known of every pixel beside its colour, read when somebody asks for it."""
+"""Layer: one named plane of values that is known of every pixel beside its colour, read on request."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,55 +45,52 @@ class LayerSource:
     identity: str | None = None
 
 
+@dataclass(eq=False, repr=False)
 class Layer:
     """Values of one kind for every pixel of the photographs, as their source stores them, and what they mean.
 
     They lie in the order of the store, so that a pixel's position there is its position here: under the same budget of
     memory, else in a file. A photograph's values are read when they are first asked for.
 
-    planes:   of each photograph; None where this one has no such values
+    planes:   sources of each photograph; None where this one has no such values
     dtype:    of stored numbers
     channels: numbers to a pixel; one alone has no axis of its own
     encoding: what the numbers mean, a key of ENCODINGS
     scale:    what a stored 1 is worth, in scene units for lengths
-    unknown:  stored numbers that say that nobody knows; NaN always does. Photographs without a plane hold the first
+    unknown:  stored numbers that mean unknown, as NaN always does. Photographs without a plane hold the first
     empty:    stored lengths that say that nothing is there
     names:    of what an index counts, if they have some
     """
 
-    def __init__(
-        self,
-        images: ImageStore,
-        planes: Sequence[LayerSource | None],
-        dtype: np.dtype,
-        channels: int,
-        encoding: str,
-        scale: float = 1.0,
-        unknown: tuple[float, ...] = (),
-        empty: tuple[float, ...] = (),
-        names: tuple[str, ...] = (),
-    ):
-        assert len(planes) == len(images) and encoding in ENCODINGS
-        self.dtype, self.channels, self.encoding, self.scale = dtype, channels, encoding, scale
-        self.unknown, self.empty, self.names = unknown, empty, names
-        self._images, self._planes = images, list(planes)
+    images: ImageStore
+    planes: Sequence[LayerSource | None]
+    dtype: np.dtype
+    channels: int
+    encoding: str
+    scale: float = 1.0
+    unknown: tuple[float, ...] = ()
+    empty: tuple[float, ...] = ()
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        assert len(self.planes) == len(self.images) and self.encoding in ENCODINGS
         self._values: np.ndarray | None = None
-        self._read = np.zeros(len(planes), bool)
+        self._read = np.zeros(len(self.planes), bool)
 
     def __len__(self) -> int:
         """Photographs that have such values of their own."""
-        return sum(plane is not None for plane in self._planes)
+        return sum(plane is not None for plane in self.planes)
 
     def stored(self, image: int) -> np.ndarray:
         """One photograph's numbers as the source stores them, (height, width) or (height, width, channels)."""
-        if self._images.streams:
+        if self.images.streams:
             return self._alone(image)
-        values, order = self._hold([image])[self._images.span(image)], self._images.order(image)
+        values, order = self._hold([image])[self.images.span(image)], self.images.order(image)
         if order is not None:
             natural = np.empty_like(values)
             natural[order] = values
             values = natural
-        width, height = self._images.sizes[image].tolist()
+        width, height = self.images.sizes[image].tolist()
         return values.reshape(height, width, *values.shape[1:])
 
     def gathered(self, position: Int[Tensor, " pixel"], images: Int[Tensor, " choice"]) -> np.ndarray:
@@ -132,14 +129,13 @@ class Layer:
 
     def like(self, images: ImageStore, planes: Sequence[LayerSource | None]) -> Layer:
         """A layer of the same kind, of other photographs."""
-        about = self.dtype, self.channels, self.encoding, self.scale, self.unknown, self.empty, self.names
-        return Layer(images, planes, *about)
+        return replace(self, images=images, planes=planes)
 
     def _hold(self, wanted: Sequence[int] | np.ndarray) -> np.ndarray:
         """All stored numbers, in the order of the store; those of the wanted photographs have been read."""
         if self._values is None:
-            shape = (int(self._images.sizes.prod(-1).sum()), *((self.channels,) if self.channels > 1 else ()))
-            if self._images.grant(int(np.prod(shape)) * self.dtype.itemsize):
+            shape = (int(self.images.sizes.prod(-1).sum()), *((self.channels,) if self.channels > 1 else ()))
+            if self.images.grant(int(np.prod(shape)) * self.dtype.itemsize):
                 self._values = np.empty(shape, self.dtype)
             else:
                 self._values = self._mapped(shape)
@@ -151,38 +147,38 @@ class Layer:
 
     def _alone(self, image: int) -> np.ndarray:
         """One photograph's numbers, row by row, read now."""
-        width, height = self._images.sizes[image].tolist()
+        width, height = self.images.sizes[image].tolist()
         values = np.empty((width * height, *((self.channels,) if self.channels > 1 else ())), self.dtype)
         self._put(values, image, None)
         return values.reshape(height, width, *values.shape[1:])
 
     def _fill(self, values: np.ndarray, image: int) -> None:
         """Read one photograph's numbers to their place."""
-        self._put(values[self._images.span(image)], image, self._images.order(image))
+        self._put(values[self.images.span(image)], image, self.images.order(image))
         self._read[image] = True
 
     def _put(self, place: np.ndarray, image: int, order: np.ndarray | None) -> None:
         """Read one photograph's numbers, in an order; None for row by row."""
-        plane = self._planes[image]
+        plane = self.planes[image]
         if plane is None:
             place[:] = self.unknown[0] if self.unknown else UNKNOWN_INDEX if self.encoding == "index" else np.nan
             return
         found = plane.read()
-        width, height = self._images.sizes[image].tolist()
+        width, height = self.images.sizes[image].tolist()
         assert found.shape[:2] == (height, width), f"promised {width}x{height}, read {found.shape}"
         flat = found.reshape(place.shape)
         place[:] = flat if order is None else flat[order]
 
     def _mapped(self, shape: tuple[int, ...]) -> np.ndarray:
         """All numbers in a file, which stays for others that ask for the same."""
-        nameless = self._images.name is None or any(p is not None and p.identity is None for p in self._planes)
-        parts = [p.identity if p else "nothing" for p in self._planes]
-        called = key([None if nameless else f"{self._images.name} {self.dtype.str} {self.channels}", *parts])
-        folder = (self._images.cache or cache_folder() / "images") / called
+        nameless = self.images.name is None or any(p is not None and p.identity is None for p in self.planes)
+        parts = [p.identity if p else "nothing" for p in self.planes]
+        called = key([None if nameless else f"{self.images.name} {self.dtype.str} {self.channels}", *parts])
+        folder = (self.images.cache or cache_folder() / "images") / called
         if not (folder / MARK_FILE).exists():
             with filled(folder, int(np.prod(shape)) * self.dtype.itemsize) as part:
                 values = new_file(part / "values", self.dtype, shape)
-                in_parallel(lambda image: self._fill(values, image), range(len(self._planes)))
+                in_parallel(lambda image: self._fill(values, image), range(len(self.planes)))
                 values.flush()
                 (part / MARK_FILE).write_text(json.dumps({"dtype": self.dtype.str, "channels": self.channels}))
         check_size(folder / "values", int(np.prod(shape)) * self.dtype.itemsize)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,60 @@ from torch import Tensor
 from ...files import read_json
 from ...system.memory import memory_for_images
 from .cache import MARK_FILE, cache_folder, check_size, filled, in_parallel, key, new_file
-from .order import Runs, shuffled_order, spread
 from .pixel_sampling import sample_pixels
 
 READS_PER_BATCH = 64  # about so many reads per batch from a file
 MIN_PIECE, MAX_PIECE = 64, 1024  # pixels; the longest fills a page
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Masks as runs of trusted pixels, row by row: a run begins at pixel `start` and is preceded by `before` trusted
+    pixels, counted from the first image on. Image i owns count[i] trusted pixels."""
+
+    start: Int[Tensor, " run"]
+    before: Int[Tensor, " run"]
+    count: Int[Tensor, " image"]
+
+    def columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """start, before, the trusted pixels ahead of each image, and each image's first run, one longer than images."""
+        ahead = self.count.cumsum(0) - self.count
+        first_run = torch.searchsorted(self.before, torch.cat([ahead, self.count.sum()[None]]))
+        return self.start, self.before, ahead, first_run
+
+    @staticmethod
+    def of(masks: Sequence[np.ndarray]) -> Runs:
+        starts, lengths = [], []
+        for mask in masks:
+            edges = np.flatnonzero(np.diff(mask.ravel().astype(np.int8), prepend=0, append=0))
+            starts.append(edges[::2])
+            lengths.append(edges[1::2] - edges[::2])
+        length = torch.from_numpy(np.concatenate(lengths))
+        count = torch.tensor([int(x.sum()) for x in lengths])
+        return Runs(torch.from_numpy(np.concatenate(starts)), length.cumsum(0) - length, count)
+
+    def mask(self, image: int, pixels: int) -> Bool[Tensor, " pixel"]:
+        ahead, own = int(self.count[:image].sum()), int(self.count[image])
+        rank = torch.arange(ahead, ahead + own)
+        run = torch.searchsorted(self.before, rank, right=True) - 1
+        trusted = torch.zeros(pixels, dtype=torch.bool)
+        trusted[self.start[run] + rank - self.before[run]] = True
+        return trusted
+
+
+def spread(count: int) -> int:
+    """The factor a of the shuffle of `count` pixels."""
+    a = max(round(count * (math.sqrt(5) - 1) / 2), 1)
+    while math.gcd(a, count) != 1:
+        a += 1
+    return a
+
+
+def shuffled_order(pixels: int, mask: Tensor | np.ndarray | None) -> Int[np.ndarray, " pixel"]:
+    """Pixel at each position of the file: trusted, shuffled so that random batches are short reads; then others."""
+    trusted = np.arange(pixels) if mask is None else np.flatnonzero(np.asarray(mask))
+    shuffled = trusted[np.arange(len(trusted)) * spread(len(trusted)) % max(len(trusted), 1)]
+    return shuffled if mask is None else np.concatenate([shuffled, np.flatnonzero(~np.asarray(mask).ravel())])
 
 
 @dataclass(frozen=True)
@@ -51,7 +100,7 @@ class ImageSource:
 class PixelBatch:
     """Random pixels: which image, where (x, y), and their bytes (red, green, blue, alpha; 255 where there is none).
 
-    position: where they lie in the store, which is where they lie in every layer; None where nobody asked
+    position: where they lie in the store, which is where they lie in every layer; None where not requested
     """
 
     image: Int[Tensor, " pixel"]
@@ -129,20 +178,22 @@ class ImageStore:
         trusted = None
         if about.trusted:
             trusted = Runs(*map(torch.from_numpy, np.load(folder / "trusted.npz", allow_pickle=False).values()))
-        # Copy on write: PyTorch wants a writable array, and the file must stay as it is.
+        # Copy on write: PyTorch requires a writable array, and the file must stay as it is.
         rgba = np.memmap(folder / "pixels", np.int32, "c")
         if nameless:
-            shutil.rmtree(folder, ignore_errors=True)  # nobody can ask for it again; what is mapped stays
+            shutil.rmtree(folder, ignore_errors=True)  # it has no name to be found by; what is mapped stays
         name = None if nameless else f"{called} shuffled"
         return cls(torch.from_numpy(rgba), sizes, about.has_alpha, trusted, True, name, memory, cache)
 
     @classmethod
     def from_arrays(cls, images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> ImageStore:
         """Pictures that are already here: uint8 (height, width, 3 or 4), and optionally which pixels to trust."""
+
+        def source(image: np.ndarray, mask: np.ndarray | None) -> ImageSource:
+            return ImageSource((image.shape[1], image.shape[0]), lambda: (image, mask))
+
         pairs = zip(images, masks or [None] * len(images), strict=True)
-        return cls.load(
-            [ImageSource((i.shape[1], i.shape[0]), partial(pair, i, m)) for i, m in pairs], memory=sys.maxsize
-        )
+        return cls.load([source(*pair) for pair in pairs], memory=sys.maxsize)
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -209,8 +260,17 @@ def name_of(pictures: Sequence[ImageSource]) -> str:
     return key(p.identity and f"{p.size} {p.identity}" for p in pictures)
 
 
-def pair(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    return image, mask
+def whole(picture: ImageSource) -> tuple[UInt8[np.ndarray, "height width 4"], Bool[np.ndarray, "height width"] | None]:
+    """A photograph's pixels, four bytes each, and which of them to trust; None for all."""
+    image, mask = picture.read()
+    assert image.shape[1::-1] == picture.size, f"promised {picture.size}, read {image.shape}"
+    four = np.full((*image.shape[:2], 4), 255, np.uint8)
+    four[..., : image.shape[2]] = image
+    return four, None if mask is None or mask.all() else mask.astype(bool)
+
+
+def see_through(pixels: UInt8[np.ndarray, "height width 4"]) -> bool:
+    return bool((pixels[..., 3] < 255).any())
 
 
 def fill(
@@ -220,23 +280,17 @@ def fill(
     ends = np.cumsum([p.size[0] * p.size[1] for p in pictures])
 
     def read(index: int) -> tuple[bool, np.ndarray | None]:
-        picture = pictures[index]
-        image, mask = picture.read()
-        assert image.shape[1::-1] == picture.size, f"promised {picture.size}, read {image.shape}"
-        pixels = image.shape[0] * image.shape[1]
-        four = np.full((pixels, 4), 255, np.uint8)
-        four[:, : image.shape[2]] = image.reshape(pixels, -1)
-        one = four.view(np.int32)[:, 0]
-        mask = None if mask is None or mask.all() else mask.astype(bool)
-        rgba[ends[index] - pixels : ends[index]] = one[shuffled_order(pixels, mask)] if shuffled else one
-        return bool((four[:, 3] < 255).any()), mask
+        pixels, mask = whole(pictures[index])
+        one = pixels.view(np.int32).ravel()
+        rgba[ends[index] - len(one) : ends[index]] = one[shuffled_order(len(one), mask)] if shuffled else one
+        return see_through(pixels), mask
 
     found = in_parallel(read, range(len(pictures)), progress)
     masks = [mask for _, mask in found]
     trusted = None
     if any(mask is not None for mask in masks):
-        whole = (np.ones(p.size[::-1], bool) for p in pictures)
-        trusted = Runs.of([w if m is None else m for m, w in zip(masks, whole, strict=True)])
+        pairs = zip(masks, pictures, strict=True)
+        trusted = Runs.of([np.ones(p.size[::-1], bool) if mask is None else mask for mask, p in pairs])
     return any(alpha for alpha, _ in found), trusted
 
 

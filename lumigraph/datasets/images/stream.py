@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Int, UInt8
+from PIL import Image
 from torch import Tensor
 
 from ...errors import LumigraphError
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.memory import memory_for_images
-from .cache import MARK_FILE, cache_folder, free_space
-from .kept import kept
-from .store import ImageSource, ImageStore, PixelBatch, name_of
+from .cache import MARK_FILE, cache_folder, free_space, key
+from .store import ImageSource, ImageStore, PixelBatch, name_of, see_through, whole
 
 DISK_SHARE = 0.5  # of the free space that a file of photographs may take
 KEPT_PIXELS = 1 << 16  # random pixels kept per photograph
@@ -29,6 +33,7 @@ READING_COPIES = 3  # of a photograph in memory, while it is read
 ALPHA_PROBES = 4  # photographs that are tested for alpha
 
 Some = tuple[UInt8[np.ndarray, "kept 4"], Int[np.ndarray, " kept"]]  # pixels of a photograph, and where they lie in it
+PICTURES_FOLDER = "pictures"  # inside the cache
 
 
 def load(
@@ -41,7 +46,7 @@ def load(
     """Photographs in memory, else in a file, else, where that would take more than half of what is free on its disk,
     read again and again. Arguments and faults as of `ImageStore.load`.
 
-    keep: whether each picture goes to a file of the cache even if all fit, so that nobody makes it again
+    keep: whether each picture goes to a file of the cache even if all fit, so that it is made once
     """
     memory = memory_for_images() if memory is None else memory
     size = 4 * sum(width * height for width, height in (p.size for p in pictures))
@@ -59,8 +64,8 @@ class ImageStream(ImageStore):
 
     Readers go through all photographs in a random order, and then in another one, and leave KEPT random pixels of each;
     a batch is drawn from those that are there, of which the oldest makes room for the next. So each photograph is as
-    likely as any other in the long run, each of its trusted pixels as well, and nobody waits for a photograph that one
-    batch alone would need. What is drawn depends on the generator of the first batch, on all batches since, and on
+    likely as any other in the long run, each of its trusted pixels as well, and no batch waits for a photograph that it
+    alone would need. What is drawn depends on the generator of the first batch, on all batches since, and on
     nothing else; a run that is resumed begins anew.
 
     pictures: how to get each
@@ -165,14 +170,33 @@ class ImageStream(ImageStore):
         return rgba[chosen], chosen.astype(np.int32)
 
 
-def whole(picture: ImageSource) -> tuple[UInt8[np.ndarray, "height width 4"], Bool[np.ndarray, "height width"] | None]:
-    """A photograph's pixels, four bytes each, and which of them to trust; None for all."""
-    image, mask = picture.read()
-    assert image.shape[1::-1] == picture.size, f"promised {picture.size}, read {image.shape}"
-    four = np.full((*image.shape[:2], 4), 255, np.uint8)
-    four[..., : image.shape[2]] = image
-    return four, None if mask is None or mask.all() else mask.astype(bool)
+def kept(picture: ImageSource, cache: Path) -> ImageSource:
+    """A picture that took long to make, made once for all scenes: it reads its file in `cache` where there is one, and
+    writes one otherwise. As it is if nothing says what it depends on."""
+    if picture.identity is None:
+        return picture
+    return replace(picture, read=partial(read_or_make, picture, cache / PICTURES_FOLDER))
 
 
-def see_through(pixels: UInt8[np.ndarray, "height width 4"]) -> bool:
-    return bool((pixels[..., 3] < 255).any())
+def read_or_make(picture: ImageSource, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    path = folder / f"{key([f'{picture.size} {picture.identity}'])}.png"
+    with contextlib.suppress(OSError, SyntaxError, ValueError), Image.open(path) as file:
+        pixels = np.asarray(file)
+        if pixels.shape[1::-1] == picture.size:
+            return pixels, None
+    pixels, mask = picture.read()
+    if mask is None:
+        leave(path, pixels)
+    return pixels, mask
+
+
+def leave(path: Path, pixels: np.ndarray) -> None:
+    """Write a picture, whole or not at all. A disk that is full or may not be written keeps nothing."""
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            Image.fromarray(pixels).save(part, "png", compress_level=1)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)

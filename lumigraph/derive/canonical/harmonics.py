@@ -1,4 +1,5 @@
-"""Functions of directions in real spherical harmonics of any band, and what a rotation does to their coefficients."""
+"""Real spherical harmonics of any band, what a rotation does to their coefficients, and moments of shapes in them:
+how much of a shape lies in each direction, at several distances from its middle. Rotations, evenly spread or random."""
 
 from __future__ import annotations
 
@@ -7,6 +8,11 @@ import math
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from ...geometry import to_matrix
+
+MAX_RADIUS = 2.2  # spreads from the mean; hardly anything lies beyond
+PHI, PSI = math.sqrt(2.0), 1.533751168755204288118041  # psi^4 = psi + 4
 
 
 def harmonics(directions: Float[Tensor, "*point 3"], bands: int) -> Float[Tensor, "*point basis"]:
@@ -36,10 +42,6 @@ def band(degree: int) -> slice:
     return slice(degree**2, (degree + 1) ** 2)
 
 
-def band_sizes(bands: int) -> list[int]:
-    return [2 * degree + 1 for degree in range(bands)]
-
-
 def turning(rotations: Float[Tensor, "*rotation 3 3"], bands: int) -> list[Float[Tensor, "*rotation _ _"]]:
     """Wigner's matrices D of each band: harmonics(R x) = D(R) harmonics(x), so that what has coefficients f has D f
     once it is turned. Found from directions, of which there are more than enough to determine them."""
@@ -50,3 +52,58 @@ def turning(rotations: Float[Tensor, "*rotation 3 3"], bands: int) -> list[Float
     after = harmonics(torch.einsum("...ij,pj->...pi", rotations, some), bands)
     inverse = [torch.linalg.pinv(before[:, band(degree)].double()).to(before) for degree in range(bands)]
     return [(inverse[degree] @ after[..., band(degree)]).mT for degree in range(bands)]
+
+
+def shells(distances: Float[Tensor, "*point"], count: int) -> Float[Tensor, "*point shell"]:
+    """Weight of each point in each shell: bells about equidistant radii from 0 to MAX_RADIUS."""
+    step = MAX_RADIUS / (count - 1)
+    radii = step * torch.arange(count, dtype=distances.dtype, device=distances.device)
+    return (-0.5 * ((distances[..., None] - radii) / (0.7 * step)).square()).exp()
+
+
+def directions_and_distances(
+    points: Float[Tensor, "*point 3"],
+) -> tuple[Float[Tensor, "*point 3"], Float[Tensor, "*point"]]:
+    distances = points.norm(dim=-1)
+    return points / distances.clamp_min(1e-9)[..., None], distances
+
+
+def moments(
+    points: Float[Tensor, "*some point 3"], weights: Float[Tensor, "*some point"], count: int, bands: int
+) -> Float[Tensor, "*some shell basis"]:
+    """Integrals of a density times each shell times each harmonic: f = sum_i w_i s(|x_i|) Y(x_i / |x_i|).
+
+    Turned with the points: moments(R x) are D(R) moments(x), to rounding.
+    """
+    directions, distances = directions_and_distances(points)
+    parts = weights[..., None] * shells(distances, count)
+    return parts.mT @ harmonics(directions, bands)
+
+
+def spread(count: int) -> Float[Tensor, "rotation 3 3"]:
+    """Rotations all over SO(3), about equally far from their neighbours: super-Fibonacci spirals (Alexa 2022)."""
+    s = torch.arange(count, dtype=torch.float64) + 0.5
+    t = s / count
+    inner, outer = t.sqrt(), (1 - t).sqrt()
+    alpha, beta = 2 * math.pi * s / PHI, 2 * math.pi * s / PSI
+    return to_matrix(torch.stack([inner * alpha.sin(), inner * alpha.cos(), outer * beta.sin(), outer * beta.cos()], 1))
+
+
+def near(degrees: float) -> Float[Tensor, "rotation 3 3"]:
+    """The identity, and rotations by an angle about the 26 directions to the neighbours of a cube among cubes."""
+    steps = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
+    axes = torch.nn.functional.normalize(torch.cartesian_prod(steps, steps, steps), dim=-1)
+    half = 0.5 * math.radians(degrees)
+    return to_matrix(torch.cat([torch.full((27, 1), math.cos(half), dtype=torch.float64), math.sin(half) * axes], 1))
+
+
+def random(count: int, generator: torch.Generator) -> Float[Tensor, "rotation 3 3"]:
+    """Rotations, all equally likely."""
+    return to_matrix(torch.randn(count, 4, generator=generator, dtype=torch.float64))
+
+
+def nearest_rotation(matrices: Float[Tensor, "*matrix 3 3"]) -> Float[Tensor, "*matrix 3 3"]:
+    """The rotation nearest to each matrix in the sense of least squares (Kabsch 1976): U diag(1, 1, +-1) V^T."""
+    u, _, vt = torch.linalg.svd(matrices)
+    sign = torch.linalg.det(u @ vt)
+    return torch.cat([u[..., :2], u[..., 2:] * sign[..., None, None]], -1) @ vt

@@ -2,5 +2,5 @@
 
 from .compress import CompressionTarget as CompressionTarget
 from .compress import compress as compress
-from .ladder import LADDER as LADDER
-from .ladder import Rung as Rung
+from .model import LADDER as LADDER
+from .model import Rung as Rung

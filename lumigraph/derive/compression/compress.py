@@ -1,33 +1,44 @@
-"""compress(): which rung of the ladder a run stands on, tuned there, and written as a run of its own."""
+"""compress(): choose a rung of the ladder, tune the run there, and write it as a run of its own.
+
+References are the run's photographs where available, else its own renderings.
+"""
 
 from __future__ import annotations
 
+import math
 import shutil
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from ... import files
 from ...budget import Budget
+from ...camera import Camera
+from ...camera.rays import Rendering
+from ...datasets.images import ImageStore
+from ...datasets.scene import Scene
 from ...errors import LumigraphError
 from ...evaluation import evaluate
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...method import Method
 from ...method.capabilities import CanCompress, needs
 from ...run import Run, check_new
 from ...run.checkpoint import Checkpoints
-from ...run.compressed import Compressed, bytes_in
+from ...run.derived import Compressed
 from ...system.progress import track
-from .ladder import LADDER, RUNG_POSITIONS, Rung, rung_at
-from .measure import Truth, truth_of
-from .model import Model
+from ...training.verdict import last_psnr
+from .model import LADDER, RUNG_POSITIONS, Model, rung_at
 
 JUDGED_VIEWS = 6  # training photographs that judge a rung; held-out ones judge the outcome alone
 IMPORTANCE_VIEWS = 40  # photographs from which importance is computed
 TRIAL_SHARE = 1 / 6  # of all tuning, per tried rung; the selected rung gets the rest
+RENDERED_VIEWS = 40  # renderings in place of photographs, evenly spread
+DEFAULT_PSNR = 30.0  # dB of a run without a recorded training PSNR
 
 
 @dataclass(frozen=True)
@@ -116,19 +127,15 @@ class Ladder:
 
     def at(self, place: float) -> Model:
         """The run on a rung, or between two."""
-        rung, step = self.rung(place), self.run.state.step
+        rung, step = rung_at(place), self.run.state.step
+        if self.aim.codebook is not None:
+            rung = replace(rung, recipe=replace(rung.recipe, codebook=self.aim.codebook))
         method = self.run.method(self.device)
         if self.run.settings.budget:
             spent = Budget.from_json(self.run.settings.budget).progress(step, self.run.state.seconds)
             method.before_step(step, spent)  # how finely it looks, at this share of its training
             self.run.restore_weights(method)
         return Model(method, self.importance, rung, step)
-
-    def rung(self, place: float) -> Rung:
-        rung = rung_at(place)
-        if self.aim.codebook is None:
-            return rung
-        return replace(rung, recipe=replace(rung.recipe, codebook=self.aim.codebook))
 
     def tune(self, model: Model, share: float) -> None:
         if share > 0:
@@ -165,9 +172,8 @@ def check_codebook(method: Method, size: int) -> None:
 
 def row_width(tensor: Tensor, layout: str) -> int:
     """Columns of a tensor's rows, see `packing.Stored`."""
-    return {"rows": tensor[:1].numel(), "cells": tensor.shape[-1], "channels": tensor.shape[min(1, tensor.dim() - 1)]}[
-        layout
-    ]
+    channels = tensor.shape[min(1, tensor.dim() - 1)]
+    return {"rows": tensor[:1].numel(), "cells": tensor.shape[-1], "channels": channels}[layout]
 
 
 def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, aim: CompressionTarget) -> Compressed:
@@ -186,16 +192,14 @@ def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, 
             method=run.method_name,
             bytes_before=run.model_bytes,
             bytes_after=small.model_bytes,
-            folder_before=bytes_in(run.folder),
-            folder_after=bytes_in(partial),
+            folder_before=folder_bytes(run.folder),
+            folder_after=folder_bytes(partial),
             psnr_before=evaluate(before, truth.scene, "test", views=views).psnr if truth.photographed else None,
             psnr_after=evaluate(small.method(before.device), truth.scene, "test", views=views).psnr,
             compared_with="photographs" if truth.photographed else "renderings of the run",
             views=views,
             pruned=rung.pruned,
-            codebook=rung.recipe.codebook,
-            apart=rung.recipe.apart,
-            coarser=rung.recipe.coarser,
+            **asdict(rung.recipe),
             steps=model.steps,
             seconds=model.seconds,
         )
@@ -203,6 +207,81 @@ def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, 
     return told_of
 
 
+def folder_bytes(folder: Path) -> int:
+    """Bytes of all files in a folder."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+
+
 def told(size: float) -> str:
     """Bytes for people, to three digits, as --to takes them."""
     return f"{size / 1e6:.3g}MB" if size >= 1e6 else f"{size / 1e3:.3g}kB"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """References for tuning and for comparison.
+
+    photographed: whether these are photographs; renderings of the run before it was compressed otherwise
+    error:        mean squared error of the run before, on the photographs that it has learnt
+    """
+
+    scene: Scene
+    photographed: bool
+    error: float
+
+    def loss(self, method: Method, views: int) -> float:
+        """dB that a method has lost on photographs it has learnt. Where renderings stand in for them, errors that know
+        nothing of each other are taken to add up."""
+        error = squared_error(method, self.scene, "train", views)
+        return decibels(error if self.photographed else self.error + error) * -1 + decibels(self.error)
+
+
+def truth_of(run: Run, method: Method, source: str | None, views: int) -> Truth:
+    """The run's photographs; where they cannot be opened, and no other place is named, its own renderings."""
+    try:
+        scene = run.scene(source)
+        return Truth(scene, True, squared_error(method, scene, "train", views))
+    except LumigraphError:
+        if source is not None:
+            raise
+    learnt = last_psnr(run.metrics())
+    return Truth(rendered(run, method), False, 10 ** (-(DEFAULT_PSNR if learnt is None else learnt) / 10))
+
+
+def squared_error(method: Method, scene: Scene, split: str, views: int) -> float:
+    """Mean over views of what their PSNR is the logarithm of, so that errors can be added."""
+    return 10 ** (-evaluate(method, scene, split, views=views).psnr / 10)
+
+
+def decibels(error: float) -> float:
+    return -10 * math.log10(max(error, 1e-12))
+
+
+def rendered(run: Run, method: Method) -> Scene:
+    """A Scene whose photographs are what a method shows from where they were taken."""
+    cameras = run.cameras()
+    some = {split: evenly(range(len(own)), RENDERED_VIEWS) for split, own in cameras.items() if len(own)}
+    chosen = [cameras[split][i] for split, index in some.items() for i in index]
+    counts = torch.tensor([0, *(len(index) for index in some.values())]).cumsum(0).tolist()
+    splits = {
+        split: torch.arange(*pair) for split, pair in zip(some, zip(counts, counts[1:], strict=False), strict=True)
+    }
+    splits.setdefault("test", splits["train"])
+    frame = run.frame
+    pictures = [
+        bytes_of(method.render(camera).cpu(), frame.background if frame.has_alpha else None)
+        for camera in track(chosen, "Rendering what there is to keep", len(chosen))
+    ]
+    images, names = ImageStore.from_arrays(pictures), [f"{i:03d}" for i in range(len(chosen))]
+    return Scene(Camera.cat(chosen), images, frame, splits, names, f"renderings of {run.folder}")
+
+
+def bytes_of(
+    seen: Rendering, background: tuple[float, float, float] | None
+) -> UInt8[np.ndarray, "height width channel"]:
+    """A rendering as a photograph; with straight alpha, where a background was behind it."""
+    rgb, alpha = seen.rgb, seen.opacity[..., None].clamp(0, 1)
+    if background is not None:
+        own = (rgb - (1 - alpha) * torch.tensor(background)) / alpha.clamp_min(1e-3)
+        rgb = torch.cat([own, alpha], -1)
+    return (255 * rgb.clamp(0, 1)).round().byte().numpy()

@@ -1,8 +1,9 @@
-"""Model: a method whose tensors are tables in few bytes, and that can be tuned as such."""
+"""Model: a method whose tensors are tables in few bytes, tuned as such; and the ladder of its sizes."""
 
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -11,11 +12,10 @@ from torch import Tensor
 from ...datasets.scene import Scene
 from ...errors import LumigraphError
 from ...exchange import packing
-from ...exchange.packing import Table
+from ...exchange.packing import Recipe, Table
 from ...method import Method
 from ...method.capabilities import CanCompress, needs
 from ...system.progress import counting
-from .ladder import Rung
 
 TUNING_RATE = 0.1  # step of tuning, as a share of the quantisation error
 FINAL_RATE_SCALE = 0.1  # of that rate, at the end
@@ -25,7 +25,7 @@ BETAS = 0.9, 0.99
 class Model:
     """A trained method on a rung of the ladder.
 
-    step: of its training, at which it goes on being tuned
+    step: of its training, at which tuning begins
     Raises LumigraphError for a method that cannot be compressed.
     """
 
@@ -63,7 +63,8 @@ class Model:
     def tune(self, scene: Scene, steps: int | None, seconds: float | None) -> None:
         """Learn from photographs with the rows' codes as they are: codebooks, rows apart from them and scaled numbers
         descend together, through the rounding, at a pace that falls with progress."""
-        rates = [(latent.requires_grad_(), unit) for _, table in self.tuned for latent, unit in learning(table)]
+        forms = [form for _, table in self.tuned for form in table.forms]
+        rates = [(latent.requires_grad_(), unit) for form in forms for latent, unit in form.learning()]
         optimizer = torch.optim.Adam([{"params": [x], "lr": 0.0, "unit": unit} for x, unit in rates], betas=BETAS)
         generator, begin, taken = torch.Generator().manual_seed(self.steps), time.perf_counter(), 0
         self.method.train()
@@ -102,12 +103,42 @@ class Model:
         optimizer.step()
 
 
-def learning(table: Table) -> list[tuple[Tensor, float]]:
-    return [pair for form in table.forms for pair in form.learning()]
-
-
 def progress(step: int, passed: float, steps: int | None, seconds: float | None) -> float:
     """The share of tuning that is over."""
     if steps is not None:
         return step / steps if steps else 1.0
     return passed / seconds if seconds else 1.0
+
+
+@dataclass(frozen=True)
+class Rung:
+    """pruned: share of all importance whose rows go, the least important ones first"""
+
+    pruned: float
+    recipe: Recipe
+
+
+# The second is VQRF's: it prunes 0.1 % of importance and keeps 60 % out of a codebook of 4096.
+LADDER: tuple[Rung, ...] = (
+    Rung(0.0, Recipe(apart=1.0)),
+    Rung(0.001, Recipe(apart=0.6)),
+    Rung(0.003, Recipe(apart=0.3, coarser=1)),
+    Rung(0.01, Recipe(apart=0.1, coarser=2)),
+    Rung(0.02, Recipe(apart=0.02, coarser=2)),
+    Rung(0.03, Recipe(apart=0.005, coarser=2)),
+    Rung(0.04, Recipe(2048, apart=0.0, coarser=3)),
+    Rung(0.08, Recipe(1024, apart=0.0, coarser=3)),
+    Rung(0.15, Recipe(256, apart=0.0, coarser=4)),
+)
+
+STEPS_BETWEEN_RUNGS = 4  # interpolated settings from one rung to the next
+RUNG_POSITIONS = [i / STEPS_BETWEEN_RUNGS for i in range(STEPS_BETWEEN_RUNGS * (len(LADDER) - 1) + 1)]
+
+
+def rung_at(place: float) -> Rung:
+    """A rung, or what lies between two: the lower one's recipe, with more pruned and fewer rows kept apart."""
+    low, high = LADDER[int(place)], LADDER[min(int(place) + 1, len(LADDER) - 1)]
+    share = place - int(place)
+    pruned = low.pruned + share * (high.pruned - low.pruned)
+    apart = low.recipe.apart + share * (high.recipe.apart - low.recipe.apart)
+    return Rung(pruned, replace(low.recipe, apart=apart))

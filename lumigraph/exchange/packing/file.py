@@ -26,10 +26,9 @@ from ...files import from_json
 from ...files.ranges import Coordinate, Name, between, typed
 from ...system.memory import free_memory, gigabytes
 from .forms import FORMS
-from .storage import Layout
 from .streams import Extent, Number, Stream, kind_of, unpacked
 from .streams import packed as to_stream
-from .table import Table
+from .table import Layout, Table
 
 MAGIC = b"LUMIPACK"
 HEAD = struct.Struct("<8sI")  # magic, length of the head
@@ -39,7 +38,7 @@ Which = Annotated[int, between(0, 1_000_000)]  # stream
 
 
 @dataclass(frozen=True)
-class Part:
+class PackedPart:
     """Columns in one form, and the streams that hold it."""
 
     form: str
@@ -59,7 +58,7 @@ class Entry:
     layout: Layout = "rows"
     fill: Coordinate = 0.0
     kept: Which | None = None
-    parts: tuple[Part, ...] = ()
+    parts: tuple[PackedPart, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,14 +94,14 @@ def write(tensors: dict[str, Tensor | Table]) -> bytes:
             entries[name] = Entry(array.shape, kind_of(array), streams.add(array))
             continue
         kept = None if value.kept is None else streams.add(value.kept.numpy())
-        parts = tuple(Part(form.name, tuple(map(streams.add, form.streams()))) for form in value.forms)
+        parts = tuple(PackedPart(form.name, tuple(map(streams.add, form.streams()))) for form in value.forms)
         entries[name] = Entry(value.shape, value.dtype, None, value.layout, value.fill, kept, parts)
     head = json.dumps(asdict(Head(tuple(streams.about), entries)), separators=(",", ":")).encode()
     return b"".join([HEAD.pack(MAGIC, len(head)), head, *streams.data])
 
 
 def read(data: bytes, path: Path) -> dict[str, Tensor]:
-    """The tensors. path: what to name in a LumigraphError, for a file that is damaged or promises too much."""
+    """The tensors. path: named in the LumigraphError for a damaged file or one that declares too much."""
     magic, length = HEAD.unpack(data[: HEAD.size]) if len(data) >= HEAD.size else (b"", 0)
     if magic != MAGIC or HEAD.size + length > len(data):
         raise LumigraphError(f"{path} holds no packed tensors; restore it from a copy")
@@ -120,8 +119,10 @@ def read(data: bytes, path: Path) -> dict[str, Tensor]:
 
 def check_sizes(head: Head, there: int, path: Path) -> None:
     """Raise LumigraphError for streams that are not there, and for tensors that memory would not hold."""
-    if (said := sum(stream.bytes for stream in head.streams)) != there:
-        raise LumigraphError(f"{path} declares {said:,} bytes of tensors and holds {there:,}; restore it from a copy")
+    if (declared := sum(stream.bytes for stream in head.streams)) != there:
+        raise LumigraphError(
+            f"{path} declares {declared:,} bytes of tensors and holds {there:,}; restore it from a copy"
+        )
     sizes = [math.prod(entry.shape) * np.dtype(entry.dtype).itemsize for entry in head.tensors.values()]
     needed, free = UNPACKING_FACTOR * (sum(sizes) + sum(stream.size for stream in head.streams)), free_memory()
     if needed > free:

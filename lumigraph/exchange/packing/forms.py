@@ -11,10 +11,59 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .clusters import clustered
+MAX_TRAINING_ROWS = 1 << 17  # rows at most; each then counts by its weight
+PASSES = 8  # over them; the error falls by less than 1 % in any further one
+CHUNK_ROWS = 1 << 13  # rows whose distances to the whole codebook are held at once, fewer if it is long
+MAX_DISTANCES = 1 << 26  # distances that are held at once
+
+
+@torch.no_grad()
+def clustered(
+    rows: Float[Tensor, "row column"], weights: Float[Tensor, " row"], size: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "code column"], Int[Tensor, " row"]]:
+    """A codebook of `size` rows and the code of each row: sum_i w_i |x_i - b_{c(i)}|^2 is made small (Lloyd 1982).
+
+    Rows that the codebook begins with are drawn by their weights. A code that nothing is nearest to begins anew at one
+    of the rows that are worst off.
+    """
+    weights = weights.double().clamp_min(0) + 1e-9 * (float(weights.max()) if len(weights) else 1.0) + 1e-30
+    if len(rows) > MAX_TRAINING_ROWS:
+        some = torch.multinomial(weights, MAX_TRAINING_ROWS, replacement=True, generator=generator)
+        learnt, counts = rows[some], torch.ones(MAX_TRAINING_ROWS)
+    else:
+        learnt, counts = rows, (weights / weights.mean()).float()
+    # different rows, heavy ones more likely (Efraimidis and Spirakis 2006)
+    keys = torch.rand(len(counts), generator=generator).clamp_min(1e-12).log() / counts.clamp_min(1e-12)
+    book = learnt[keys.topk(size).indices].clone()
+    for _ in range(PASSES):
+        codes, errors = nearest(learnt, book)
+        total = torch.zeros(size).index_add_(0, codes, counts)
+        sums = torch.zeros_like(book).index_add_(0, codes, counts[:, None] * learnt)
+        used = total > 0
+        book[used] = sums[used] / total[used, None]
+        if (idle := int((~used).sum())) and (worst := errors * counts).any():
+            book[~used] = learnt[worst.topk(min(idle, len(worst))).indices.repeat(idle)[:idle]]
+    codes = nearest(rows, book)[0]
+    order = torch.bincount(codes, minlength=size).argsort(descending=True, stable=True)  # small codes are the frequent
+    return book[order], order.argsort()[codes]
+
+
+def nearest(
+    rows: Float[Tensor, "row column"], book: Float[Tensor, "code column"]
+) -> tuple[Int[Tensor, " row"], Float[Tensor, " row"]]:
+    """The code of each row, and its squared distance."""
+    half = 0.5 * book.square().sum(-1)
+    codes, errors = torch.empty(len(rows), dtype=torch.int64), torch.empty(len(rows))
+    chunk = min(CHUNK_ROWS, max(1, MAX_DISTANCES // max(1, len(book))))
+    for i in range(0, len(rows), chunk):
+        some = rows[i : i + chunk]
+        least, codes[i : i + chunk] = torch.addmm(half, some, book.t(), alpha=-1).min(-1)
+        errors[i : i + chunk] = (2 * least + some.square().sum(-1)).clamp_min(0)
+    return codes, errors
+
 
 MAX_DEVIATIONS = 8.0  # standard deviations that the levels of a whole number span; what lies beyond has more levels
 MAX_WHOLE_NUMBER = (1 << 16) - 1  # the largest whole number
@@ -133,9 +182,8 @@ class Coded(Form):
 
     def values(self) -> Float[Tensor, "row column"]:
         found = self.own.exact.new_empty(len(self.apart), self.width)
-        return found.index_put((self.apart,), self.own.values()).index_put(
-            (~self.apart,), self.book.values()[self.codes]
-        )
+        found = found.index_put((self.apart,), self.own.values())
+        return found.index_put((~self.apart,), self.book.values()[self.codes])
 
     def learning(self) -> list[tuple[Tensor, float]]:
         return [(self.book.exact, self.error), *self.own.learning()]

@@ -1,4 +1,4 @@
-"""Streams: arrays of few kinds, entropy-coded with zstandard, and taken out again no larger than they said."""
+"""Streams: arrays of few kinds, entropy-coded with zstandard, and unpacked to the declared size at most."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
     """An array as a stream, whichever way is smaller."""
     ways = (False, True) if array.dtype.kind in "ui" and array.ndim else (False,)
     coder = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-    found = [(delta, coder.compress(_bytes(_differences(array) if delta else array))) for delta in ways]
+    found = []
+    for delta in ways:
+        values = np.diff(array, axis=0, prepend=np.zeros_like(array[:1])) if delta else array
+        found.append((delta, coder.compress(_bytes(values))))
     delta, data = min(found, key=lambda pair: len(pair[1]))
     return Stream(kind_of(array), array.shape, len(data), delta), data
 
@@ -56,7 +59,7 @@ def kind_of(array: Shaped[np.ndarray, "*shape"]) -> Number:
 
 
 def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
-    """The inverse. Raises ValueError, EOFError or ZstdError for what is not as the stream says."""
+    """The inverse. Raises ValueError, EOFError or ZstdError for data that contradicts the stream's declaration."""
     if stream.size > MAX_ZSTD_RATIO * max(len(data), 1):
         raise ValueError(f"{len(data)} bytes cannot hold {stream.size:,}")
     reader = zstandard.ZstdDecompressor().stream_reader(data)
@@ -72,7 +75,7 @@ def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
 
 
 def take(stream: Any, size: int) -> bytes:
-    """Exactly `size` bytes, in pieces, so that memory grows with what is there and not with what is promised."""
+    """Exactly `size` bytes, in pieces, so that memory grows with the data and not with the declared size."""
     pieces = []
     while size:
         piece = stream.read(min(size, CHUNK_BYTES))
@@ -83,12 +86,8 @@ def take(stream: Any, size: int) -> bytes:
     return b"".join(pieces)
 
 
-def _differences(array: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
-    return np.diff(array, axis=0, prepend=np.zeros_like(array[:1]))
-
-
 def _bytes(array: Shaped[np.ndarray, "*shape"]) -> bytes:
-    """Column by column, and of each number the first bytes, then the second ones: like stands beside like."""
+    """Column by column, and of each number the first bytes, then the second ones: similar bytes are together."""
     if array.dtype == bool:
         return np.packbits(array).tobytes()
     columns = np.ascontiguousarray(array.reshape(array.shape[0] if array.ndim else 1, -1).T) if array.size else array

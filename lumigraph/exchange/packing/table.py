@@ -5,16 +5,40 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from .forms import Coded, Form, Half, Scaled
-from .storage import Layout, Stored
 from .streams import Number, kind_of
 
-MIN_ROWS_PER_CODE = 8  # rows for each code; with fewer a codebook would be no smaller than what it stands for
+Layout = Literal["rows", "cells", "channels"]
+
+
+@dataclass(frozen=True)
+class Stored:
+    """Storage format of a tensor, seen as a table of rows and columns.
+
+    how:   "scaled", as whole numbers with a scale for each column; "coded", as rows of a codebook, the most important
+           ones scaled; "half", as float16; "nothing", because rendering does not need it: it reads as `fill`.
+           A tensor without a declaration is stored to the bit; a mask (bool) as one bit each
+    bits:  of a whole number
+    layout: meaning of a row: "rows", the first axis; "cells", of (..., channel); "channels", the cells of
+           (grid, channel, x, y, z)
+    plain: columns at the front that are scaled, also where the others are coded
+    fill:  the value of all numbers in an empty row; such rows are not stored
+    """
+
+    how: Literal["scaled", "coded", "half", "nothing"]
+    bits: int = 8
+    layout: Layout = "rows"
+    plain: int = 0
+    fill: float = 0.0
+
+
+MIN_ROWS_PER_CODE = 8  # rows for each code; with fewer a codebook would be no smaller than its rows
 MIN_BITS = 2
 
 
@@ -96,7 +120,7 @@ def packed(
     weights: Float[Tensor, " row"] | None,
     generator: torch.Generator,
 ) -> Table:
-    """A tensor in the form that its method says. weights: importance of each of its rows; None where all are alike"""
+    """A tensor in the form that its method declares. weights: importance of each of its rows; None if equal"""
     shape, bits = tuple(tensor.shape), max(how.bits - recipe.coarser, MIN_BITS)
     if how.how == "nothing":
         return Table(shape, how.layout, how.fill, None, dtype=kind_of(tensor.detach().cpu().numpy()))

@@ -1,4 +1,4 @@
-"""Marching through baked voxels in blocks, one voxel a step, and compositing what lies there (Hedman 2021)."""
+"""Marching through baked voxels in blocks, one voxel a step, and compositing them (Hedman 2021)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
-FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=9, smooth=(2, 3, 7))
+FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=5, compiled=9, smooth=(2, 3, 7))
 
 CHANNELS = 8  # of a voxel: red, green, blue, alpha, four features
 ALPHA = 3
-MAX_VOXEL_DISTANCE = 6  # of an empty voxel's distance to what is not empty, that is told
-MAX_BLOCK_DISTANCE = 64  # of an empty block's
+MAX_VOXEL_DISTANCE = 6  # voxels; limit of a stored distance from an empty voxel to one that is not empty
+MAX_BLOCK_DISTANCE = 64  # blocks; the same for empty blocks
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ class Blocks:
 
 
 def _with_distances(rows: Int32[Tensor, "n x y z"], farthest: int, beyond: bool) -> Int32[Tensor, "n x y z"]:
-    """Rows whose empty places say how far what is not empty is. beyond: whether there may be something around them"""
+    """Rows with distances to the nearest row at empty places. beyond: whether there may be rows around them"""
     near = torch.nn.functional.pad(rows >= 0, (1,) * 6, value=beyond)
     far = torch.full_like(near, farthest, dtype=torch.int8)
     for distance in range(1, farthest):
@@ -123,14 +121,14 @@ def block_march(
     out, h^2 s / r^2 the ray's speed in contracted voxels, s^2 = 1 + 4 (r sin / h)^2 (1 - h / r). To first order that
     is r^2 / (h^2 s), the rest makes it exact straight in and out.
 
-    origins:      in voxels; the centre of voxel (x, y, z) is there. Nothing contracts them
+    origins:      in voxels; the centre of voxel (x, y, z) is there; never contracted
     directions:   unit length
     enter, leave: distances of the first step and of the end, in voxels as origins
     blocks:       which row each voxel has, 0 where it has none; trusted to be as its maker leaves it
     values:       (blocks.count, 8): red, green, blue, alpha, four features, all but alpha multiplied by alpha
 
     Returns sum_i T_i v_i (R, 8), of which alpha's channel is the opacity, and sum_i T_i alpha_i t_i (R,).
-    Both are differentiable in the values. A march of one step looks up what is at a point.
+    Both are differentiable in the values. A march of one step is a lookup at a point.
     """
     require(len(values) == blocks.count, f"{len(values)} rows of values, where blocks have {blocks.count}")
     return implementation("block_march", origins)(origins, directions, enter, leave, blocks, values, stop)

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 from ..sparse_grid.cpu import slabs_of
 from .reference import MIN_STRIDE_DIVISOR
 
@@ -142,10 +142,34 @@ def blended(values, at, weights, count, seen):
             seen[c] += weight * values[row, c]
 
 
+@njit(inline="always")
+def next_met(o, d, t, end, ahead, aside, index, rows, ball, at, weights):
+    """The first step from t on that meets voxels with rows, and how many these are; 0 if there is none before the end.
+
+    ahead, aside: of `nearest`; at, weights: filled as by `corners`
+    """
+    block, count = rows.shape[1] - 2, 0
+    while t < end:
+        x, y, z = placed(o, d, t, ball)
+        bx, by, bz, number = block_of(x, y, z, index, block)
+        if number < 0:
+            t = later(t, past(x, y, z, d, bx, by, bz, number, block, ball), ahead, aside, ball)
+            continue
+        (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
+        leap = onward(rows[number, cx, cy, cz], ball)
+        if leap == 0:
+            count = corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights)
+            if count > 0:
+                break
+            leap = np.int64(1)
+        t = later(t, leap, ahead, aside, ball)
+    return t, count
+
+
 @njit(parallel=True, fastmath=True, cache=True)
 def _forward(origins, directions, enter, leave, index, rows, values, ball, stop, totals, distance, lengths):
     """lengths: how many steps of each ray met something"""
-    n, block = len(origins), rows.shape[1] - 2
+    n = len(origins)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights = np.empty(9, np.int64), np.empty(9, np.float32)
         seen, total = np.empty(C, np.float32), np.empty(C, np.float32)
@@ -155,25 +179,16 @@ def _forward(origins, directions, enter, leave, index, rows, values, ball, stop,
             light, along, met = ONE, ZERO, 0
             for c in range(C):
                 total[c] = ZERO
-            while t < leave[r] and light >= stop:
-                x, y, z = placed(o, d, t, ball)
-                bx, by, bz, number = block_of(x, y, z, index, block)
-                if number < 0:
-                    t = later(t, past(x, y, z, d, bx, by, bz, number, block, ball), ahead, aside, ball)
-                    continue
-                (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
-                leap = onward(rows[number, cx, cy, cz], ball)
-                if leap > 0:
-                    t = later(t, leap, ahead, aside, ball)
-                    continue
-                count = corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights)
-                if count > 0:
-                    met += 1
-                    blended(values, at, weights, count, seen)
-                    for c in range(C):
-                        total[c] += light * seen[c]
-                    along += light * seen[A] * t
-                    light *= ONE - seen[A]
+            while light >= stop:
+                t, count = next_met(o, d, t, leave[r], ahead, aside, index, rows, ball, at, weights)
+                if count == 0:
+                    break
+                met += 1
+                blended(values, at, weights, count, seen)
+                for c in range(C):
+                    total[c] += light * seen[c]
+                along += light * seen[A] * t
+                light *= ONE - seen[A]
                 t = later(t, 1, ahead, aside, ball)
             for c in range(C):
                 totals[r, c] = total[c]
@@ -181,32 +196,19 @@ def _forward(origins, directions, enter, leave, index, rows, values, ball, stop,
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _steps(origins, directions, enter, leave, index, rows, values, ball, stop, starts, steps, lights):
+def _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, lights):
     """Distances of the steps of each ray that met something, and the light that reached them."""
-    n, block = len(origins), rows.shape[1] - 2
+    n = len(origins)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights, seen = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            o, d, t = origins[r], directions[r], enter[r]
+            o, d, t, light = origins[r], directions[r], enter[r], ONE
             ahead, aside = nearest(o, d, ball)
-            light, s = ONE, starts[r]
-            while s < starts[r + 1]:
-                x, y, z = placed(o, d, t, ball)
-                bx, by, bz, number = block_of(x, y, z, index, block)
-                if number < 0:
-                    t = later(t, past(x, y, z, d, bx, by, bz, number, block, ball), ahead, aside, ball)
-                    continue
-                (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
-                leap = onward(rows[number, cx, cy, cz], ball)
-                if leap > 0:
-                    t = later(t, leap, ahead, aside, ball)
-                    continue
-                count = corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights)
-                if count > 0:
-                    blended(values, at, weights, count, seen)
-                    steps[s], lights[s] = t, light
-                    light *= ONE - seen[A]
-                    s += 1
+            for s in range(starts[r], starts[r + 1]):
+                t, count = next_met(o, d, t, leave[r], ahead, aside, index, rows, ball, at, weights)
+                blended(values, at, weights, count, seen)
+                steps[s], lights[s] = t, light
+                light *= ONE - seen[A]
                 t = later(t, 1, ahead, aside, ball)
 
 
@@ -258,11 +260,11 @@ def _spread(owed, points, index, rows, order, starts, out):
 
 
 def forward(ctx, origins, directions, enter, leave, blocks, values, stop):
-    ctx.blocks, ctx.stop = blocks, np.float32(stop)
+    ctx.blocks = blocks
     totals, distance = empty(len(origins), C), empty(len(origins))
     lengths = torch.zeros(len(origins), dtype=torch.int64)
     given = (x.detach().numpy() for x in (origins, directions, enter, leave, blocks.index, blocks.rows, values))
-    _forward(*given, np.float32(blocks.ball), ctx.stop, totals.numpy(), distance.numpy(), lengths.numpy())
+    _forward(*given, np.float32(blocks.ball), np.float32(stop), totals.numpy(), distance.numpy(), lengths.numpy())
     ctx.save_for_backward(origins, directions, enter, leave, values, lengths)
     return totals, distance
 
@@ -274,9 +276,23 @@ def backward(ctx, g_totals, g_distance):
     total, block = int(starts[-1]), ctx.blocks.block
     ball, first = np.float32(ctx.blocks.ball), np.empty(total, np.int32)
     steps, lights, points, owed = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
-    _steps(origins, directions, enter, leave, index, rows, values, ball, ctx.stop, starts, steps, lights)
-    grads = g_totals.contiguous().numpy(), g_distance.contiguous().numpy()
-    _owed(*grads, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, owed)
+    _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, lights)
+    _owed(
+        g_totals.numpy(),
+        g_distance.numpy(),
+        origins,
+        directions,
+        index,
+        rows,
+        values,
+        ball,
+        starts,
+        steps,
+        lights,
+        points,
+        first,
+        owed,
+    )
     # Places of one slab of cells touch its voxels and the next one's first: see `sparse_grid`.
     order, slabs = slabs_of(first, block * index.shape[0] + 1)
     to_values = torch.zeros(values.shape)

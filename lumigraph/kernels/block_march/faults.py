@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "a leap too far": ("cpu", "onward", "np.int64(-1 - row)", "np.int64(-row)"),
@@ -17,7 +17,4 @@ FAULTS = {
     "what lies behind is not hidden there": ("gpu", "_backward", "g_along * t - hidden", "g_along * t"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "the block beyond the grid": ("cpu", "block_of", "ix < index.shape[0]", "ix <= index.shape[0]"),
-}
+ASTRAY = {"the block beyond the grid": ("cpu", "block_of", "ix < index.shape[0]", "ix <= index.shape[0]")}

@@ -1,18 +1,16 @@
 """Triton: one lane takes one ray. Gradients of the rows meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row
+from .._gpu import blocks, indices, launch, load_row
+from .._operation import differentiable, empty
 from ..sparse_grid.gpu import corner_of, weight_of
-from . import ALPHA, CHANNELS, Blocks
+from . import ALPHA, CHANNELS
 from .reference import MIN_STRIDE_DIVISOR
 
-BLOCK = 32  # rays; they march together, so a program is as slow as its slowest
+BLOCK = tl.constexpr(32)  # rays; they march together, so a program is as slow as its slowest
 C, A = tl.constexpr(CHANNELS), tl.constexpr(ALPHA)
 MIN_DIVISOR = tl.constexpr(MIN_STRIDE_DIVISOR)
 SURE_STEP = tl.constexpr(0.9)  # voxels of a step, in a count of steps that must not lead too far
@@ -104,7 +102,7 @@ def _row_of(rows, number, voxel, there, B: tl.constexpr):
 
 
 @triton.jit
-def _blended(rows, values, number, voxel, f, there, BLOCK: tl.constexpr, B: tl.constexpr):
+def _blended(rows, values, number, voxel, f, there, B: tl.constexpr):
     """What is at each place, and whether any of the eight voxels around it has a row."""
     c = tl.arange(0, C)
     seen = tl.zeros([BLOCK, C], tl.float32)
@@ -125,34 +123,15 @@ def _alpha(seen):
 
 @triton.jit(do_not_specialize=["R"])
 def _march(
-    origins,
-    directions,
-    enter,
-    leave,
-    index,
-    rows,
-    values,
-    totals,
-    distance,
-    lengths,
-    starts,
-    steps,
-    lights,
-    R,
-    X,
-    Y,
-    Z,
-    ball,
-    stop,
-    NOTE: tl.constexpr,
-    CURVED: tl.constexpr,
-    BLOCK: tl.constexpr,
-    B: tl.constexpr,
+    rays, grid, values, sums, noted, R, X, Y, Z, ball, stop, NOTE: tl.constexpr, CURVED: tl.constexpr, B: tl.constexpr
 ):
     """Composite along each ray; or NOTE its steps that meet something, and the light that reaches them."""
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    origins, directions, enter, leave = rays
+    index, rows = grid
+    totals, distance, lengths = sums
+    starts, steps, lights = noted
+    r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
-    here = r < R
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     t = tl.load(enter + r, mask=here, other=0.0)
@@ -176,7 +155,7 @@ def _march(
         if CURVED:  # a step may be longer than a voxel
             leap = tl.maximum(leap - 1, 0)
         there &= leap == 0
-        seen, some = _blended(rows, values, number, voxel, f, there, BLOCK, B)
+        seen, some = _blended(rows, values, number, voxel, f, there, B)
         alpha = _alpha(seen)
         if NOTE:
             place = first + met
@@ -202,31 +181,14 @@ def _march(
 
 
 @triton.jit(do_not_specialize=["R"])
-def _backward(
-    g_totals,
-    g_distance,
-    origins,
-    directions,
-    index,
-    rows,
-    values,
-    starts,
-    steps,
-    lights,
-    to_values,
-    R,
-    X,
-    Y,
-    Z,
-    ball,
-    CURVED: tl.constexpr,
-    BLOCK: tl.constexpr,
-    B: tl.constexpr,
-):
+def _backward(grads, rays, grid, values, noted, to_values, R, X, Y, Z, ball, CURVED: tl.constexpr, B: tl.constexpr):
     """From the back of each ray to its front: dL/dv = T g, and for alpha beside it what it hides of all behind it."""
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    g_totals, g_distance = grads
+    origins, directions = rays
+    index, rows = grid
+    starts, steps, lights = noted
+    r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
-    here = r < R
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     g = tl.load(g_totals + r[:, None] * C + c[None, :], mask=here[:, None], other=0.0)
@@ -242,7 +204,7 @@ def _backward(
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
         there = number >= 0
         voxel, f = _voxel_of(x, y, z, bx, by, bz, B)
-        seen, _ = _blended(rows, values, number, voxel, f, there, BLOCK, B)
+        seen, _ = _blended(rows, values, number, voxel, f, there, B)
         alpha = _alpha(seen)
         owed = light[:, None] * (g + tl.where(c[None, :] == A, (g_along * t - hidden)[:, None], 0.0))
         for k in tl.static_range(8):
@@ -256,39 +218,30 @@ def _backward(
         alive &= s >= first
 
 
-def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
+def forward(ctx, origins, directions, enter, leave, voxels, values, stop):
     device, rays = origins.device, len(origins)
-    ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
-    ctx.sizes = rays, *blocks.index.shape, float(blocks.ball)
-    ctx.options = {"CURVED": blocks.ball > 0, "BLOCK": BLOCK, "B": blocks.block}
-    ctx.options |= {"num_warps": 1, "enable_fp_fusion": False}
-    ctx.stop = float(stop)
+    ctx.voxels = voxels.index.contiguous(), voxels.rows.contiguous()
+    ctx.grid, ctx.sizes, ctx.stop = (blocks(rays, BLOCK),), (rays, *voxels.index.shape, float(voxels.ball)), float(stop)
+    ctx.options = {"CURVED": voxels.ball > 0, "B": voxels.block, "num_warps": 1, "enable_fp_fusion": False}
     totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
     lengths = torch.zeros(rays, dtype=torch.int32, device=device)
-    if rays:
-        out = totals, distance, lengths, lengths, distance, distance  # the last three are only noted into
-        rest = *out, *ctx.sizes, ctx.stop
-        _march[(triton.cdiv(rays, BLOCK),)](
-            origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
-        )
-    ctx.save_for_backward(origins, directions, enter, leave, values, totals, distance, lengths)
+    out, noted = (totals, distance, lengths), (lengths, distance, distance)  # into `noted` nothing is written here
+    given = (origins, directions, enter, leave), ctx.voxels, values, out, noted
+    launch(_march, ctx.grid, *given, *ctx.sizes, ctx.stop, NOTE=False, **ctx.options)
+    ctx.save_for_backward(origins, directions, enter, leave, values, *out)
     return totals, distance
 
 
-def backward(ctx, g_totals, g_distance):
+def backward(ctx, *grads):
     origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
     starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
     steps = torch.zeros(int(starts[-1]), device=values.device)
     lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
-    if len(origins):
-        grid = (triton.cdiv(len(origins), BLOCK),)
-        out = totals, distance, lengths, starts, steps, lights
-        rest = *out, *ctx.sizes, ctx.stop
-        _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
-        grads = g_totals.contiguous(), g_distance.contiguous()
-        noted = starts, steps, lights, to_values
-        given = origins, directions, *ctx.given, values
-        _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
+    out, noted = (totals, distance, lengths), (starts, steps, lights)
+    given = (origins, directions, enter, leave), ctx.voxels, values, out, noted
+    launch(_march, ctx.grid, *given, *ctx.sizes, ctx.stop, NOTE=True, **ctx.options)
+    inputs = grads, (origins, directions), ctx.voxels, values, noted, to_values
+    launch(_backward, ctx.grid, *inputs, *ctx.sizes, **ctx.options)
     return None, None, None, None, None, to_values, None
 
 

@@ -1,7 +1,5 @@
 """The definition: every step of every ray, looked up and composited."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch

@@ -1,14 +1,10 @@
 """Compositing: samples along rays become one value per ray."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require_starts
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require_starts
 
 FACTS = Facts(unit="samples", outputs=3, differentiable=(0, 1), typical=13, compiled=15, smooth=(15,))
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 
 ONE = np.float32(1)
 
@@ -65,8 +65,7 @@ def forward(ctx, tau, values, starts, stop):
 def backward(ctx, *grads):
     saved = [x.detach().numpy() for x in ctx.saved_tensors]
     to_tau, to_values = (empty(*x.shape) for x in ctx.saved_tensors[:2])
-    arrays = (g.contiguous().numpy() for g in grads)
-    _backward(*arrays, *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
+    _backward(*(g.numpy() for g in grads), *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
     return to_tau, to_values, None, None
 
 

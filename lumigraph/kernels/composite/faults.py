@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "sign": ("gpu", "_backward", " - after", " + after"),
@@ -8,7 +8,4 @@ FAULTS = {
     "attenuation forgotten": ("cpu", "_backward", "worth * through - behind", "worth * through"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a weight of the next sample": ("cpu", "_forward", "weights[i] = w", "weights[i + 1] = w"),
-}
+ASTRAY = {"a weight of the next sample": ("cpu", "_forward", "weights[i] = w", "weights[i + 1] = w")}

@@ -1,13 +1,12 @@
 """Triton: one program takes one ray, a block of samples at a time."""
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
+from .._gpu import launch
+from .._operation import differentiable, empty
 
-BLOCK = 32  # samples; most rays of a trained scene need one or two blocks
+BLOCK = tl.constexpr(32)  # samples; most rays of a trained scene need one or two blocks
 
 
 @triton.jit
@@ -19,9 +18,8 @@ def _thickness(tau, i, i0, b, before):
 
 
 @triton.jit
-def _forward(
-    tau, values, ray_starts, total, opacity, weights, stop, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
-):
+def _forward(tau, values, ray_starts, outputs, stop, C: tl.constexpr, CHANNELS: tl.constexpr):
+    total, opacity, weights = outputs
     r = tl.program_id(0).to(tl.int64)
     i0, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
     c = tl.arange(0, CHANNELS)
@@ -47,24 +45,10 @@ def _forward(
 
 
 @triton.jit
-def _backward(
-    d_total,
-    d_opacity,
-    d_weights,
-    tau,
-    values,
-    ray_starts,
-    total,
-    opacity,
-    weights,
-    d_tau,
-    d_values,
-    stop,
-    C: tl.constexpr,
-    CHANNELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _backward(grads, tau, values, ray_starts, outputs, d_tau, d_values, stop, C: tl.constexpr, CHANNELS: tl.constexpr):
     """With g_i the loss's derivative in w_i:  dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j,  dL/dv_i = w_i dL/dtotal."""
+    d_total, d_opacity, d_weights = grads
+    total, opacity, weights = outputs
     r = tl.program_id(0).to(tl.int64)
     a, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
     c = tl.arange(0, CHANNELS)
@@ -97,24 +81,20 @@ def _backward(
 
 def forward(ctx, tau, values, ray_starts, stop):
     rays, channels = len(ray_starts) - 1, values.shape[1]
-    shapes = (rays, channels), (rays,), (len(tau),)
-    total, opacity, weights = (empty(*shape, device=tau.device) for shape in shapes)
-    ctx.sizes = {"C": channels, "CHANNELS": max(triton.next_power_of_2(channels), 1), "BLOCK": BLOCK}
+    outputs = tuple(empty(*shape, device=tau.device) for shape in ((rays, channels), (rays,), (len(tau),)))
+    ctx.sizes = {"C": channels, "CHANNELS": max(triton.next_power_of_2(channels), 1), "num_warps": 1}
     ctx.stop = stop
-    if rays:
-        _forward[(rays,)](tau, values, ray_starts, total, opacity, weights, stop, **ctx.sizes, num_warps=1)
-    ctx.save_for_backward(tau, values, ray_starts, total, opacity, weights)
-    return total, opacity, weights
+    launch(_forward, (rays,), tau, values, ray_starts, outputs, stop, **ctx.sizes)
+    ctx.save_for_backward(tau, values, ray_starts, *outputs)
+    return outputs
 
 
 def backward(ctx, *grads):
     tau, values, ray_starts, *outputs = ctx.saved_tensors
-    d_tau, d_values = (empty(*x.shape, device=x.device) for x in (tau, values))
-    if len(ray_starts) > 1:
-        given = *(g.contiguous() for g in grads), tau, values, ray_starts, *outputs
-        grid = (len(ray_starts) - 1,)
-        _backward[grid](*given, d_tau, d_values, ctx.stop, **ctx.sizes, num_warps=1)
-    return d_tau, d_values, None, None
+    found = [empty(*x.shape, device=x.device) for x in (tau, values)]
+    given = grads, tau, values, ray_starts, tuple(outputs), *found
+    launch(_backward, (len(ray_starts) - 1,), *given, ctx.stop, **ctx.sizes)
+    return *found, None, None
 
 
 run = differentiable(forward, backward)

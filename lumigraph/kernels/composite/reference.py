@@ -1,7 +1,5 @@
 """The definition: rays laid out as rows, (R, K) with K the longest ray."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

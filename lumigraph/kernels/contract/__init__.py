@@ -1,14 +1,10 @@
-"""Contraction: all of space in a ball of radius 1, as networks and grids of open captures need it."""
-
-from __future__ import annotations
+"""Contraction: all of space in a ball of radius 1, for networks and grids of unbounded scenes."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door
-from .._facts import Facts
+from .._operation import Facts, door, implementation
 
 FACTS = Facts(unit="points", outputs=2, differentiable=(), typical=3, compiled=3)
 
@@ -17,7 +13,7 @@ FACTS = Facts(unit="points", outputs=2, differentiable=(), typical=3, compiled=3
 def contract(
     points: Float[Tensor, "point 3"], stretch: bool = False
 ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"] | None]:
-    """Coordinates of points, half of contract(x) (Barron 2022, eq. 10), and their stretch where it is asked for.
+    """Coordinates of points, half of contract(x) (Barron 2022, eq. 10), and on request their stretch.
 
         c(x) = x / 2 for |x| <= 1, else (2 - 1 / |x|) x / (2 |x|)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._operation import empty
 
 
 @njit(inline="always")

@@ -1,15 +1,12 @@
 """Triton: one program takes a block of points."""
 
-from __future__ import annotations
-
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._gpu import blocks, indices, launch, load_row, store_row
+from .._operation import empty
 
-BLOCK = 256
+BLOCK = tl.constexpr(256)
 
 
 @triton.jit
@@ -26,25 +23,17 @@ def stretch_of(inverse, across):
 
 
 @triton.jit
-def _contract(points, coordinates, stretch, count, STRETCH: tl.constexpr, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
-    x = tl.load(points + 3 * i, mask=here, other=0.0)
-    y = tl.load(points + 3 * i + 1, mask=here, other=0.0)
-    z = tl.load(points + 3 * i + 2, mask=here, other=0.0)
+def _contract(points, coordinates, stretch, count, STRETCH: tl.constexpr):
+    i, here = indices(count, BLOCK)
+    x, y, z = load_row(points, i, here)
     inverse, across = scale_of(x, y, z)
-    tl.store(coordinates + 3 * i, across * x, mask=here)
-    tl.store(coordinates + 3 * i + 1, across * y, mask=here)
-    tl.store(coordinates + 3 * i + 2, across * z, mask=here)
+    store_row(coordinates, i, (across * x, across * y, across * z), here)
     if STRETCH:
         tl.store(stretch + i, stretch_of(inverse, across), mask=here)
 
 
-@torch.no_grad()
-def run(points: Tensor, stretch: bool) -> tuple[Tensor, Tensor | None]:
+def run(points, stretch):
     count, device = len(points), points.device
     coordinates, lengths = empty(count, 3, device=device), empty(count if stretch else 0, device=device)
-    if count:
-        grid = (triton.cdiv(count, BLOCK),)
-        _contract[grid](points.contiguous(), coordinates, lengths, count, STRETCH=stretch, BLOCK=BLOCK)
+    launch(_contract, (blocks(count, BLOCK),), points.contiguous(), coordinates, lengths, count, STRETCH=stretch)
     return coordinates, lengths if stretch else None

@@ -1,7 +1,5 @@
 """The definition: Barron 2022, eq. 10, halved, and the determinant of its Jacobian."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

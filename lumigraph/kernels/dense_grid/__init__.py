@@ -1,14 +1,10 @@
 """Trilinear lookup of a grid's channels, as voxel grids of density and features need it for every sample."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1), typical=3, compiled=3, smooth=(5,))
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 from ..hash_encode.cpu import BLOCK, blend, spread
 
 FAST = {"fastmath": True, "cache": True, "error_model": "numpy"}
@@ -122,6 +122,7 @@ def _slabs(points, box, planes, parts):
 
 
 def forward(ctx, points, grid, box):
+    points, grid = points.contiguous(), grid.contiguous()
     ctx.save_for_backward(points, grid)
     ctx.box = _scaled(box, grid).numpy()
     out = empty(grid.shape[3], len(points))
@@ -153,4 +154,4 @@ def _scaled(box, grid):
     return torch.stack([box[0], (torch.tensor(grid.shape[:3]) - 1) / (box[1] - box[0])])
 
 
-run = differentiable(forward, backward)
+run = differentiable(forward, backward, contiguous=False)

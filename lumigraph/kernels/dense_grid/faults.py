@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_grid", "tl.static_range(8)", "tl.static_range(7)"),
@@ -11,7 +11,4 @@ FAULTS = {
     "slope's sign on the cpu": ("cpu", "_point_gradient", "(2 * by - 1)", "(1 - 2 * by)"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "the point 1.0, a corner too far": ("cpu", "_axis", "np.int32(size - 2)", "np.int32(size - 1)"),
-}
+ASTRAY = {"the point 1.0, a corner too far": ("cpu", "_axis", "np.int32(size - 2)", "np.int32(size - 1)")}

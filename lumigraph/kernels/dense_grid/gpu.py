@@ -1,16 +1,14 @@
 """Triton: one program takes a block of points. Gradients of the grid meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
+from .._operation import differentiable, empty
 from ..sparse_grid.gpu import corner_of, slope_of, weight_of
 
-BLOCK = 64
+BLOCK = tl.constexpr(64)
 
 
 @triton.jit
@@ -39,10 +37,9 @@ def _entry(corner, Y, Z):
 
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
-def _forward(points, grid, box, out, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _forward(points, grid, box, out, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, CHANNELS)
-    here = i < S
     there = here[:, None] & (c < C)[None, :]
     cell, f, _ = _cell_of(points, box, i, here, X, Y, Z)
     total = tl.zeros([BLOCK, CHANNELS], tl.float32)
@@ -54,10 +51,9 @@ def _forward(points, grid, box, out, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.c
 
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
-def _backward_grid(grad, points, box, d_grid, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _backward_grid(grad, points, box, d_grid, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, CHANNELS)
-    here = i < S
     there = here[:, None] & (c < C)[None, :]
     cell, f, _ = _cell_of(points, box, i, here, X, Y, Z)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=there, other=0.0)
@@ -68,12 +64,9 @@ def _backward_grid(grad, points, box, d_grid, S, X, Y, Z, C: tl.constexpr, CHANN
 
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
-def _backward_points(
-    grad, points, grid, box, d_points, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
-):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _backward_points(grad, points, grid, box, d_points, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, CHANNELS)
-    here = i < S
     there = here[:, None] & (c < C)[None, :]
     cell, f, inside = _cell_of(points, box, i, here, X, Y, Z)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=there, other=0.0)
@@ -93,27 +86,23 @@ def _backward_points(
 
 def forward(ctx, points, grid, box):
     (X, Y, Z, C), S = grid.shape, len(points)
-    ctx.sizes = {"S": S, "X": X, "Y": Y, "Z": Z, "C": C, "CHANNELS": triton.next_power_of_2(C), "BLOCK": BLOCK}
+    ctx.sizes = {"S": S, "X": X, "Y": Y, "Z": Z, "C": C, "CHANNELS": triton.next_power_of_2(C)}
     ctx.box = torch.stack([box[0], (torch.tensor([X, Y, Z], device=box.device) - 1) / (box[1] - box[0])])
     out = empty(S, C, device=points.device)
-    if S:
-        _forward[(triton.cdiv(S, BLOCK),)](points, grid, ctx.box, out, **ctx.sizes)
+    launch(_forward, (blocks(S, BLOCK),), points, grid, ctx.box, out, **ctx.sizes)
     ctx.save_for_backward(points, grid)
     return out
 
 
 def backward(ctx, grad):
     points, grid = ctx.saved_tensors
-    grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
-    d_points = d_grid = None
+    programs, d_points, d_grid = (blocks(len(points), BLOCK),), None, None
     if ctx.needs_input_grad[0]:
         d_points = empty(*points.shape, device=points.device)
-        if blocks:
-            _backward_points[(blocks,)](grad, points, grid, ctx.box, d_points, **ctx.sizes)
+        launch(_backward_points, programs, grad, points, grid, ctx.box, d_points, **ctx.sizes)
     if ctx.needs_input_grad[1]:
         d_grid = torch.zeros_like(grid)
-        if blocks:
-            _backward_grid[(blocks,)](grad, points, ctx.box, d_grid, **ctx.sizes)
+        launch(_backward_grid, programs, grad, points, ctx.box, d_grid, **ctx.sizes)
     return d_points, d_grid, None
 
 

@@ -1,7 +1,5 @@
 """The definition: what PyTorch has for it."""
 
-from __future__ import annotations
-
 from torch import Tensor
 from torch.nn.functional import grid_sample
 

@@ -1,14 +1,10 @@
-"""Distortion: how far apart along its ray the weight of what a ray sees lies."""
-
-from __future__ import annotations
+"""Distortion loss: how far apart the weights along a ray lie."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require_starts
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require_starts
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0,), typical=5, compiled=5, smooth=(2, 3, 4))
 

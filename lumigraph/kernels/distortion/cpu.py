@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 
 THIRD = np.float32(1 / 3)
 
@@ -47,7 +47,7 @@ def forward(ctx, weights, middles, lengths, starts):
 def backward(ctx, to_total):
     saved = [x.detach().numpy() for x in ctx.saved_tensors]
     to_weights = empty(len(saved[0]))
-    _backward(to_total.contiguous().numpy(), *saved, to_weights.numpy())
+    _backward(to_total.numpy(), *saved, to_weights.numpy())
     return to_weights, None, None, None
 
 

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "the samples behind forgotten": ("cpu", "_backward", "weight -= weights[i]", "weight -= 0"),
@@ -8,7 +8,4 @@ FAULTS = {
     "a sample before itself": ("gpu", "_forward", "tl.cumsum(w * m, 0) - w * m", "tl.cumsum(w * m, 0)"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a gradient of the next sample": ("cpu", "_backward", "to_weights[i] = ", "to_weights[i + 1] = "),
-}
+ASTRAY = {"a gradient of the next sample": ("cpu", "_backward", "to_weights[i] = ", "to_weights[i + 1] = ")}

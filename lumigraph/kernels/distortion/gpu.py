@@ -1,13 +1,12 @@
 """Triton: one program takes one ray, a block of samples at a time."""
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
+from .._gpu import launch
+from .._operation import differentiable, empty
 
-BLOCK = 32  # samples; most rays of a trained scene need one or two blocks
+BLOCK = tl.constexpr(32)  # samples; most rays of a trained scene need one or two blocks
 
 
 @triton.jit
@@ -18,7 +17,7 @@ def _load(weights, middles, lengths, i, b):
 
 
 @triton.jit
-def _forward(weights, middles, lengths, ray_starts, total, BLOCK: tl.constexpr):
+def _forward(weights, middles, lengths, ray_starts, total):
     r = tl.program_id(0).to(tl.int64)
     a, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
     weight, moment, found = 0.0, 0.0, 0.0
@@ -33,7 +32,7 @@ def _forward(weights, middles, lengths, ray_starts, total, BLOCK: tl.constexpr):
 
 
 @triton.jit
-def _backward(d_total, weights, middles, lengths, ray_starts, d_weights, BLOCK: tl.constexpr):
+def _backward(d_total, weights, middles, lengths, ray_starts, d_weights):
     r = tl.program_id(0).to(tl.int64)
     a, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
     g = tl.load(d_total + r)
@@ -54,8 +53,7 @@ def _backward(d_total, weights, middles, lengths, ray_starts, d_weights, BLOCK: 
 
 def forward(ctx, weights, middles, lengths, ray_starts):
     total = empty(len(ray_starts) - 1, device=weights.device)
-    if len(total):
-        _forward[(len(total),)](weights, middles, lengths, ray_starts, total, BLOCK=BLOCK, num_warps=1)
+    launch(_forward, (len(total),), weights, middles, lengths, ray_starts, total, num_warps=1)
     ctx.save_for_backward(weights, middles, lengths, ray_starts)
     return total
 
@@ -63,9 +61,7 @@ def forward(ctx, weights, middles, lengths, ray_starts):
 def backward(ctx, d_total):
     weights, *rest = ctx.saved_tensors
     d_weights = empty(*weights.shape, device=weights.device)
-    if len(d_total):
-        grid = (len(d_total),)
-        _backward[grid](d_total.contiguous(), weights, *rest, d_weights, BLOCK=BLOCK, num_warps=1)
+    launch(_backward, (len(d_total),), d_total, weights, *rest, d_weights, num_warps=1)
     return d_weights, None, None, None
 
 

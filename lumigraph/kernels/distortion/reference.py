@@ -1,7 +1,5 @@
 """The definition: every sample with every other of its ray."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Factorised grids: values in a box as sums of products of planes and lines, or of three lines."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -10,9 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(1,), typical=2, compiled=4, smooth=(5, 11))
 
@@ -66,10 +62,7 @@ class Factors:
 
 @door
 def factor_grid(
-    points: Float[Tensor, "sample 3"],
-    table: Float[Tensor, "row component"],
-    factors: Factors,
-    summed: bool = False,
+    points: Float[Tensor, "sample 3"], table: Float[Tensor, "row component"], factors: Factors, summed: bool = False
 ) -> Float[Tensor, "sample width"]:
     """Each component's product of factors at each point (Chen 2022, eqs. 2 to 4), planes and lines interpolated.
 

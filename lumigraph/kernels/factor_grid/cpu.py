@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
 from .._lanes import LANES, fetch, put, totals
+from .._operation import differentiable, empty
 from . import MODES
 
 # All but "reassoc": sums over corners stay in their order.
@@ -175,7 +175,7 @@ def backward(ctx, grad):
     _places(_flat(points, 2), nodes, cells, fractions)
     found, lines = empty(*table.shape), sum(factors.sizes[-3:])
     sums = torch.zeros(BANDS, lines, width)
-    given = _flat(grad.contiguous()), cells, fractions, _flat(table)
+    given = _flat(grad), cells, fractions, _flat(table)
     if factors.kind == "vm":
         edges = np.stack([_bands(cells[axes[0]], nodes[axes[0]]) for axes in MODES])
         _spread_planes(*given, nodes, starts, AXES, edges, width, summed, _flat(found), _flat(sums))

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "the other axis's step": ("cpu", "_look_up", "ny * width, width, fx, fy", "nz * width, width, fx, fy"),
@@ -11,7 +11,4 @@ FAULTS = {
     "own factor instead of another's, on the gpu": ("gpu", "_backward", "slope * a * d", "slope * b * d"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "the point 1.0, a node too far": ("cpu", "_place", "np.int64(s), n - 2)", "np.int64(s), n - 1)"),
-}
+ASTRAY = {"the point 1.0, a node too far": ("cpu", "_place", "np.int64(s), n - 2)", "np.int64(s), n - 1)")}

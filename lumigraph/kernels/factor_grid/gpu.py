@@ -1,14 +1,13 @@
 """Triton: one program takes a block of points through all components. Gradients meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
+from .._gpu import blocks, indices, launch
+from .._operation import differentiable, empty
 
-BLOCK = 64  # samples
+BLOCK = tl.constexpr(64)  # samples
 MAX_COMPONENTS = 32  # components taken together
 
 
@@ -50,21 +49,9 @@ def _add_plane(table, row, across, f, g, c, there, x, R: tl.constexpr):
 
 @triton.jit(do_not_specialize=["S"])
 def _forward(
-    points,
-    table,
-    out,
-    S,
-    nx,
-    ny,
-    nz,
-    VM: tl.constexpr,
-    SUMMED: tl.constexpr,
-    R: tl.constexpr,
-    C: tl.constexpr,
-    BLOCK: tl.constexpr,
+    points, table, out, S, nx, ny, nz, VM: tl.constexpr, SUMMED: tl.constexpr, R: tl.constexpr, C: tl.constexpr
 ):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < S
+    i, here = indices(S, BLOCK)
     x, fx = _place(points, i, 0, here, nx)
     y, fy = _place(points, i, 1, here, ny)
     z, fz = _place(points, i, 2, here, nz)
@@ -109,10 +96,8 @@ def _backward(
     SUMMED: tl.constexpr,
     R: tl.constexpr,
     C: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < S
+    i, here = indices(S, BLOCK)
     x, fx = _place(points, i, 0, here, nx)
     y, fy = _place(points, i, 1, here, ny)
     z, fz = _place(points, i, 2, here, nz)
@@ -154,13 +139,12 @@ def _backward(
 
 
 def forward(ctx, points, table, factors, summed):
-    width, vm = table.shape[1], factors.kind == "vm"
+    width = table.shape[1]
     out = empty(len(points), 1 if summed else factors.products * width, device=points.device)
     ctx.numbers = len(points), *factors.nodes
-    ctx.shape = {"VM": vm, "SUMMED": summed, "R": width, "BLOCK": BLOCK}
+    ctx.shape = {"VM": factors.kind == "vm", "SUMMED": summed, "R": width}
     ctx.shape["C"] = min(MAX_COMPONENTS, triton.next_power_of_2(width))
-    if len(points):
-        _forward[(triton.cdiv(len(points), BLOCK),)](points, table, out, *ctx.numbers, **ctx.shape)
+    launch(_forward, (blocks(len(points), BLOCK),), points, table, out, *ctx.numbers, **ctx.shape)
     ctx.save_for_backward(points, table)
     return out
 
@@ -168,8 +152,7 @@ def forward(ctx, points, table, factors, summed):
 def backward(ctx, grad):
     points, table = ctx.saved_tensors
     d_table = torch.zeros_like(table)
-    if blocks := triton.cdiv(len(points), BLOCK):
-        _backward[(blocks,)](grad.contiguous(), points, table, d_table, *ctx.numbers, **ctx.shape)
+    launch(_backward, (blocks(len(points), BLOCK),), grad, points, table, d_table, *ctx.numbers, **ctx.shape)
     return None, d_table, None, None
 
 

@@ -1,7 +1,5 @@
 """The definition: PyTorch's own interpolation of planes and lines, as the paper's code composes it."""
 
-from __future__ import annotations
-
 from functools import reduce
 from operator import mul
 

@@ -1,14 +1,10 @@
 """Density and view-dependent colour of a sparse grid, in one lookup (Fridovich-Keil and Yu 2022, section 3.1)."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 from ..sparse_grid import Nodes, shell, some_nodes, through_the_shell
 
 FACTS = Facts(unit="samples", outputs=2, differentiable=(3, 4), typical=2, compiled=2, smooth=(4,))

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
 from .._lanes import fetch, put, put_where, totals
+from .._operation import differentiable, empty
 from ..sparse_grid.cpu import CHUNK, corners, in_slabs
 from ..spherical_harmonics import K00, K1, K20, K21, K22
 
@@ -116,10 +116,9 @@ def backward(ctx, d_density, d_rgb):
     points, directions = (x.detach().numpy() for x in ctx.saved_tensors)
     to_density, to_harmonics = (torch.zeros(shape) for shape in ctx.shapes)
     index, rows = ctx.nodes.index.numpy(), ctx.nodes.rows.numpy()
-    grads = d_density.contiguous().numpy(), d_rgb.contiguous().numpy()
     order, starts = in_slabs(points, index)
     out = to_density.numpy(), to_harmonics.view(-1).numpy()
-    _gradient(*grads, points, directions, index, rows, order, starts, LANES_OF, *out)
+    _gradient(d_density.numpy(), d_rgb.numpy(), points, directions, index, rows, order, starts, LANES_OF, *out)
     return None, None, None, to_density, to_harmonics
 
 

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward", "tl.static_range(8)", "tl.static_range(7)"),
@@ -9,12 +9,11 @@ FAULTS = {
     "density without weight": ("cpu", "_gradient", "weight * d_density[i]", "d_density[i]"),
 }
 
-# These let an index leave its array.
 ASTRAY = {
     "a register beyond the last row": (
         "cpu",
         "_look_up",
         "row * WIDTH + SECOND_REGISTER",
         "row * WIDTH + SECOND_REGISTER + 16",
-    ),
+    )
 }

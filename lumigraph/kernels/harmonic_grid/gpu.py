@@ -1,17 +1,15 @@
 """Triton: one program takes a block of samples. Gradients of the rows meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row
+from .._gpu import blocks, indices, launch, load_row
+from .._operation import differentiable, empty
 from ..sparse_grid.gpu import cell_of, corner_of, row_of, weight_of
 from ..spherical_harmonics.gpu import harmonic
 
-BLOCK = 64
+BLOCK = tl.constexpr(64)
 WIDTH = tl.constexpr(27)  # coefficients of a row, colours next to each other
 
 
@@ -26,10 +24,9 @@ def _basis(directions, i, here, c):
 
 
 @triton.jit(do_not_specialize=["S"])
-def _forward(points, directions, index, rows, density, harmonics, to_density, to_rgb, S, X, Y, Z, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _forward(points, directions, index, rows, density, harmonics, to_density, to_rgb, S, X, Y, Z):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, 32)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     sigma = tl.zeros([BLOCK], tl.float32)
     total = tl.zeros([BLOCK, 32], tl.float32)
@@ -47,10 +44,9 @@ def _forward(points, directions, index, rows, density, harmonics, to_density, to
 
 
 @triton.jit(do_not_specialize=["S"])
-def _backward(d_sigma, d_rgb, points, directions, index, rows, d_density, d_harmonics, S, X, Y, Z, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _backward(d_sigma, d_rgb, points, directions, index, rows, d_density, d_harmonics, S, X, Y, Z):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, 32)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g_sigma = tl.load(d_sigma + i, mask=here, other=0.0)
     g = tl.load(d_rgb + 3 * i[:, None] + c[None, :] % 3, mask=here[:, None], other=0.0)
@@ -68,18 +64,15 @@ def forward(ctx, points, directions, nodes, density, harmonics):
     ctx.sizes = (len(points), *nodes.index.shape)
     ctx.save_for_backward(points, directions)
     out = empty(len(points), device=points.device), empty(len(points), 3, device=points.device)
-    if len(points):
-        blocks = (triton.cdiv(len(points), BLOCK),)
-        _forward[blocks](points, directions, *ctx.index, density, harmonics, *out, *ctx.sizes, BLOCK=BLOCK)
+    ctx.grid = (blocks(len(points), BLOCK),)
+    launch(_forward, ctx.grid, points, directions, *ctx.index, density, harmonics, *out, *ctx.sizes)
     return out
 
 
-def backward(ctx, d_sigma, d_rgb):
+def backward(ctx, *grads):
     points, directions = ctx.saved_tensors
     out = [torch.zeros(shape, device=points.device) for shape in ctx.shapes]
-    if len(points):
-        blocks, grads = (triton.cdiv(len(points), BLOCK),), (d_sigma.contiguous(), d_rgb.contiguous())
-        _backward[blocks](*grads, points, directions, *ctx.index, *out, *ctx.sizes, BLOCK=BLOCK)
+    launch(_backward, ctx.grid, *grads, points, directions, *ctx.index, *out, *ctx.sizes)
     return None, None, None, *out
 
 

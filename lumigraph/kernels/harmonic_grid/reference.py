@@ -1,7 +1,5 @@
 """The definition: all 28 channels blended, then a scalar product with the harmonics."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

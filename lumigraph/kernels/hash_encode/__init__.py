@@ -1,7 +1,5 @@
 """Multiresolution hash encoding: features of a point, looked up at many scales."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,9 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1), typical=2, compiled=3, smooth=(8,))
 

@@ -5,11 +5,10 @@ that no two threads add to one place and the sum is the same every time."""
 from functools import cache
 
 import numpy as np
-import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import empty
 from .._lanes import LANES, fetch, fetch_like, gather, highest, lowest, put, real, scatter, whole
+from .._operation import differentiable, empty
 from ..sparse_grid.cpu import cell_of
 from . import PRIMES
 
@@ -166,34 +165,35 @@ def _grid(levels):
     return resolutions, np.array(levels.offsets), masks, (ONE,) * levels.features
 
 
-class _Encode(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, table, levels):
-        n, flat = len(points), _planes(points.detach())
-        ctx.levels = levels
-        ctx.save_for_backward(flat, table)
-        out = empty(levels.levels * levels.features, n)
-        share = max(BLOCK, min(CHUNK, -(-n // get_num_threads())))
-        _look_up(flat.numpy(), n, table.detach().numpy().reshape(-1), *_grid(levels), out.numpy().reshape(-1), share)
-        return out.t()
+def forward(ctx, points, table, levels):
+    n, flat, table = len(points), _planes(points.detach()), table.contiguous()
+    ctx.levels = levels
+    ctx.save_for_backward(flat, table)
+    out = empty(levels.levels * levels.features, n)
+    share = max(BLOCK, min(CHUNK, -(-n // get_num_threads())))
+    _look_up(flat.numpy(), n, table.detach().numpy().reshape(-1), *_grid(levels), out.numpy().reshape(-1), share)
+    return out.t()
 
-    @staticmethod
-    def backward(ctx, grad):
-        flat, table = ctx.saved_tensors
-        *grid, features = _grid(ctx.levels)
-        grad, n = grad.t().contiguous().numpy(), len(grad)
-        to_points = to_table = None
-        if ctx.needs_input_grad[0]:
-            to_points = empty(3, n)
-            points = flat[: 3 * n].view(3, n).numpy()
-            _point_gradient(grad, points, table.detach().numpy(), *grid, to_points.numpy())
-            to_points = to_points.t()
-        if ctx.needs_input_grad[1]:
-            to_table = empty(*table.shape)
-            order = _shared_out(ctx.levels.levels, get_num_threads())
-            given = grad.reshape(-1), flat.numpy(), n, *grid, order, features
-            _table_gradient(*given, to_table.numpy().reshape(-1))
-        return to_points, to_table, None
+
+def backward(ctx, grad):
+    flat, table = ctx.saved_tensors
+    *grid, features = _grid(ctx.levels)
+    grad, n = grad.t().contiguous().numpy(), len(grad)
+    to_points = to_table = None
+    if ctx.needs_input_grad[0]:
+        to_points = empty(3, n)
+        points = flat[: 3 * n].view(3, n).numpy()
+        _point_gradient(grad, points, table.detach().numpy(), *grid, to_points.numpy())
+        to_points = to_points.t()
+    if ctx.needs_input_grad[1]:
+        to_table = empty(*table.shape)
+        order = _shared_out(ctx.levels.levels, get_num_threads())
+        given = grad.reshape(-1), flat.numpy(), n, *grid, order, features
+        _table_gradient(*given, to_table.numpy().reshape(-1))
+    return to_points, to_table, None
+
+
+run = differentiable(forward, backward, contiguous=False)
 
 
 def _planes(points):
@@ -209,7 +209,3 @@ def _planes(points):
 def _shared_out(levels, threads):
     """Levels in an order that gives each thread's consecutive share fine and coarse ones alike."""
     return np.concatenate([np.arange(t, levels, threads) for t in range(threads)])
-
-
-def run(points, table, levels):
-    return _Encode.apply(points, table.contiguous(), levels)

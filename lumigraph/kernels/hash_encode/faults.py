@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_table", "tl.static_range(8)", "tl.static_range(7)"),
@@ -11,7 +11,6 @@ FAULTS = {
     "slope's sign on the cpu": ("cpu", "_point_gradient", "(2 * by - 1)", "(1 - 2 * by)"),
 }
 
-# These let an index leave its array.
 ASTRAY = {
     "the entry after the last": ("cpu", "_corners", "(entry + np.uint32(base))", "(entry + np.uint32(base + 1))"),
     "the point 1.0, a cell too far": ("cpu", "_along", "np.uint32(resolution - 1)", "np.uint32(resolution)"),

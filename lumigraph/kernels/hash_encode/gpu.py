@@ -1,7 +1,5 @@
 """Triton: one program takes a block of points on one level. Gradients of the table meet in atomic adds."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch
@@ -9,13 +7,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import store_row
+from .._gpu import blocks, indices, launch, store_row
+from .._operation import differentiable, empty
 from ..sparse_grid.gpu import cell_of, corner_of, slope_of, weight_of
 from . import PRIMES, HashLevels
 
 PRIME_Y, PRIME_Z = tl.constexpr(PRIMES[1]), tl.constexpr(PRIMES[2])
-BLOCK = 128
+BLOCK = tl.constexpr(128)
 
 
 @triton.jit
@@ -29,23 +27,12 @@ def _entry(corner, n, mask):
 
 
 @triton.jit(do_not_specialize=["S"])
-def _forward(
-    points,
-    table,
-    pyramid,
-    out,
-    S,
-    L: tl.constexpr,
-    F: tl.constexpr,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _forward(points, table, pyramid, out, S, L: tl.constexpr, F: tl.constexpr, FEATURES: tl.constexpr):
     level = tl.program_id(1)
     n = tl.load(pyramid + 3 * level).to(tl.int32)
     offset, mask = tl.load(pyramid + 3 * level + 1), tl.load(pyramid + 3 * level + 2)
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
-    here = i < S
     there = here[:, None] & (feature < F)[None, :]
     cell, f, _ = cell_of(points, i, here, n, n, n)
     total = tl.zeros([BLOCK, FEATURES], tl.float32)
@@ -57,23 +44,12 @@ def _forward(
 
 
 @triton.jit(do_not_specialize=["S"])
-def _backward_table(
-    grad,
-    points,
-    pyramid,
-    d_table,
-    S,
-    L: tl.constexpr,
-    F: tl.constexpr,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+def _backward_table(grad, points, pyramid, d_table, S, L: tl.constexpr, F: tl.constexpr, FEATURES: tl.constexpr):
     level = tl.program_id(1)
     n = tl.load(pyramid + 3 * level).to(tl.int32)
     offset, mask = tl.load(pyramid + 3 * level + 1), tl.load(pyramid + 3 * level + 2)
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
-    here = i < S
     there = here[:, None] & (feature < F)[None, :]
     cell, f, _ = cell_of(points, i, here, n, n, n)
     g = tl.load(grad + i[:, None] * (L * F) + level * F + feature[None, :], mask=there, other=0.0)
@@ -85,21 +61,11 @@ def _backward_table(
 
 @triton.jit(do_not_specialize=["S"])
 def _backward_points(
-    grad,
-    points,
-    table,
-    pyramid,
-    d_points,
-    S,
-    L: tl.constexpr,
-    F: tl.constexpr,
-    FEATURES: tl.constexpr,
-    BLOCK: tl.constexpr,
+    grad, points, table, pyramid, d_points, S, L: tl.constexpr, F: tl.constexpr, FEATURES: tl.constexpr
 ):
     """Here one program sees all levels, so that it can sum over them."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
-    here = i < S
     there = here[:, None] & (feature < F)[None, :]
     dx = tl.zeros([BLOCK], tl.float32)
     dy = tl.zeros([BLOCK], tl.float32)
@@ -122,37 +88,29 @@ def _backward_points(
 @cache
 def _pyramid(levels: HashLevels, device: torch.device) -> Tensor:
     """(L, 3) int64: cells per side, first entry, hash mask (0 where dense)."""
-    most = 2**levels.log2_entries
-    rows = [
-        (n, offset, 0 if (n + 1) ** 3 <= most else most - 1)
-        for n, offset in zip(levels.resolutions, levels.offsets[:-1], strict=True)
-    ]
-    return torch.tensor(rows, device=device)
+    most, rows = 2**levels.log2_entries, zip(levels.resolutions, levels.offsets[:-1], strict=True)
+    return torch.tensor([(n, first, 0 if (n + 1) ** 3 <= most else most - 1) for n, first in rows], device=device)
 
 
 def forward(ctx, points, table, levels):
     L, F = levels.levels, levels.features
     out = empty(len(points), L * F, device=points.device)
-    ctx.sizes = {"S": len(points), "L": L, "F": F, "FEATURES": triton.next_power_of_2(F), "BLOCK": BLOCK}
+    ctx.sizes = {"S": len(points), "L": L, "F": F, "FEATURES": triton.next_power_of_2(F)}
     ctx.pyramid = _pyramid(levels, points.device)
-    if len(points):
-        _forward[(triton.cdiv(len(points), BLOCK), L)](points, table, ctx.pyramid, out, **ctx.sizes)
+    launch(_forward, (blocks(len(points), BLOCK), L), points, table, ctx.pyramid, out, **ctx.sizes)
     ctx.save_for_backward(points, table)
     return out
 
 
 def backward(ctx, grad):
     points, table = ctx.saved_tensors
-    grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
-    d_points = d_table = None
+    programs, d_points, d_table = blocks(len(points), BLOCK), None, None
     if ctx.needs_input_grad[0]:
         d_points = empty(*points.shape, device=points.device)
-        if blocks:
-            _backward_points[(blocks,)](grad, points, table, ctx.pyramid, d_points, **ctx.sizes)
+        launch(_backward_points, (programs,), grad, points, table, ctx.pyramid, d_points, **ctx.sizes)
     if ctx.needs_input_grad[1]:
         d_table = torch.zeros_like(table)
-        if blocks:
-            _backward_table[(blocks, ctx.sizes["L"])](grad, points, ctx.pyramid, d_table, **ctx.sizes)
+        launch(_backward_table, (programs, ctx.sizes["L"]), grad, points, ctx.pyramid, d_table, **ctx.sizes)
     return d_points, d_table, None
 
 

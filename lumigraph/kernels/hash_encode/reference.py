@@ -1,7 +1,5 @@
 """The definition: eight corners a level, looked up and blended."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch

@@ -1,7 +1,5 @@
 """Ray marching: which stretches of each ray are worth asking the network about."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -9,9 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...camera.rays import Samples
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="rays", outputs=3, differentiable=(), typical=2, compiled=7)
 

@@ -7,7 +7,7 @@ import torch
 from numba import njit, prange
 from torch.utils.weak import WeakTensorKeyDictionary
 
-from .._dispatch import empty
+from .._operation import empty
 
 ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
 BLOCK_BITS = 2  # log2 of the cells per axis of the blocks that empty space is skipped by

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "empty cells counted": ("gpu", "_march", "count += kept", "count += held"),
@@ -7,7 +7,4 @@ FAULTS = {
     "spent, yet going on, on the cpu": ("cpu", "_walk", "thickness > depth_limit", "thickness > 2 * depth_limit"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "the ray after the next": ("cpu", "_write", "starts[r + 1] - starts[r]", "starts[r + 2] - starts[r]"),
-}
+ASTRAY = {"the ray after the next": ("cpu", "_write", "starts[r + 1] - starts[r]", "starts[r + 2] - starts[r]")}

@@ -1,18 +1,15 @@
 """Triton: one lane takes one ray. The first pass counts samples, the second writes them."""
 
-from __future__ import annotations
-
 import math
 
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from .._rows_gpu import load_row
+from .._gpu import blocks, indices, launch, load_row
+from .._operation import empty
 
-BLOCK = 32  # rays; they march together, so a program is as slow as its slowest
+BLOCK = tl.constexpr(32)  # rays; they march together, so a program is as slow as its slowest
 
 
 @triton.jit
@@ -82,10 +79,8 @@ def _march(
     GROWS: tl.constexpr,
     STOP: tl.constexpr,
     WRITE: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     t_near = tl.load(t_nears + r, mask=here, other=0.0)
@@ -155,17 +150,7 @@ def _march(
 
 
 @torch.no_grad()
-def run(
-    origins: Tensor,
-    directions: Tensor,
-    t_near: Tensor,
-    t_far: Tensor,
-    occupied: Tensor,
-    density: Tensor,
-    step: float,
-    growth: float,
-    stop: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+def run(origins, directions, t_near, t_far, occupied, density, step, growth, stop):
     rays, (cascades, n) = len(origins), occupied.shape[:2]
     inputs = [x.contiguous() for x in (origins, directions, t_near, t_far, occupied.view(torch.uint8), density)]
     numbers = (rays, float(step), float(growth), math.log1p(growth), -math.log(stop) if stop > 0 else math.inf)
@@ -175,17 +160,15 @@ def run(
         "SKIP": cascades == 1 or n % 4 == 0,  # else a cell may reach into the finer cascade
         "GROWS": growth > 0,
         "STOP": stop > 0,
-        "BLOCK": BLOCK,
         "num_warps": 1,
         "enable_fp_fusion": False,  # both passes must round alike
     }
-    grid = (triton.cdiv(rays, BLOCK),)
+    grid = (blocks(rays, BLOCK),)
     counts = torch.zeros(rays, dtype=torch.int32, device=origins.device)
     ray_starts = torch.zeros(rays + 1, dtype=torch.int64, device=origins.device)
     t_start = t_end = empty(0, device=origins.device)
-    if rays:
-        _march[grid](*inputs, counts, ray_starts, t_start, t_end, *numbers, WRITE=False, **options)
-        torch.cumsum(counts, 0, out=ray_starts[1:])
-        t_start, t_end = (empty(int(ray_starts[-1]), device=origins.device) for _ in range(2))
-        _march[grid](*inputs, counts, ray_starts, t_start, t_end, *numbers, WRITE=True, **options)
+    launch(_march, grid, *inputs, counts, ray_starts, t_start, t_end, *numbers, WRITE=False, **options)
+    torch.cumsum(counts, 0, out=ray_starts[1:])
+    t_start, t_end = (empty(int(ray_starts[-1]), device=origins.device) for _ in range(2))
+    launch(_march, grid, *inputs, counts, ray_starts, t_start, t_end, *numbers, WRITE=True, **options)
     return t_start, t_end, ray_starts

@@ -1,23 +1,11 @@
 """The definition: every lattice interval of every ray, (R, K), then a mask."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
 
 @torch.no_grad()
-def run(
-    origins: Tensor,
-    directions: Tensor,
-    t_near: Tensor,
-    t_far: Tensor,
-    occupied: Tensor,
-    density: Tensor,
-    step: float,
-    growth: float,
-    stop: float,
-) -> tuple[Tensor, Tensor, Tensor]:
+def run(origins, directions, t_near, t_far, occupied, density, step, growth, stop) -> tuple[Tensor, Tensor, Tensor]:
     t_far = torch.minimum(t_far, _beyond_all(origins, len(occupied)))
     t = lattice(t_near, t_far, step, growth)
     t_start, t_end = t[:, :-1], t[:, 1:]

@@ -1,4 +1,4 @@
-"""Octree traversal: which cells with something in them each ray crosses, and between which distances."""
+"""Octree traversal: the occupied cells that each ray crosses, and between which distances."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from ...camera.rays import Samples
-from .._dispatch import implementation, using
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require, using
 
 FACTS = Facts(unit="rays", outputs=4, differentiable=(), typical=3, compiled=5)
 
 MAX_LEVELS = 10  # levels: a code has three bits for each, and one more, in 32 bits
-MIN_SPEED = 1e-9  # of a direction along an axis, below which a ray is said to go forward so slowly
+MIN_SPEED = 1e-9  # of a direction along an axis; slower ones are set to it
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,7 @@ def octree_cells(
 
     origins, directions, near: in units of the cube, which is [0, 1]^3; directions of unit length
     tree:    trusted to be as its makers leave it
-    density: per side of the cube, (tree.count,); tells when a ray is spent
+    density: per side of the cube, (tree.count,); a ray ends once its light is spent
     stop:    cells behind exp(-sum of density times length) < stop are left out; 0 keeps all
     Not differentiable.
     """
@@ -122,7 +120,7 @@ def octree_cells(
 
 
 def check(tree: Tree, density: Tensor, near: float, stop: float) -> None:
-    """Raise ValueError for what a traversal cannot bear."""
+    """Raise ValueError for inputs that a traversal cannot use."""
     require(len(density) == tree.count, f"{len(density)} densities, where a tree has {tree.count} rows")
     require(1 <= tree.depth <= MAX_LEVELS, f"a tree of {tree.depth} levels cannot be")
     require(near >= 0 and 0 <= stop <= 1, f"near {near} and stop {stop} cannot be")

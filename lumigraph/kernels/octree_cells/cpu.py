@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._operation import empty
 from . import MIN_SPEED as _MIN_SPEED
 
 ZERO, ONE, MIN_SPEED = np.float32(0), np.float32(1), np.float32(_MIN_SPEED)
@@ -16,14 +16,23 @@ FAST = {"cache": True, "error_model": "numpy"}
 
 
 @njit(inline="always")
-def inverse_of(d, side):
+def _inverse(d, side):
     """One over the smallest cells that a ray passes along an axis in a unit of its length."""
     return ONE / ((MIN_SPEED if abs(d) < MIN_SPEED else d) * side)
 
 
 @njit(inline="always")
-def through_cube(ox, oy, oz, ix, iy, iz, side, near):
+def in_cells(o, d, r, side):
+    """Ray r in smallest cells: its origin, its direction, and one over that."""
+    dx, dy, dz = d[r, 0], d[r, 1], d[r, 2]
+    ix, iy, iz = _inverse(dx, side), _inverse(dy, side), _inverse(dz, side)
+    return o[r, 0] * side, o[r, 1] * side, o[r, 2] * side, dx * side, dy * side, dz * side, ix, iy, iz
+
+
+@njit(inline="always")
+def through_cube(ray, side, near):
     """Where a ray enters the cube and leaves it."""
+    ox, oy, oz, _, _, _, ix, iy, iz = ray
     a, b, c = -ox * ix, -oy * iy, -oz * iz
     d, e, f = (side - ox) * ix, (side - oy) * iy, (side - oz) * iz
     return max(min(a, d), min(b, e), min(c, f), near), min(max(a, d), max(b, e), max(c, f))
@@ -33,6 +42,13 @@ def through_cube(ox, oy, oz, ix, iy, iz, side, near):
 def cell_at(x, low, high):
     """The whole number of the smallest cell at a coordinate, from low to below high."""
     return min(max(np.int64(x), low), high - 1)
+
+
+@njit(inline="always")
+def place_at(ray, t, side):
+    """The smallest cell in the cube at a distance along a ray."""
+    ox, oy, oz, dx, dy, dz, _, _, _ = ray
+    return cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
 
 
 @njit(inline="always")
@@ -50,15 +66,9 @@ def leaf(cells, path, level, depth, x, y, z):
 
 
 @njit(inline="always")
-def row_of(value, rows):
-    """The row of a cell that holds something. rows: as `Tree.rows` has them"""
-    return np.int64(rows[-1 - value]) if len(rows) else -1 - value
-
-
-@njit(inline="always")
-def leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t):
-    """Where a ray leaves the cell of side 2^shift at a place, and the place beyond. Origin, direction and one over it
-    are in smallest cells."""
+def leave(x, y, z, shift, ray, t):
+    """Where a ray leaves the cell of side 2^shift at a place, and the place beyond."""
+    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray
     size = np.int64(1) << shift
     lx, ly, lz = x >> shift << shift, y >> shift << shift, z >> shift << shift
     hx, hy, hz = lx + size, ly + size, lz + size
@@ -77,6 +87,26 @@ def leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t):
 
 
 @njit(inline="always")
+def cross(cells, rows, path, level, depth, x, y, z, ray, t):
+    """Cross the undivided cell at a place: its row, -1 for none, its level, and the results of `leave`.
+
+    rows: `Tree.rows`; path: the nodes from the cube down to `level`, to which those below are added
+    """
+    value, level = leaf(cells, path, level, depth, x, y, z)
+    row = np.int64(-1)
+    if value < 0:
+        row = np.int64(rows[-1 - value]) if len(rows) else -1 - value
+    end, u, v, w = leave(x, y, z, depth - level, ray, t)
+    return row, level, end, u, v, w
+
+
+@njit(inline="always")
+def outside(u, v, w, side):
+    """Whether a place lies beyond the cube."""
+    return u < 0 or v < 0 or w < 0 or u >= side or v >= side or w >= side
+
+
+@njit(inline="always")
 def shared(level, depth, differing):
     """The deepest level, at most this one, whose node holds two places. differing: the bits in which they do"""
     while differing >> (depth - level):
@@ -92,29 +122,20 @@ def _walk(o, d, cells, named, density, depth, near, most, write, starts, t_start
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         path = np.zeros(depth + 1, np.int64)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
-            dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
-            ix, iy, iz = (
-                inverse_of(d[r, 0], across),
-                inverse_of(d[r, 1], across),
-                inverse_of(d[r, 2], across),
-            )
-            t, far = through_cube(ox, oy, oz, ix, iy, iz, across, near)
+            ray = in_cells(o, d, r, across)
+            t, far = through_cube(ray, across, near)
             count, thickness, level = np.int64(0), ZERO, np.int64(0)
             if t < far:
-                x, y, z = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
+                x, y, z = place_at(ray, t, side)
                 while True:
-                    value, level = leaf(cells, path, level, depth, x, y, z)
-                    end, u, v, w = leave(x, y, z, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
-                    if value < 0:
-                        row = row_of(value, named)
-                        if row >= 0:
-                            if write:
-                                i = starts[r] + count
-                                t_start[i], t_end[i], rows[i] = t, end, row
-                            count += 1
-                            thickness += density[row] * (end - t)
-                    if u < 0 or v < 0 or w < 0 or u >= side or v >= side or w >= side or thickness > most:
+                    row, level, end, u, v, w = cross(cells, named, path, level, depth, x, y, z, ray, t)
+                    if row >= 0:
+                        if write:
+                            i = starts[r] + count
+                            t_start[i], t_end[i], rows[i] = t, end, row
+                        count += 1
+                        thickness += density[row] * (end - t)
+                    if outside(u, v, w, side) or thickness > most:
                         break
                     level = shared(level - 1, depth, (x ^ u) | (y ^ v) | (z ^ w))
                     x, y, z, t = u, v, w, end

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "through the wrong side": ("cpu", "leave", "u = hx if ix > ZERO else lx - 1", "u = hx"),
@@ -8,7 +8,4 @@ FAULTS = {
     "spent, yet going on, on a gpu": ("gpu", "_walk", "thickness <= most", "thickness <= 2 * most"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "the cell after the last": ("cpu", "_walk", "i = starts[r] + count", "i = starts[r] + count + 1"),
-}
+ASTRAY = {"the cell after the last": ("cpu", "_walk", "i = starts[r] + count", "i = starts[r] + count + 1")}

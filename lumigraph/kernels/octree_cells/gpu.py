@@ -1,31 +1,18 @@
 """Triton: one lane takes one ray, and goes down from the cube to each of its cells. The first pass counts them, the
 second writes them."""
 
-from __future__ import annotations
-
 import math
 
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from .._rows_gpu import load_row
+from .._gpu import blocks, indices, launch, load_row
+from .._operation import empty
 from . import MIN_SPEED as _MIN_SPEED
-from . import Tree
 
 MIN_SPEED = tl.constexpr(_MIN_SPEED)
-BLOCK = 32  # rays; they go together, so a program is as slow as its slowest
-
-
-@triton.jit
-def through_cube(ox, oy, oz, ix, iy, iz, near):
-    """Where rays enter the unit cube and leave it."""
-    a, b, c = -ox * ix, -oy * iy, -oz * iz
-    d, e, f = (1.0 - ox) * ix, (1.0 - oy) * iy, (1.0 - oz) * iz
-    enter = tl.maximum(tl.maximum(tl.minimum(a, d), tl.minimum(b, e)), tl.minimum(c, f))
-    return tl.maximum(enter, near), tl.minimum(tl.minimum(tl.maximum(a, d), tl.maximum(b, e)), tl.maximum(c, f))
+BLOCK = tl.constexpr(32)  # rays; they go together, so a program is as slow as its slowest
 
 
 @triton.jit
@@ -43,7 +30,10 @@ def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
     ix = 1.0 / tl.where(tl.abs(dx) < MIN_SPEED, MIN_SPEED, dx)
     iy = 1.0 / tl.where(tl.abs(dy) < MIN_SPEED, MIN_SPEED, dy)
     iz = 1.0 / tl.where(tl.abs(dz) < MIN_SPEED, MIN_SPEED, dz)
-    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+    a, b, c = -ox * ix, -oy * iy, -oz * iz
+    d, e, f = (1.0 - ox) * ix, (1.0 - oy) * iy, (1.0 - oz) * iz
+    first = tl.maximum(tl.maximum(tl.minimum(a, d), tl.minimum(b, e)), tl.minimum(c, f))
+    t, far = tl.maximum(first, near), tl.minimum(tl.minimum(tl.maximum(a, d), tl.maximum(b, e)), tl.maximum(c, f))
     x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
     y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
     z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
@@ -108,11 +98,11 @@ def row_in(named, value, going):
 
 @triton.jit(do_not_specialize=["R", "near", "most"])
 def _walk(
-    origins, directions, cells, named, density, counts, ray_starts, t_start, t_end, rows, R, near, most,
-    DEPTH: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    rays, cells, named, density, counts, ray_starts, out, R, near, most, DEPTH: tl.constexpr, WRITE: tl.constexpr
+):
+    origins, directions = rays
+    t_start, t_end, rows = out
+    r, here = indices(R, BLOCK)
     ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
     x, y, z = cell
     count = tl.zeros([BLOCK], tl.int32)
@@ -138,28 +128,18 @@ def _walk(
 
 
 @torch.no_grad()
-def run(
-    origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, near: float, stop: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def run(origins, directions, tree, density, near, stop):
     count, device = len(origins), origins.device
-    given = [x.contiguous() for x in (origins, directions, tree.cells, tree.named, density)]
+    rays = origins.contiguous(), directions.contiguous()
+    given = rays, *(x.contiguous() for x in (tree.cells, tree.named, density))
     numbers = count, float(near), -math.log(stop) if stop > 0 else math.inf
-    options = {
-        "DEPTH": tree.depth,
-        "BLOCK": BLOCK,
-        "num_warps": 1,
-        "enable_fp_fusion": False,
-    }  # both passes round alike
+    options = {"DEPTH": tree.depth, "num_warps": 1, "enable_fp_fusion": False}  # both passes round alike
     counts = torch.zeros(count, dtype=torch.int32, device=device)
     ray_starts = torch.zeros(count + 1, dtype=torch.int64, device=device)
-    rows = torch.empty(0, dtype=torch.int64, device=device)
-    t_start = t_end = empty(0, device=device)
-    if count:
-        grid = (triton.cdiv(count, BLOCK),)
-        _walk[grid](*given, counts, ray_starts, t_start, t_end, rows, *numbers, WRITE=False, **options)
-        torch.cumsum(counts, 0, out=ray_starts[1:])
-        total = int(ray_starts[-1])
-        t_start, t_end = empty(total, device=device), empty(total, device=device)
-        rows = torch.empty(total, dtype=torch.int64, device=device)
-        _walk[grid](*given, counts, ray_starts, t_start, t_end, rows, *numbers, WRITE=True, **options)
-    return t_start, t_end, ray_starts, rows
+    grid, out = (blocks(count, BLOCK),), (density, density, ray_starts)  # nothing is written into these
+    launch(_walk, grid, *given, counts, ray_starts, out, *numbers, WRITE=False, **options)
+    torch.cumsum(counts, 0, out=ray_starts[1:])
+    total = int(ray_starts[-1])
+    out = empty(total, device=device), empty(total, device=device), torch.empty(total, dtype=torch.int64, device=device)
+    launch(_walk, grid, *given, counts, ray_starts, out, *numbers, WRITE=True, **options)
+    return *out[:2], ray_starts, out[2]

@@ -1,7 +1,5 @@
 """The definition: all rays take a step together, each from its cell to the next."""
 
-from __future__ import annotations
-
 import math
 
 import torch

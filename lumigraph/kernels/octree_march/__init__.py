@@ -1,14 +1,10 @@
 """Rendering an octree: traversal, harmonics and compositing in one (Yu 2021, arXiv 2103.14024, section 4)."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 from ..octree_cells import Tree, check, picture, shell, some_rays, some_tree, steady
 
 FACTS = Facts(unit="rays", outputs=3, differentiable=(3, 4), typical=3, compiled=4, smooth=(7,))

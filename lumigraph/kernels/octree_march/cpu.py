@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import differentiable, empty
-from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cell_at, inverse_of, leaf, leave, row_of, shared, through_cube
+from .._operation import differentiable, empty
+from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cross, in_cells, outside, place_at, shared, through_cube
 from ..spherical_harmonics.cpu import basis
 
 HALF = np.float32(0.5)
@@ -59,37 +59,28 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
         met, weights = np.zeros(CELLS_PER_CHUNK, np.int64), np.zeros(CELLS_PER_CHUNK, np.float32)
         asked = np.zeros(1, np.float32)  # a sum that nobody needs, or compilers would leave it out
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
-            dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
-            ix, iy, iz = (
-                inverse_of(d[r, 0], across),
-                inverse_of(d[r, 1], across),
-                inverse_of(d[r, 2], across),
-            )
-            t, far = through_cube(ox, oy, oz, ix, iy, iz, across, near)
+            ray = in_cells(o, d, r, across)
+            t, far = through_cube(ray, across, near)
             red = green = blue = way = spent = ZERO
             through, count, level, waiting = ONE, np.int64(0), np.int64(0), 0
             if t < far:
                 basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
-                u, v, w = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
+                u, v, w = place_at(ray, t, side)
                 while True:
-                    value, level = leaf(cells, path, level, depth, u, v, w)
-                    end, u2, v2, w2 = leave(u, v, w, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
-                    if value < 0:
-                        row = row_of(value, named)
-                        if row >= 0:
-                            count += 1
-                            keep = np.exp(-density[row] * (end - t))
-                            weight = through * (ONE - keep)
-                            through *= keep
-                            way += weight * HALF * (t + end)
-                            spent += weight
-                            met[waiting], weights[waiting] = row, weight
-                            waiting += weight > ZERO
-                            if waiting == CELLS_PER_CHUNK:
-                                r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
-                                red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
-                    if u2 < 0 or v2 < 0 or w2 < 0 or u2 >= side or v2 >= side or w2 >= side or through < stop:
+                    row, level, end, u2, v2, w2 = cross(cells, named, path, level, depth, u, v, w, ray, t)
+                    if row >= 0:
+                        count += 1
+                        keep = np.exp(-density[row] * (end - t))
+                        weight = through * (ONE - keep)
+                        through *= keep
+                        way += weight * HALF * (t + end)
+                        spent += weight
+                        met[waiting], weights[waiting] = row, weight
+                        waiting += weight > ZERO
+                        if waiting == CELLS_PER_CHUNK:
+                            r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
+                            red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
+                    if outside(u2, v2, w2, side) or through < stop:
                         break
                     level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
                     u, v, w, t = u2, v2, w2, end
@@ -118,43 +109,34 @@ def _share(
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             if starts[r] == starts[r + 1]:
                 continue
-            ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
-            dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
-            ix, iy, iz = (
-                inverse_of(d[r, 0], across),
-                inverse_of(d[r, 1], across),
-                inverse_of(d[r, 2], across),
-            )
-            t, _ = through_cube(ox, oy, oz, ix, iy, iz, across, near)
+            ray = in_cells(o, d, r, across)
+            t, _ = through_cube(ray, across, near)
             y = bases[r]
             basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
             behind = g_distance[r] * distance[r] + g_opacity[r] * opacity[r]
             for c in range(3):
                 behind += g_rgb[r, c] * rgb[r, c]
             through, i, level = ONE, starts[r], np.int64(0)
-            u, v, w = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
+            u, v, w = place_at(ray, t, side)
             while True:
-                value, level = leaf(cells, path, level, depth, u, v, w)
-                end, u2, v2, w2 = leave(u, v, w, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
-                if value < 0:
-                    row = row_of(value, named)
-                    if row >= 0:
-                        length = end - t
-                        keep = np.exp(-density[row] * length)
-                        weight = through * (ONE - keep)
-                        through *= keep
-                        worth = g_opacity[r] + g_distance[r] * HALF * (t + end)
-                        colours = _colour(harmonics, row, y)
-                        for c in range(3):
-                            colour = colours[c]
-                            worth += g_rgb[r, c] * colour
-                            shares[i, 1 + c] = weight * g_rgb[r, c] * colour * (ONE - colour)
-                        behind -= worth * weight
-                        shares[i, 0] = (worth * through - behind) * length
-                        rows[i], rays[i] = row, r
-                        i += 1
-                        if i == starts[r + 1]:
-                            break
+                row, level, end, u2, v2, w2 = cross(cells, named, path, level, depth, u, v, w, ray, t)
+                if row >= 0:
+                    length = end - t
+                    keep = np.exp(-density[row] * length)
+                    weight = through * (ONE - keep)
+                    through *= keep
+                    worth = g_opacity[r] + g_distance[r] * HALF * (t + end)
+                    colours = _colour(harmonics, row, y)
+                    for c in range(3):
+                        colour = colours[c]
+                        worth += g_rgb[r, c] * colour
+                        shares[i, 1 + c] = weight * g_rgb[r, c] * colour * (ONE - colour)
+                    behind -= worth * weight
+                    shares[i, 0] = (worth * through - behind) * length
+                    rows[i], rays[i] = row, r
+                    i += 1
+                    if i == starts[r + 1]:
+                        break
                 level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
                 u, v, w, t = u2, v2, w2, end
 
@@ -208,7 +190,7 @@ def backward(ctx, *grads):
     rows, rays, order = (np.empty(starts[-1], np.int32) for _ in range(3))
     shares = empty(int(starts[-1]), 4).numpy()
     given = origins, directions, *ctx.tree, density, harmonics, *ctx.numbers, *outputs
-    _share(spread(len(origins)), *(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
+    _share(spread(len(origins)), *(g.numpy() for g in grads), *given, bases, rows, rays, shares)
     firsts = np.zeros(len(density) + 1, np.int64)
     _sorted(rows, firsts, order)
     to_density, to_harmonics = torch.zeros(density.shape), torch.zeros(harmonics.shape)

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "attenuation forgotten": ("cpu", "_share", "worth * through - behind", "worth * through"),
@@ -11,7 +11,4 @@ FAULTS = {
     "distance to the far side": ("gpu", "_forward", "0.5 * (t + end)", "end"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a share of the next ray": ("cpu", "_share", "rows[i], rays[i] = row, r", "rows[i], rays[i + 1] = row, r"),
-}
+ASTRAY = {"a share of the next ray": ("cpu", "_share", "rows[i], rays[i] = row, r", "rows[i], rays[i + 1] = row, r")}

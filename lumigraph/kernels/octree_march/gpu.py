@@ -1,17 +1,15 @@
 """Triton: one lane takes one ray, forward and on the way back. Gradients of the rows meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
+from .._operation import differentiable, empty
 from ..octree_cells.gpu import enter, inside, leaf, leave, row_in
 from ..spherical_harmonics.gpu import harmonic
 
-BLOCK = 32  # rays
+BLOCK = tl.constexpr(32)  # rays
 
 
 @triton.jit
@@ -29,12 +27,10 @@ def _colour(harmonics, row, held, direction, BASIS: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["R", "near", "stop"])
-def _forward(
-    origins, directions, cells, named, density, harmonics, rgb, distance, opacity, R, near, stop,
-    DEPTH: tl.constexpr, BASIS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+def _forward(rays, cells, named, density, harmonics, outputs, R, near, stop, DEPTH: tl.constexpr, BASIS: tl.constexpr):
+    origins, directions = rays
+    rgb, distance, opacity = outputs
+    r, here = indices(R, BLOCK)
     ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
     x, y, z = cell
     red = tl.zeros([BLOCK], tl.float32)
@@ -66,13 +62,26 @@ def _forward(
 
 @triton.jit(do_not_specialize=["R", "near", "stop"])
 def _backward(
-    d_rgb, d_distance, d_opacity, origins, directions, cells, named, density, harmonics, rgb, distance, opacity,
-    to_density, to_harmonics, R, near, stop,
-    DEPTH: tl.constexpr, BASIS: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
+    grads,
+    rays,
+    cells,
+    named,
+    density,
+    harmonics,
+    outputs,
+    found,
+    R,
+    near,
+    stop,
+    DEPTH: tl.constexpr,
+    BASIS: tl.constexpr,
+):
     """dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss."""
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    origins, directions = rays
+    d_rgb, d_distance, d_opacity = grads
+    rgb, distance, opacity = outputs
+    to_density, to_harmonics = found
+    r, here = indices(R, BLOCK)
     ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
     x, y, z = cell
     dx, dy, dz = ray[1]
@@ -115,24 +124,21 @@ def _backward(
 def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
     rays, device = len(origins), origins.device
     out = empty(rays, 3, device=device), empty(rays, device=device), empty(rays, device=device)
-    ctx.numbers = rays, float(near), float(stop)
-    ctx.sizes = {"DEPTH": tree.depth, "BASIS": harmonics.shape[1], "BLOCK": BLOCK, "num_warps": 1}
+    ctx.grid, ctx.numbers = (blocks(rays, BLOCK),), (rays, float(near), float(stop))
+    ctx.sizes = {"DEPTH": tree.depth, "BASIS": harmonics.shape[1], "num_warps": 1}
     ctx.tree = tree.cells.contiguous(), tree.named
-    if rays:
-        grid = (triton.cdiv(rays, BLOCK),)
-        _forward[grid](origins, directions, *ctx.tree, density, harmonics, *out, *ctx.numbers, **ctx.sizes)
+    given = (origins, directions), *ctx.tree, density, harmonics, out
+    launch(_forward, ctx.grid, *given, *ctx.numbers, **ctx.sizes)
     ctx.save_for_backward(origins, directions, density, harmonics, *out)
     return out
 
 
 def backward(ctx, *grads):
     origins, directions, density, harmonics, *out = ctx.saved_tensors
-    to_density, to_harmonics = torch.zeros_like(density), torch.zeros_like(harmonics)
-    if rays := len(origins):
-        given = origins, directions, *ctx.tree, density, harmonics, *out, to_density, to_harmonics
-        grid, slopes = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
-        _backward[grid](*slopes, *given, *ctx.numbers, **ctx.sizes)
-    return None, None, None, to_density, to_harmonics, None, None
+    found = torch.zeros_like(density), torch.zeros_like(harmonics)
+    given = grads, (origins, directions), *ctx.tree, density, harmonics, tuple(out), found
+    launch(_backward, ctx.grid, *given, *ctx.numbers, **ctx.sizes)
+    return None, None, None, *found, None, None
 
 
 run = differentiable(forward, backward)

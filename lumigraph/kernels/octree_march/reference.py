@@ -1,7 +1,5 @@
 """The definition: the cells, their colours along each ray, compositing."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -14,13 +12,7 @@ from ..spherical_harmonics.reference import run as basis
 
 
 def run(
-    origins: Tensor,
-    directions: Tensor,
-    tree: Tree,
-    density: Tensor,
-    harmonics: Tensor,
-    near: float,
-    stop: float,
+    origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, harmonics: Tensor, near: float, stop: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     origins, directions = origins.detach(), directions.detach()
     start, end, ray_starts, rows = crossed(origins, directions, tree, density.detach(), near, stop)

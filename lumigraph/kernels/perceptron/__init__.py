@@ -1,16 +1,12 @@
 """A small multilayer perceptron for very many inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1, 2, 3), typical=4, compiled=4, smooth=(2, 4))
 

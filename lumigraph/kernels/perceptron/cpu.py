@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import empty
 from .._lanes import LANES, fetch_like, filled, highest, put, turn, where
+from .._operation import differentiable, empty
 
 FAST = {"cache": True, "fastmath": True, "error_model": "numpy"}
 BLOCK = 32  # samples, whose values of one feature are lanes; a buffer has feature f of sample s at [f BLOCK + s]
@@ -181,41 +181,30 @@ def _backward(grad, x, n, weights, widths, rows, share, inputs, to_x, sums):
         sums[part] = mine
 
 
-class _Perceptron(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x, *weights):
-        planes = x.detach().t().contiguous()
-        shape = _shape(weights)
-        out = empty(len(weights[-1]), len(x))
-        _forward(planes.numpy().reshape(-1), len(x), *shape, _share(len(x)), out.numpy().reshape(-1))
-        ctx.save_for_backward(planes, *weights)
-        return out.t()
+def forward(ctx, x, *weights):
+    planes = x.detach().t().contiguous()
+    out = empty(len(weights[-1]), len(x))
+    _forward(planes.numpy().reshape(-1), len(x), *_shape(weights), _share(len(x)), out.numpy().reshape(-1))
+    ctx.save_for_backward(planes, *weights)
+    return out.t()
 
-    @staticmethod
-    def backward(ctx, grad):
-        x, *weights = ctx.saved_tensors
-        flat, widths, rows = _shape(weights)
-        n, share = x.shape[1], _share(x.shape[1])
-        to_x = empty(len(x) if ctx.needs_input_grad[0] else 0, n)
-        heights = [-(-w.shape[1] // BLOCK) * len(w) for w in weights]
-        sums = torch.zeros(max(1, -(-n // share)), sum(heights) * BLOCK)
-        given = (
-            grad.t().contiguous().numpy().reshape(-1),
-            x.numpy().reshape(-1),
-            n,
-            flat,
-            widths,
-            rows,
-            share,
-            len(to_x),
-        )
-        _backward(*given, to_x.numpy().reshape(-1), sums.numpy())
-        parts = sums.sum(0).view(-1, BLOCK).split(heights)
-        to_weights = [
-            part.view(-1, len(w), BLOCK).transpose(0, 1).reshape(len(w), -1)[:, : w.shape[1]]
-            for part, w in zip(parts, weights, strict=True)
-        ]
-        return (to_x.t() if len(to_x) else None), *to_weights
+
+def backward(ctx, grad):
+    x, *weights = ctx.saved_tensors
+    n, share, shape = x.shape[1], _share(x.shape[1]), _shape(weights)
+    to_x = empty(len(x) if ctx.needs_input_grad[0] else 0, n)
+    heights = [-(-w.shape[1] // BLOCK) * len(w) for w in weights]
+    sums = torch.zeros(max(1, -(-n // share)), sum(heights) * BLOCK)
+    given = grad.t().contiguous().numpy().reshape(-1), x.numpy().reshape(-1), n, *shape, share, len(to_x)
+    _backward(*given, to_x.numpy().reshape(-1), sums.numpy())
+    to_weights = [
+        part.view(-1, len(w), BLOCK).transpose(0, 1).reshape(len(w), -1)[:, : w.shape[1]]
+        for part, w in zip(sums.sum(0).view(-1, BLOCK).split(heights), weights, strict=True)
+    ]
+    return (to_x.t() if len(to_x) else None), *to_weights
+
+
+_perceptron = differentiable(forward, backward, contiguous=False)
 
 
 def _shape(weights):
@@ -231,4 +220,4 @@ def _share(n):
 
 
 def run(x, weights):
-    return _Perceptron.apply(x, *weights)
+    return _perceptron(x, *weights)

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "a layer that no gate closes": ("cpu", "_backward", "layer == 0)", "True)"),
@@ -11,7 +11,4 @@ FAULTS = {
     ),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a tile too many": ("cpu", "_product", "whole = count - count % TILE\n", "whole = count\n"),
-}
+ASTRAY = {"a tile too many": ("cpu", "_product", "whole = count - count % TILE\n", "whole = count\n")}

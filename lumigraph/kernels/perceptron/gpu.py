@@ -1,7 +1,5 @@
 """Matrix products by the vendor's library, which PyTorch calls: what is left to fuse costs a GPU little."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

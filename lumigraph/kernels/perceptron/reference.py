@@ -1,7 +1,5 @@
 """The definition."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

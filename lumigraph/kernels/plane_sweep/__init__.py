@@ -1,14 +1,10 @@
 """Plane sweep: how well a photograph agrees with its neighbours at each depth that a pixel may have."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(), typical=2, compiled=2)
 
@@ -56,7 +52,7 @@ def plane_sweep(
 
 
 def centred(pictures: Float[Tensor, "picture rows columns"], trust: Float[Tensor, "picture rows columns"]) -> Tensor:
-    """Pictures without the mean of what they are trusted in, and zero where they are not trusted at all."""
+    """Pictures less their mean weighted by trust, and zero where trust is zero."""
     total = trust.sum((1, 2), keepdim=True).clamp_min(1e-6)
     mean = (pictures * trust).sum((1, 2), keepdim=True) / total
     return torch.where(trust > 0, pictures - mean, 0)

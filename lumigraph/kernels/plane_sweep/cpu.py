@@ -4,7 +4,7 @@ keeps as many rows of these as a window has in a near cache, and adds them acros
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._operation import empty
 from . import BEHIND_DEPTH, MIN_VARIANCE
 
 BORDER = 3  # zeros around a neighbour: one pixel before, two behind, where two are looked up beside each other

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "half a pixel aside": ("cpu", "_place", "v0) * inverse + HALF", "v0) * inverse"),
@@ -11,7 +11,4 @@ FAULTS = {
     "another neighbour's warp": ("gpu", "_costs", "warps + 12 * neighbour", "warps"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "no border behind": ("cpu", "_place", "np.float32(rows + 1)", "np.float32(rows + 2)"),
-}
+ASTRAY = {"no border behind": ("cpu", "_place", "np.float32(rows + 1)", "np.float32(rows + 2)")}

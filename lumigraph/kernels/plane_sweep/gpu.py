@@ -1,16 +1,14 @@
 """Triton: a program takes some pixels at one plane and one neighbour, and goes through their windows."""
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._gpu import blocks, launch
+from .._operation import empty
 from . import BEHIND_DEPTH, MIN_VARIANCE
 
 E, MIN_DEPTH = tl.constexpr(MIN_VARIANCE), tl.constexpr(BEHIND_DEPTH)
-BLOCK = 128
+BLOCK = tl.constexpr(128)
 
 
 @triton.jit
@@ -31,7 +29,7 @@ def _between(picture, row, column, down, right, rows, columns, here):
 
 @triton.jit(do_not_specialize=["height", "width", "rows", "columns", "planes"])
 def _costs(
-    reference,
+    picture,
     trust,
     weights,
     weighted,
@@ -44,7 +42,6 @@ def _costs(
     columns,
     planes,
     WINDOW: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     plane, neighbour = tl.program_id(1), tl.program_id(2).to(tl.int64)
@@ -62,7 +59,7 @@ def _costs(
         y = pixel // width + k // WINDOW - WINDOW // 2
         x = pixel % width + k % WINDOW - WINDOW // 2
         inside = here & (y >= 0) & (y < height) & (x >= 0) & (x < width)
-        a = tl.load(reference + y * width + x, mask=inside, other=0.0)
+        a = tl.load(picture + y * width + x, mask=inside, other=0.0)
         t = tl.load(trust + y * width + x, mask=inside, other=0.0)
         centre_x, centre_y = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
         u = tl.load(warp) * centre_x + tl.load(warp + 1) * centre_y + tl.load(warp + 2) + h * tl.load(warp + 3)
@@ -93,21 +90,10 @@ def _costs(
     tl.store(out + place, cost, mask=here)
 
 
-def run(
-    reference: Tensor,
-    trust: Tensor,
-    neighbours: Tensor,
-    neighbour_trust: Tensor,
-    warps: Tensor,
-    hypotheses: Tensor,
-    window: int,
-    best: int,
-) -> Tensor:
+def run(reference, trust, neighbours, neighbour_trust, warps, hypotheses, window, best):
     (height, width), (count, rows, columns), planes = reference.shape, neighbours.shape, len(hypotheses)
     costs = empty(count, planes, height, width, device=reference.device)
-    grid = (triton.cdiv(height * width, BLOCK), planes, count)
-    given = (reference, trust, neighbour_trust, neighbour_trust * neighbours, warps, hypotheses)
-    if planes:
-        inputs = (x.contiguous() for x in given)
-        _costs[grid](*inputs, costs, height, width, rows, columns, planes, WINDOW=window, BLOCK=BLOCK)
+    given = reference, trust, neighbour_trust, neighbour_trust * neighbours, warps, hypotheses
+    inputs = *(x.contiguous() for x in given), costs, height, width, rows, columns, planes
+    launch(_costs, (blocks(height * width, BLOCK), planes, count), *inputs, WINDOW=window)
     return costs.topk(best, 0, largest=False).values.mean(0)

@@ -1,7 +1,5 @@
 """The definition: every hypothesis at every pixel, (P, H, W), one neighbour after the other."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
@@ -9,16 +7,7 @@ from torch.nn.functional import avg_pool2d, grid_sample
 from . import BEHIND_DEPTH, MIN_VARIANCE
 
 
-def run(
-    reference: Tensor,
-    trust: Tensor,
-    neighbours: Tensor,
-    neighbour_trust: Tensor,
-    warps: Tensor,
-    hypotheses: Tensor,
-    window: int,
-    best: int,
-) -> Tensor:
+def run(reference, trust, neighbours, neighbour_trust, warps, hypotheses, window, best) -> Tensor:
     height, width = reference.shape
     x, y = (torch.arange(n, device=reference.device).to(reference) + 0.5 for n in (width, height))
     pixels = torch.stack([x.expand(height, width), y[:, None].expand(height, width), torch.ones_like(reference)], -1)

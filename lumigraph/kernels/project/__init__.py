@@ -9,9 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="gaussians", outputs=5, differentiable=(0, 1, 2, 3, 4), typical=5, compiled=5, smooth=(5, 6))
 

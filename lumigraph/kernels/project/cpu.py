@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 from ..spherical_harmonics.cpu import basis, slope
 from . import MIN_ALPHA
 
@@ -296,8 +296,7 @@ def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, 
 def backward(ctx, *grads):
     *inputs, colours, seen = (x.detach().numpy() for x in ctx.saved_tensors)
     results = [empty(*x.shape) for x in inputs]
-    given = (x.contiguous().numpy() for x in grads)
-    _backward(*given, *inputs, *ctx.numbers, colours, seen, *(x.numpy() for x in results))
+    _backward(*(x.numpy() for x in grads), *inputs, *ctx.numbers, colours, seen, *(x.numpy() for x in results))
     return *results, None, None, None, None
 
 

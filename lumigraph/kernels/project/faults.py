@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "held, yet with gradient": ("gpu", "_lens_backward", "where(x == X", "where(z > 0"),
@@ -13,7 +13,4 @@ FAULTS = {
     "the cross product's order": ("cpu", "_pulled", "turn * nT[n]", "-turn * nT[n]"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a coefficient too few": ("cpu", "_forward", "np.empty(16,", "np.empty(15,"),
-}
+ASTRAY = {"a coefficient too few": ("cpu", "_forward", "np.empty(16,", "np.empty(15,")}

@@ -16,13 +16,11 @@ C = T T^T + blur I = (a b; b c), K = C^-1 the conic; T_0 and T_1 are a matrix's 
     mean     p' = ((X, Y)' / z, z' - (X X' + Y Y') / z)      mean' = R^T p' + (d' - d (d . d')) / |mean - eye|
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
+from .._operation import differentiable, empty
 from ..spherical_harmonics.gpu import harmonic, harmonic_slope
 from . import MIN_ALPHA as _MIN_ALPHA
 
@@ -30,7 +28,7 @@ MIN_ALPHA, MIN_SHARE = tl.constexpr(_MIN_ALPHA), tl.constexpr(1e-8)
 # Where the parts of a view begin in View.numbers()
 EYE, FOCAL, CENTRE, DISTORTION = tl.constexpr(9), tl.constexpr(12), tl.constexpr(14), tl.constexpr(16)
 LIMITS, SIZE, NEAR = tl.constexpr(24), tl.constexpr(28), tl.constexpr(30)
-BLOCK = 128
+BLOCK = tl.constexpr(128)
 
 # Vectors are tuples of three, matrices tuples of rows.
 
@@ -239,27 +237,10 @@ def _reaches(u, extent, size):
 
 
 @triton.jit(do_not_specialize=["N"])
-def _forward(
-    means,
-    quaternions,
-    scales,
-    opacities,
-    harmonics,
-    view,
-    centres,
-    conics,
-    depths,
-    colours,
-    shown,
-    N,
-    blur,
-    K: tl.constexpr,
-    BANDS: tl.constexpr,
-    COMPENSATE: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < N
+def _forward(inputs, view, outputs, N, blur, K: tl.constexpr, BANDS: tl.constexpr, COMPENSATE: tl.constexpr):
+    means, quaternions, scales, opacities, harmonics = inputs
+    centres, conics, depths, colours, shown = outputs
+    i, here = indices(N, BLOCK)
     R = _rotation(view)
     v = _mix(1.0, load_row(means, i, here), -1.0, load_row(view + EYE, 0, True))
     p = _apply(R, v)
@@ -290,33 +271,12 @@ def _forward(
 
 @triton.jit(do_not_specialize=["N"])
 def _backward(
-    d_centres,
-    d_conics,
-    d_depths,
-    d_colours,
-    d_shown,
-    means,
-    quaternions,
-    scales,
-    opacities,
-    harmonics,
-    view,
-    depths,
-    colours,
-    d_means,
-    d_quaternions,
-    d_scales,
-    d_opacities,
-    d_harmonics,
-    N,
-    blur,
-    K: tl.constexpr,
-    BANDS: tl.constexpr,
-    COMPENSATE: tl.constexpr,
-    BLOCK: tl.constexpr,
+    grads, inputs, view, depths, colours, found, N, blur, K: tl.constexpr, BANDS: tl.constexpr, COMPENSATE: tl.constexpr
 ):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < N
+    d_centres, d_conics, d_depths, d_colours, d_shown = grads
+    means, quaternions, scales, opacities, harmonics = inputs
+    d_means, d_quaternions, d_scales, d_opacities, d_harmonics = found
+    i, here = indices(N, BLOCK)
     seen = tl.load(depths + i, mask=here, other=0.0) > 0  # what is not seen has depth zero, and all gradients zero
     R = _rotation(view)
     v = _mix(1.0, load_row(means, i, seen), -1.0, load_row(view + EYE, 0, True))
@@ -375,22 +335,20 @@ def _backward(
 
 
 def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
-    inputs = means, quaternions, scales, opacities, harmonics, view.numbers().to(means)
+    inputs, numbers = (means, quaternions, scales, opacities, harmonics), view.numbers().to(means)
     count, device = len(means), means.device
-    outputs = [empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,))]
-    options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate, "BLOCK": BLOCK}
-    ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
-    if count:
-        _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
-    ctx.save_for_backward(*inputs, outputs[2], outputs[3])
-    return tuple(outputs)
+    outputs = tuple(empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,)))
+    ctx.options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate}
+    ctx.grid, ctx.rest = (blocks(count, BLOCK),), (count, float(blur))
+    launch(_forward, ctx.grid, inputs, numbers, outputs, *ctx.rest, **ctx.options)
+    ctx.save_for_backward(*inputs, numbers, outputs[2], outputs[3])
+    return outputs
 
 
 def backward(ctx, *grads):
-    saved = ctx.saved_tensors
-    found = [empty(*x.shape, device=x.device) for x in saved[:5]]
-    if len(saved[0]):
-        _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+    *inputs, view, depths, colours = ctx.saved_tensors
+    found = tuple(empty(*x.shape, device=x.device) for x in inputs)
+    launch(_backward, ctx.grid, grads, tuple(inputs), view, depths, colours, found, *ctx.rest, **ctx.options)
     return *found, None, None, None, None
 
 

@@ -1,27 +1,15 @@
 """The definition."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
 from ...camera.lens import bend
 from ...geometry import to_matrix
 from ..spherical_harmonics.reference import run as harmonics_of
-from . import MIN_ALPHA, View
+from . import MIN_ALPHA
 
 
-def run(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    harmonics: Tensor,
-    view: View,
-    bands: int,
-    blur: float,
-    compensate: bool,
-) -> tuple[Tensor, ...]:
+def run(means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate) -> tuple[Tensor, ...]:
     rotation, eye, focal, centre, distortion, limits = (
         x.to(means) for x in (view.rotation, view.eye, view.focal, view.centre, view.distortion, view.limits)
     )

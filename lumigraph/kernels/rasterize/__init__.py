@@ -1,14 +1,10 @@
 """Rasterising: footprints become a picture, front to back."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require, require_indices, require_starts
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require, require_indices, require_starts
 from ..project import MAX_ALPHA, MIN_ALPHA
 from ..tile import Tiles, footprints, tile
 

@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import differentiable, empty
 from .._lanes import bytes_between, exp2, fetch, first_bit, highest, inverse, lowest, put, root, some, totals, where
+from .._operation import differentiable, empty
 from ..project import MAX_ALPHA as _MAX_ALPHA
 from ..project import MIN_ALPHA as _MIN_ALPHA
 
@@ -270,8 +270,7 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
 def backward(ctx, *grads):
     (rows, order, starts, masks, shares), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
     n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
-    given = (x.contiguous().numpy() for x in grads)
-    _backward(*given, *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
+    _backward(*(x.numpy() for x in grads), *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
     results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
     _gather(sums, masks, order, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
     return *results, None, None

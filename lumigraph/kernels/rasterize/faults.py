@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "light not lost": ("gpu", "_backward", "after / (1 - alpha)", "after"),
@@ -14,7 +14,4 @@ FAULTS = {
     "only one block's sums": ("cpu", "_gather", "and masks[p]", "and masks[p] == 1"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a plane too few": ("cpu", "_forward", "BLOCKS * 5", "BLOCKS * 4"),
-}
+ASTRAY = {"a plane too few": ("cpu", "_forward", "BLOCKS * 5", "BLOCKS * 4")}

@@ -4,21 +4,21 @@ Backward goes the same way again, and sums over a program's pixels meet in atomi
 loss in w_i, dL/da_i = T_i g_i - sum_{j>i} w_j g_j / (1 - a_i), where the sum over all j is known from the outputs.
 """
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row, store_row
+from .._gpu import launch, load_row, store_row
+from .._operation import differentiable, empty
 from ..project import MAX_ALPHA as _MAX_ALPHA
 from ..project import MIN_ALPHA as _MIN_ALPHA
 
 MIN_ALPHA, MAX_ALPHA = tl.constexpr(_MIN_ALPHA), tl.constexpr(_MAX_ALPHA)
 SQUARE = 16  # pixels along a program's share of a tile, at most
 MIN_TRANSMITTANCE = 1e-37  # less light is none, and a program without any has ended
-GAUSSIANS = 8  # looked at together; a matrix with a row for each and a column for each pixel must fit into registers
+GAUSSIANS = tl.constexpr(
+    8
+)  # looked at together; a matrix with a row for each and a column for each pixel must fit into registers
 
 
 @triton.jit
@@ -34,8 +34,9 @@ def _pixels(width, height, SIDE: tl.constexpr, SQUARE: tl.constexpr):
 
 
 @triton.jit
-def _gaussians(i, here, order, centres, conics, opacities, colours, depths):
+def _gaussians(i, here, order, gaussians):
     """Numbers, centres, conics, opacities and values of the tile's Gaussians at i; opacity 0 after the last."""
+    centres, conics, opacities, colours, depths = gaussians
     n = tl.load(order + i, mask=here, other=0).to(tl.int64)
     cx, cy = tl.load(centres + 2 * n, mask=here, other=0.0), tl.load(centres + 2 * n + 1, mask=here, other=0.0)
     a, b, c = load_row(conics, n, here)
@@ -67,31 +68,16 @@ def _light(dx, dy, conic, opacity, through, stop):
 
 
 @triton.jit
-def _of_pixel(picture, depth, weight, at, inside):
-    """What the outputs, or their gradients, hold for each pixel."""
+def _of_pixel(outputs, at, inside):
+    """Outputs, or their gradients, of each pixel."""
+    picture, depth, weight = outputs
     red, green, blue = load_row(picture, at, inside)
     return red, green, blue, tl.load(depth + at, mask=inside, other=0.0), tl.load(weight + at, mask=inside, other=0.0)
 
 
 @triton.jit(do_not_specialize=["width", "height"])
-def _forward(
-    centres,
-    conics,
-    opacities,
-    colours,
-    depths,
-    order,
-    starts,
-    picture,
-    depth,
-    weight,
-    width,
-    height,
-    stop,
-    SIDE: tl.constexpr,
-    SQUARE: tl.constexpr,
-    GAUSSIANS: tl.constexpr,
-):
+def _forward(gaussians, order, starts, outputs, width, height, stop, SIDE: tl.constexpr, SQUARE: tl.constexpr):
+    picture, depth, weight = outputs
     k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
     first, last = tl.load(starts + k), tl.load(starts + k + 1)
     through = tl.where(inside, 1.0, 0.0)
@@ -99,7 +85,7 @@ def _forward(
     sum_depth, sum_w = tl.zeros_like(through), tl.zeros_like(through)
     while (first < last) & (tl.max(through, 0) >= stop):
         i = first + tl.arange(0, GAUSSIANS)
-        _, centre, conic, opacity, v = _gaussians(i, i < last, order, centres, conics, opacities, colours, depths)
+        _, centre, conic, opacity, v = _gaussians(i, i < last, order, gaussians)
         dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
         _, _, _, behind, w = _light(dx, dy, conic, opacity, through, stop)
         red += tl.sum(w * v[0][:, None], 0)
@@ -122,41 +108,19 @@ def _add(pointer, n, value, here):
 
 @triton.jit(do_not_specialize=["width", "height"])
 def _backward(
-    d_picture,
-    d_depth,
-    d_weight,
-    centres,
-    conics,
-    opacities,
-    colours,
-    depths,
-    order,
-    starts,
-    picture,
-    depth,
-    weight,
-    d_centres,
-    d_conics,
-    d_opacities,
-    d_colours,
-    d_depths,
-    width,
-    height,
-    stop,
-    SIDE: tl.constexpr,
-    SQUARE: tl.constexpr,
-    GAUSSIANS: tl.constexpr,
+    grads, gaussians, order, starts, outputs, found, width, height, stop, SIDE: tl.constexpr, SQUARE: tl.constexpr
 ):
+    d_centres, d_conics, d_opacities, d_colours, d_depths = found
     k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
     first, last = tl.load(starts + k), tl.load(starts + k + 1)
     through = tl.where(inside, 1.0, 0.0)
-    g = _of_pixel(d_picture, d_depth, d_weight, at, inside)
-    seen = _of_pixel(picture, depth, weight, at, inside)
+    g = _of_pixel(grads, at, inside)
+    seen = _of_pixel(outputs, at, inside)
     rest = g[0] * seen[0] + g[1] * seen[1] + g[2] * seen[2] + g[3] * seen[3] + g[4] * seen[4]  # sum of w_j g_j to come
     while (first < last) & (tl.max(through, 0) >= stop):
         i = first + tl.arange(0, GAUSSIANS)
         here = i < last
-        n, centre, conic, opacity, v = _gaussians(i, here, order, centres, conics, opacities, colours, depths)
+        n, centre, conic, opacity, v = _gaussians(i, here, order, gaussians)
         dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
         raw, alpha, before, behind, w = _light(dx, dy, conic, opacity, through, stop)
         worth = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
@@ -182,21 +146,22 @@ def _backward(
 
 def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
     (width, height), device = tiles.size, centres.device
-    inputs = centres, conics, opacities, colours, depths, tiles.order, tiles.starts
-    outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
+    gaussians = centres, conics, opacities, colours, depths
+    outputs = tuple(empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width)))
     square = min(tiles.side, SQUARE)
     ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
     ctx.rest = width, height, max(float(stop), MIN_TRANSMITTANCE)
-    ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
-    _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
-    ctx.save_for_backward(*inputs, *outputs)
-    return tuple(outputs)
+    ctx.options = {"SIDE": tiles.side, "SQUARE": square}
+    launch(_forward, ctx.grid, gaussians, tiles.order, tiles.starts, outputs, *ctx.rest, **ctx.options)
+    ctx.save_for_backward(*gaussians, tiles.order, tiles.starts, *outputs)
+    return outputs
 
 
 def backward(ctx, *grads):
-    saved = ctx.saved_tensors
-    found = [torch.zeros_like(x) for x in saved[:5]]
-    _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+    *gaussians, order, starts, picture, depth, weight = ctx.saved_tensors
+    found = tuple(torch.zeros_like(x) for x in gaussians)
+    given = grads, tuple(gaussians), order, starts, (picture, depth, weight), found
+    launch(_backward, ctx.grid, *given, *ctx.rest, **ctx.options)
     return *found, None, None
 
 

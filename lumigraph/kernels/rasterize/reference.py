@@ -1,7 +1,5 @@
 """The definition: every pixel of a tile against every Gaussian of its list, (P, M)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import torch

@@ -1,6 +1,4 @@
-"""Proposal sampling: from a coarse grid of density to the intervals of each ray at which a field is asked."""
-
-from __future__ import annotations
+"""Proposal sampling: from a coarse grid of density to the intervals of each ray at which a field is evaluated."""
 
 from dataclasses import dataclass
 
@@ -8,9 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="rays", outputs=1, differentiable=(), typical=2, compiled=6)
 

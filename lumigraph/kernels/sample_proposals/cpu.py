@@ -4,7 +4,7 @@ sixteen of them at a time."""
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._operation import empty
 from ..contract.cpu import scale_of
 
 BLOCK = 64  # rays that share their memory

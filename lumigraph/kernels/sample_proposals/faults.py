@@ -1,7 +1,4 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "transmittance forgotten": ("cpu", "_sample", "passed *= left", "passed *= one"),
@@ -18,7 +15,6 @@ FAULTS = {
     "not clamped at the near plane": ("gpu", "_sample", "1 / tl.maximum(z, plane)", "1 / tl.maximum(z, 0.01)"),
 }
 
-# These let an index leave its array.
 ASTRAY = {
     "the coordinate 1, a cell too far": ("cpu", "_cell", "np.int32(size - 2)", "np.int32(size - 1)"),
     "an edge too many": ("cpu", "_sample", "range(count + 1)", "range(count + 2)"),

@@ -1,16 +1,14 @@
 """Triton: one program takes one ray, all its bins at once, and then a few edges at a time."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._gpu import launch
+from .._operation import empty
 from ..contract.gpu import scale_of, stretch_of
 
-EDGES = 16
+EDGES = tl.constexpr(16)
 
 
 @triton.jit
@@ -43,30 +41,10 @@ def _distance(share, near, far, first, last, FORWARD: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["X", "Y", "Z", "bins", "samples"])
-def _sample(
-    origins,
-    directions,
-    near,
-    far,
-    values,
-    edges,
-    X,
-    Y,
-    Z,
-    scale_x,
-    scale_y,
-    plane,
-    factor,
-    bins,
-    samples,
-    sharpness,
-    uniform_share,
-    min_weight,
-    max_log_density,
-    FORWARD: tl.constexpr,
-    BINS: tl.constexpr,
-    EDGES: tl.constexpr,
-):
+def _sample(rays, values, edges, X, Y, Z, frustum, bins, samples, limits, FORWARD: tl.constexpr, BINS: tl.constexpr):
+    origins, directions, near, far = rays
+    scale_x, scale_y, plane, factor = frustum
+    sharpness, uniform_share, min_weight, max_log_density = limits
     r = tl.program_id(0).to(tl.int64)
     i = tl.arange(0, BINS)
     here = i < bins
@@ -112,14 +90,14 @@ def _sample(
 
 
 @torch.no_grad()
-def run(origins, directions, near, far, log_density, resampling, frustum) -> Tensor:
+def run(origins, directions, near, far, log_density, resampling, frustum):
     r, (scale_x, scale_y, plane) = resampling, frustum or (1.0, 1.0, 1.0)
     edges = empty(len(origins), r.samples + 1, device=origins.device)
-    inputs = [x.contiguous() for x in (origins, directions, near, far, log_density)]
-    numbers = scale_x, scale_y, plane, (2 * scale_x * scale_y * plane) ** (1 / 3)
+    rays = tuple(x.contiguous() for x in (origins, directions, near, far))
+    numbers = *log_density.shape, (scale_x, scale_y, plane, (2 * scale_x * scale_y * plane) ** (1 / 3))
     limits = r.sharpness, r.uniform_share, r.min_weight, r.max_log_density
     BINS = triton.next_power_of_2(r.bins)
-    options = {"FORWARD": frustum is not None, "BINS": BINS, "EDGES": EDGES, "num_warps": max(1, min(8, BINS // 128))}
-    if len(origins):
-        _sample[(len(origins),)](*inputs, edges, *log_density.shape, *numbers, r.bins, r.samples, *limits, **options)
+    options = {"FORWARD": frustum is not None, "BINS": BINS, "num_warps": max(1, min(8, BINS // 128))}
+    given = rays, log_density.contiguous(), edges, *numbers, r.bins, r.samples, limits
+    launch(_sample, (len(origins),), *given, **options)
     return edges

@@ -1,7 +1,5 @@
 """The definition: all bins of all rays, (R, bins), then the inverse of each ray's distribution function."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad

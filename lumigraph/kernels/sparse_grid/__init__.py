@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 2), typical=2, compiled=3, smooth=(7,))
 

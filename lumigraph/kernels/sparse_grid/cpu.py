@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 
 ZERO, ONE = np.float32(0), np.float32(1)
 SLABS = 32  # that a grid is cut into at most, however many threads there are
@@ -174,7 +174,7 @@ def forward(ctx, points, nodes, values):
 def backward(ctx, grad):
     points, values = (x.detach() for x in ctx.saved_tensors)
     index, rows = ctx.nodes.index.numpy(), ctx.nodes.rows.numpy()
-    grad = grad.contiguous().numpy()
+    grad = grad.numpy()
     to_points = to_values = None
     if ctx.needs_input_grad[0]:
         to_points = empty(*points.shape)

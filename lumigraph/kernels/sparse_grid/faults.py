@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_values", "tl.static_range(8)", "tl.static_range(7)"),
@@ -10,7 +10,4 @@ FAULTS = {
     "empty nodes as the first row": ("cpu", "corners", "count += row >= 0", "count += 1"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "the point 1.0, a cell too far": ("cpu", "cell_of", "np.int64(cells - 1))\n", "np.int64(cells))\n"),
-}
+ASTRAY = {"the point 1.0, a cell too far": ("cpu", "cell_of", "np.int64(cells - 1))\n", "np.int64(cells))\n")}

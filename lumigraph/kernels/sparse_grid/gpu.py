@@ -1,15 +1,13 @@
 """Triton: one program takes a block of samples. Gradients of the values meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
+from .._operation import differentiable, empty
 
-BLOCK = 64
+BLOCK = tl.constexpr(64)
 
 
 @triton.jit
@@ -66,10 +64,9 @@ def row_of(index, rows, node, here, Y, Z):
 
 
 @triton.jit(do_not_specialize=["S"])
-def _forward(points, index, rows, values, out, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _forward(points, index, rows, values, out, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, WIDTH)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     total = tl.zeros([BLOCK, WIDTH], tl.float32)
     for k in tl.static_range(8):
@@ -81,12 +78,9 @@ def _forward(points, index, rows, values, out, S, X, Y, Z, C: tl.constexpr, WIDT
 
 
 @triton.jit(do_not_specialize=["S"])
-def _backward_values(
-    grad, points, index, rows, d_values, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr
-):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _backward_values(grad, points, index, rows, d_values, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, WIDTH)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=here[:, None] & (c < C)[None, :], other=0.0)
     for k in tl.static_range(8):
@@ -97,12 +91,9 @@ def _backward_values(
 
 
 @triton.jit(do_not_specialize=["S"])
-def _backward_points(
-    grad, points, index, rows, values, d_points, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr, BLOCK: tl.constexpr
-):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+def _backward_points(grad, points, index, rows, values, d_points, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr):
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, WIDTH)
-    here = i < S
     cell, f, inside = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=here[:, None] & (c < C)[None, :], other=0.0)
     dx = tl.zeros([BLOCK], tl.float32)
@@ -124,26 +115,22 @@ def forward(ctx, points, nodes, values):
     channels = values.shape[1]
     ctx.index = nodes.index.contiguous(), nodes.named
     ctx.sizes = (len(points), *nodes.index.shape)
-    ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK}
+    ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1))}
     ctx.save_for_backward(points, values)
     out = empty(len(points), channels, device=points.device)
-    if len(points):
-        _forward[(triton.cdiv(len(points), BLOCK),)](points, *ctx.index, values, out, *ctx.sizes, **ctx.meta)
+    launch(_forward, (blocks(len(points), BLOCK),), points, *ctx.index, values, out, *ctx.sizes, **ctx.meta)
     return out
 
 
 def backward(ctx, grad):
     points, values = ctx.saved_tensors
-    grad, blocks = grad.contiguous(), (triton.cdiv(len(points), BLOCK),)
-    d_points = d_values = None
+    grid, d_points, d_values = (blocks(len(points), BLOCK),), None, None
     if ctx.needs_input_grad[0]:
         d_points = empty(*points.shape, device=points.device)
-        if len(points):
-            _backward_points[blocks](grad, points, *ctx.index, values, d_points, *ctx.sizes, **ctx.meta)
+        launch(_backward_points, grid, grad, points, *ctx.index, values, d_points, *ctx.sizes, **ctx.meta)
     if ctx.needs_input_grad[2]:
         d_values = torch.zeros_like(values)
-        if len(points):
-            _backward_values[blocks](grad, points, *ctx.index, d_values, *ctx.sizes, **ctx.meta)
+        launch(_backward_values, grid, grad, points, *ctx.index, d_values, *ctx.sizes, **ctx.meta)
     return d_points, None, d_values
 
 

@@ -1,7 +1,5 @@
 """The definition: eight nodes, looked up and blended."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch

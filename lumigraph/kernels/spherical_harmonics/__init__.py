@@ -1,16 +1,12 @@
 """Real spherical harmonics: a direction as smooth features."""
 
-from __future__ import annotations
-
 from math import pi, sqrt
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="directions", outputs=1, differentiable=(0,), typical=4, compiled=0, smooth=(4,))
 

@@ -1,11 +1,9 @@
 """Numba: threads share the directions. One coefficient of all directions after another, as networks like them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 
 MAX_COEFFICIENTS = 16  # coefficients
@@ -87,7 +85,7 @@ def forward(ctx, directions, bands):
 def backward(ctx, grad):
     (directions,) = ctx.saved_tensors
     d_directions = empty(*directions.shape)
-    _backward(grad.contiguous().numpy(), directions.numpy(), ctx.bands, d_directions.numpy())
+    _backward(grad.numpy(), directions.numpy(), ctx.bands, d_directions.numpy())
     return d_directions, None
 
 

@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "sign in band 3": ("gpu", "harmonic", "z * z - 3", "z * z + 3"),
@@ -12,7 +12,4 @@ FAULTS = {
     "term forgotten": ("cpu", "slope", " - zonal * g[13]", ""),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a coefficient too many": ("cpu", "basis", "out[15] =", "out[16] ="),
-}
+ASTRAY = {"a coefficient too many": ("cpu", "basis", "out[15] =", "out[16] =")}

@@ -1,17 +1,15 @@
 """Triton: one lane takes one direction."""
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable, empty
-from .._rows_gpu import load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
+from .._operation import differentiable, empty
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 
 Y00, Y1, Y20, Y21, Y22 = (tl.constexpr(k) for k in (K00, K1, K20, K21, K22))
 Y30, Y31, Y32, Y33 = (tl.constexpr(k) for k in (K30, K31, K32, K33))
-BLOCK = 128
+BLOCK = tl.constexpr(128)
 
 
 @triton.jit
@@ -92,18 +90,16 @@ def harmonic_slope(k: tl.constexpr, x, y, z):
 
 
 @triton.jit(do_not_specialize=["R"])
-def _forward(directions, out, R, BANDS: tl.constexpr, BLOCK: tl.constexpr):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+def _forward(directions, out, R, BANDS: tl.constexpr):
+    r, here = indices(R, BLOCK)
     x, y, z = load_row(directions, r, here)
     for k in tl.static_range(BANDS * BANDS):
         tl.store(out + r * (BANDS * BANDS) + k, harmonic(k, x, y, z), mask=here)
 
 
 @triton.jit(do_not_specialize=["R"])
-def _backward(grad, directions, d_directions, R, BANDS: tl.constexpr, BLOCK: tl.constexpr):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+def _backward(grad, directions, d_directions, R, BANDS: tl.constexpr):
+    r, here = indices(R, BLOCK)
     x, y, z = load_row(directions, r, here)
     dx, dy, dz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(1, BANDS * BANDS):
@@ -117,17 +113,14 @@ def forward(ctx, directions, bands):
     ctx.save_for_backward(directions)
     ctx.bands = bands
     out = empty(len(directions), bands**2, device=directions.device)
-    if len(out):
-        _forward[(triton.cdiv(len(out), BLOCK),)](directions, out, len(out), BANDS=bands, BLOCK=BLOCK)
+    launch(_forward, (blocks(len(out), BLOCK),), directions, out, len(out), BANDS=bands)
     return out
 
 
 def backward(ctx, grad):
     (directions,) = ctx.saved_tensors
     d_directions = empty(*directions.shape, device=directions.device)
-    if len(grad):
-        grid = (triton.cdiv(len(grad), BLOCK),)
-        _backward[grid](grad.contiguous(), directions, d_directions, len(grad), BANDS=ctx.bands, BLOCK=BLOCK)
+    launch(_backward, (blocks(len(grad), BLOCK),), grad, directions, d_directions, len(grad), BANDS=ctx.bands)
     return d_directions, None
 
 

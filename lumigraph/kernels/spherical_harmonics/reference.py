@@ -1,7 +1,5 @@
 """The definition: K_lm q_lm(z) times the real or imaginary part of (x + i y)^|m| (Sloan 2013)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,14 +1,10 @@
 """Structural similarity of two images, as a loss needs it."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(0, 1), typical=1, compiled=4, smooth=(1,))
 

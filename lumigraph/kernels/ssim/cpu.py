@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import differentiable, empty
+from .._operation import differentiable, empty
 from . import C1, C2, WINDOW, weights
 
 REACH = WINDOW // 2

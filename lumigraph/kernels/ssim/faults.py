@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "the wrong image": ("cpu", "_gradient", "other[x] * products", "own[x] * products"),
@@ -10,7 +10,4 @@ FAULTS = {
     "the neighbouring channel": ("gpu", "_along", "(k - REACH) * C", "k - REACH"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a window too long": ("cpu", "_window", "x[at + 10 * step]", "x[at + 11 * step]"),
-}
+ASTRAY = {"a window too long": ("cpu", "_window", "x[at + 10 * step]", "x[at + 11 * step]")}

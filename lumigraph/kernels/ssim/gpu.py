@@ -1,7 +1,5 @@
 """Triton: a row is one line of width x channels numbers. One pass blurs along the line, another across the lines."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import torch
@@ -9,24 +7,25 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .._dispatch import differentiable, empty
+from .._gpu import blocks, launch
+from .._operation import differentiable, empty
 from . import C1, C2, WINDOW, weights
 
 TAPS, REACH = tl.constexpr(WINDOW), tl.constexpr(WINDOW // 2)
 K1, K2 = tl.constexpr(C1), tl.constexpr(C2)
-BLOCK = 256
+BLOCK = tl.constexpr(256)
 MEAN_A, MEAN_B = 0, 3  # of the maps
 
 
 @triton.jit
-def _place(length, BLOCK: tl.constexpr):
+def _place(length):
     """This program's row, its numbers along it, and which of them exist."""
     x = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     return tl.program_id(0).to(tl.int64), x, x < length
 
 
 @triton.jit
-def _across(plane, window, x, y, size, length, here, BLOCK: tl.constexpr):
+def _across(plane, window, x, y, size, length, here):
     """One blur across the lines, of rows that are blurred along."""
     total = tl.zeros([BLOCK], tl.float32)
     for k in tl.static_range(TAPS):
@@ -37,9 +36,9 @@ def _across(plane, window, x, y, size, length, here, BLOCK: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def _moments(a, b, window, rows, height, length, C: tl.constexpr, BLOCK: tl.constexpr):
+def _moments(a, b, window, rows, height, length, C: tl.constexpr):
     """Along the lines: both images, their squares' sum, their product."""
-    y, x, here = _place(length, BLOCK)
+    y, x, here = _place(length)
     mean_a = tl.zeros([BLOCK], tl.float32)
     mean_b = tl.zeros([BLOCK], tl.float32)
     squares = tl.zeros([BLOCK], tl.float32)
@@ -62,14 +61,14 @@ def _moments(a, b, window, rows, height, length, C: tl.constexpr, BLOCK: tl.cons
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def _likeness(rows, window, out, maps, height, length, MAPS: tl.constexpr, BLOCK: tl.constexpr):
+def _likeness(rows, window, out, maps, height, length, MAPS: tl.constexpr):
     """S, and its derivatives in the mean of a, the squares' mean, the products' mean, and the mean of b."""
-    y, x, here = _place(length, BLOCK)
+    y, x, here = _place(length)
     size = height.to(tl.int64) * length
-    a = _across(rows, window, x, y, size, length, here, BLOCK)
-    b = _across(rows + size, window, x, y, size, length, here, BLOCK)
-    squares = _across(rows + 2 * size, window, x, y, size, length, here, BLOCK)
-    products = _across(rows + 3 * size, window, x, y, size, length, here, BLOCK)
+    a = _across(rows, window, x, y, size, length, here)
+    b = _across(rows + size, window, x, y, size, length, here)
+    squares = _across(rows + 2 * size, window, x, y, size, length, here)
+    products = _across(rows + 3 * size, window, x, y, size, length, here)
     A1, A2 = 2 * a * b + K1, 2 * (products - a * b) + K2
     B1, B2 = a * a + b * b + K1, squares - (a * a + b * b) + K2
     S = A1 * A2 / (B1 * B2)
@@ -85,8 +84,8 @@ def _likeness(rows, window, out, maps, height, length, MAPS: tl.constexpr, BLOCK
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def _along(maps, window, rows, height, length, C: tl.constexpr, BLOCK: tl.constexpr):
-    y, x, here = _place(length, BLOCK)
+def _along(maps, window, rows, height, length, C: tl.constexpr):
+    y, x, here = _place(length)
     start = (tl.program_id(2) * height.to(tl.int64) + y) * length
     total = tl.zeros([BLOCK], tl.float32)
     for k in tl.static_range(TAPS):
@@ -97,13 +96,13 @@ def _along(maps, window, rows, height, length, C: tl.constexpr, BLOCK: tl.conste
 
 
 @triton.jit(do_not_specialize=["height", "length", "mean"])
-def _gradient(rows, window, own, other, grad, d_own, height, length, mean, share, BLOCK: tl.constexpr):
+def _gradient(rows, window, own, other, grad, d_own, height, length, mean, share):
     """Every derivative spreads to where it was gathered: the window is symmetric, so that is the same blur."""
-    y, x, here = _place(length, BLOCK)
+    y, x, here = _place(length)
     size = height.to(tl.int64) * length
-    to_mean = _across(rows + mean * size, window, x, y, size, length, here, BLOCK)
-    to_squares = _across(rows + size, window, x, y, size, length, here, BLOCK)
-    to_products = _across(rows + 2 * size, window, x, y, size, length, here, BLOCK)
+    to_mean = _across(rows + mean * size, window, x, y, size, length, here)
+    to_squares = _across(rows + size, window, x, y, size, length, here)
+    to_products = _across(rows + 2 * size, window, x, y, size, length, here)
     place = y * length + x
     mine, its = tl.load(own + place, mask=here), tl.load(other + place, mask=here)
     to_own = to_mean + 2 * mine * to_squares + its * to_products
@@ -118,13 +117,13 @@ def _window(device: torch.device) -> Tensor:
 def forward(ctx, a, b):
     height, width, channels = a.shape
     length = width * channels
-    ctx.grid, ctx.window = (height, triton.cdiv(length, BLOCK)), _window(a.device)
+    ctx.grid, ctx.window = (height, blocks(length, BLOCK)), _window(a.device)
     wanted = ctx.needs_input_grad
     first, second = (b, a) if wanted == (False, True) else (a, b)  # S is symmetric
     count = 3 + all(wanted) if any(wanted) else 0
     rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 1, count))
-    _moments[ctx.grid](first, second, ctx.window, rows, height, length, C=channels, BLOCK=BLOCK)
-    _likeness[ctx.grid](rows, ctx.window, out, maps, height, length, MAPS=count, BLOCK=BLOCK)
+    launch(_moments, ctx.grid, first, second, ctx.window, rows, height, length, C=channels)
+    launch(_likeness, ctx.grid, rows, ctx.window, out, maps, height, length, MAPS=count)
     ctx.save_for_backward(a, b, maps)
     return out.mean()
 
@@ -133,14 +132,14 @@ def backward(ctx, grad):
     a, b, maps = ctx.saved_tensors
     count, height, length = maps.shape
     rows = empty(*maps.shape, device=a.device)
-    _along[(*ctx.grid, count)](maps, ctx.window, rows, height, length, C=a.shape[2], BLOCK=BLOCK)
+    launch(_along, (*ctx.grid, count), maps, ctx.window, rows, height, length, C=a.shape[2])
     gradients: list[Tensor | None] = [None, None]
     for i, (own, other) in enumerate([(a, b), (b, a)]):
         if ctx.needs_input_grad[i]:
             mean = MEAN_B if i and count > MEAN_B else MEAN_A
             found = gradients[i] = empty(*a.shape, device=a.device)
-            given = rows, ctx.window, own, other, grad.contiguous(), found
-            _gradient[ctx.grid](*given, height, length, mean, 1 / a.numel(), BLOCK=BLOCK)
+            given = rows, ctx.window, own, other, grad, found
+            launch(_gradient, ctx.grid, *given, height, length, mean, 1 / a.numel())
     return (*gradients,)
 
 

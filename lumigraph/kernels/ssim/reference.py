@@ -1,7 +1,5 @@
 """The definition."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d

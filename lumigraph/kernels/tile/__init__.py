@@ -1,4 +1,4 @@
-"""Tiling: which Gaussians each square of the picture must look at, nearest first."""
+"""Tiling: the Gaussians that touch each square of the picture, nearest first."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 from ..project import MIN_ALPHA
 
 FACTS = Facts(unit="gaussians", outputs=2, differentiable=(), typical=2, compiled=6)
@@ -20,7 +18,7 @@ SIDE = 32  # pixels along a tile
 
 @dataclass(frozen=True)
 class Tiles:
-    """Tile k, row by row, must look at Gaussians order[starts[k] : starts[k + 1]], front to back.
+    """Tile k, row by row, has Gaussians order[starts[k] : starts[k + 1]], front to back.
 
     size: (width, height) of the picture; side: pixels along a tile. The last tile of a row or column may stick out.
     """

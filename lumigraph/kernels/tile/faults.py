@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "the circle for the ellipse": ("cpu", "_span", " - ellipse[4] * y\n    y =", "\n    y ="),
@@ -9,7 +9,4 @@ FAULTS = {
     "another row's tile": ("gpu", "_tile", "row * across + column", "column * down + row"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "room for one tile in each row": ("cpu", "_room", " * rows[k, 2]", ""),
-}
+ASTRAY = {"room for one tile in each row": ("cpu", "_room", " * rows[k, 2]", "")}

@@ -3,17 +3,15 @@
 A stable sort by tile then leaves each tile's list in order of depth.
 """
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
+from .._gpu import blocks, indices, launch
 from ..project import MIN_ALPHA as _MIN_ALPHA
 
 MIN_ALPHA = tl.constexpr(_MIN_ALPHA)
-BLOCK = 32  # Gaussians; they go through their tiles together, so a program is as slow as its largest
+BLOCK = tl.constexpr(32)  # Gaussians; they go through their tiles together, so a program is as slow as its largest
 
 
 @triton.jit
@@ -46,24 +44,10 @@ def _least_on(x, y0, y1, c, tilt, rest):
 
 
 @triton.jit(do_not_specialize=["N", "width", "height"])
-def _tile(
-    near_first,
-    centres,
-    conics,
-    opacities,
-    counts,
-    ends,
-    pair_tiles,
-    pair_numbers,
-    N,
-    width,
-    height,
-    SIDE: tl.constexpr,
-    WRITE: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
-    rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = rank < N
+def _tile(near_first, gaussians, counts, ends, pairs, N, width, height, SIDE: tl.constexpr, WRITE: tl.constexpr):
+    centres, conics, opacities = gaussians
+    pair_tiles, pair_numbers = pairs
+    rank, here = indices(N, BLOCK)
     i = tl.load(near_first + rank, mask=here, other=0)
     cx, cy = tl.load(centres + 2 * i, mask=here, other=0.0), tl.load(centres + 2 * i + 1, mask=here, other=0.0)
     a = tl.load(conics + 3 * i, mask=here, other=1.0)
@@ -108,21 +92,18 @@ def _tile(
 
 
 @torch.no_grad()
-def run(
-    centres: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, size: tuple[int, int], side: int
-) -> tuple[Tensor, Tensor]:
+def run(centres, conics, opacities, depths, size, side):
     (width, height), count, device = size, len(centres), centres.device
-    inputs = [depths.argsort(stable=True), *(x.contiguous() for x in (centres, conics, opacities))]
-    options = {"SIDE": side, "BLOCK": BLOCK, "num_warps": 1, "enable_fp_fusion": False}  # both passes must round alike
+    inputs = depths.argsort(stable=True), tuple(x.contiguous() for x in (centres, conics, opacities))
+    options = {"SIDE": side, "num_warps": 1, "enable_fp_fusion": False}  # both passes must round alike
     counts = torch.zeros(count, dtype=torch.int32, device=device)
     ends = torch.zeros(count, dtype=torch.int64, device=device)
-    tiles = numbers = torch.empty(0, dtype=torch.int32, device=device)
-    if count:
-        grid = (triton.cdiv(count, BLOCK),)
-        _tile[grid](*inputs, counts, ends, tiles, numbers, count, width, height, WRITE=False, **options)
-        torch.cumsum(counts, 0, out=ends)
-        tiles, numbers = (torch.empty(int(ends[-1]), dtype=torch.int32, device=device) for _ in range(2))
-        _tile[grid](*inputs, counts, ends, tiles, numbers, count, width, height, WRITE=True, **options)
+    grid, pairs = (blocks(count, BLOCK),), (counts, counts)  # nothing is written into these
+    launch(_tile, grid, *inputs, counts, ends, pairs, count, width, height, WRITE=False, **options)
+    torch.cumsum(counts, 0, out=ends)
+    total = int(ends[-1]) if count else 0
+    tiles, numbers = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
+    launch(_tile, grid, *inputs, counts, ends, (tiles, numbers), count, width, height, WRITE=True, **options)
     tiles, places = tiles.sort(stable=True)
     every = torch.arange(-(-width // side) * -(-height // side) + 1, dtype=torch.int32, device=device)
     return numbers[places], torch.searchsorted(tiles, every)

@@ -1,7 +1,5 @@
 """The definition: every Gaussian against every tile, (N, K)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,14 +1,10 @@
 """Total variation of a grid: how much neighbouring nodes differ."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require, require_indices
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require, require_indices
 from ..sparse_grid import Nodes, shell, some_nodes
 
 FACTS = Facts(unit="nodes", outputs=1, differentiable=(2,), typical=2, compiled=2, smooth=(4,))

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import differentiable
+from .._operation import differentiable
 from ..sparse_grid.cpu import row_of, slabs_of
 from . import EPSILON
 

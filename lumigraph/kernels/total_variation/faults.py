@@ -1,4 +1,4 @@
-"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "a neighbour's slope forgotten": ("gpu", "_vary", "dy / length", "0 * dy"),
@@ -7,7 +7,4 @@ FAULTS = {
     "a node's own slope forgotten": ("cpu", "_vary", "per * (dx + dy + dz)", "per * (dx + dy)"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "after the last node": ("cpu", "_after", "x >= index.shape[0]", "x > index.shape[0]"),
-}
+ASTRAY = {"after the last node": ("cpu", "_after", "x >= index.shape[0]", "x > index.shape[0]")}

@@ -1,17 +1,16 @@
 """Triton: one program takes a block of nodes. Sums and gradients meet in atomic adds."""
 
-from __future__ import annotations
-
 import torch
 import triton
 import triton.language as tl
 
-from .._dispatch import differentiable
+from .._gpu import blocks, launch
+from .._operation import differentiable
 from ..sparse_grid.gpu import row_of
 from . import EPSILON
 
 EPSILON_ = tl.constexpr(EPSILON)
-BLOCK = 64
+BLOCK = tl.constexpr(64)
 
 
 @triton.jit
@@ -24,20 +23,7 @@ def _after(index, rows, x, y, z, row, X, Y, Z):
 
 @triton.jit(do_not_specialize=["K"])
 def _vary(
-    chosen,
-    index,
-    rows,
-    values,
-    total,
-    out,
-    K,
-    X,
-    Y,
-    Z,
-    C: tl.constexpr,
-    WIDTH: tl.constexpr,
-    SLOPED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    chosen, index, rows, values, total, out, K, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr, SLOPED: tl.constexpr
 ):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, WIDTH)[None, :]
@@ -66,11 +52,9 @@ def forward(ctx, chosen, nodes, values):
     ctx.count = max(len(chosen), 1)
     total = torch.zeros((), device=values.device)
     slope = torch.zeros_like(values) if sloped else total
-    if len(chosen):
-        sizes = len(chosen), *nodes.index.shape
-        meta = {"C": channels, "WIDTH": triton.next_power_of_2(channels), "SLOPED": sloped, "BLOCK": BLOCK}
-        index = nodes.index.contiguous(), nodes.named
-        _vary[(triton.cdiv(len(chosen), BLOCK),)](chosen, *index, values, total, slope, *sizes, **meta)
+    meta = {"C": channels, "WIDTH": triton.next_power_of_2(channels), "SLOPED": sloped}
+    given = chosen, nodes.index.contiguous(), nodes.named, values, total, slope, len(chosen), *nodes.index.shape
+    launch(_vary, (blocks(len(chosen), BLOCK),), *given, **meta)
     ctx.save_for_backward(slope)
     return total / ctx.count
 

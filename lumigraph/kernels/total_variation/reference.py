@@ -1,7 +1,5 @@
 """The definition: differences along three axes."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,7 +5,7 @@ The field of one block learns from any scene. `large.compositing` makes one pict
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -13,34 +13,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.frustum_field import FrustumField
-from ...components.fields.hash_field import CODES_RATE, CPU_TABLE, OPEN_RATE, TINY_TABLE, HashField, HashNumbers
-from ...components.fields.sky import sky_for
+from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
+from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
+from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, HashNumbers
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayNumbers
-from ...components.sampling.occupancy_sampler import (
-    CPU_OCCUPANCY,
-    CPU_STEPS,
-    TINY_OCCUPANCY,
-    TINY_STEPS,
-    OccupancyNumbers,
-    StepNumbers,
-)
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.schedules import held
+from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
 from ...method import FieldMethod
+from ...method.field import Directions, Points
 from ...volume import composite
-from .exposures import Exposures
-from .moving import Moving
-from .visibility import Visibility
+from .parts import Exposures, Moving, Visibility
 
 
 @dataclass(frozen=True)
@@ -81,7 +70,7 @@ FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 class BlockNeRF(FieldMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
-    Config = Config
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | FrustumField
     in_blocks = True
 
@@ -113,61 +102,24 @@ class BlockNeRF(FieldMethod):
             self.sight = Visibility(space, *shape) if c.visibility else None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's networks. On a CPU a hash table with Instant-NGP's numbers there."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            field="hash",
-            table=CPU_TABLE,
-            occupancy=CPU_OCCUPANCY,
-            steps=CPU_STEPS,
-            visibility_layers=2,
-            visibility_width=64,
-            huber_delta=0.3,
-            hidden_width=32,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-            decay_start=0.3,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table with Instant-NGP's numbers."""
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with tiny networks, every part of it, within some twenty quick steps."""
-        return Config(
-            field="hash",
-            table=TINY_TABLE,
-            occupancy=TINY_OCCUPANCY,
-            steps=TINY_STEPS,
-            poses=PoseNumbers(refine_cameras=True, match_photographs=False),
-            appearance_code=4,
-            exposure_frequencies=2,
-            visibility_frequencies=3,
-            visibility_layers=1,
-            visibility_width=16,
-            residual_masks=True,
-            hidden_width=16,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-        )
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        c = config
-        if c.field == "network":
-            return c.network.activation_bytes(c.rays.samples_per_step, c.hidden_width) * learning
-        activations = c.table.activation_bytes(c.occupancy.samples_per_step, c.hidden_width)
-        return super().further_bytes(frame, config, learning) + activations * learning
+        poses = PoseNumbers(refine_cameras=True, match_photographs=False)
+        c = Config(**TINY_HASH, field="hash", poses=poses, hidden_width=16, residual_masks=True, appearance_code=4)
+        c = replace(c, exposure_frequencies=2, visibility_frequencies=3, visibility_layers=1, visibility_width=16)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3)
 
     # Learning
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         places = self.moving is not None
         return data.sample_rays(self.sampler.batch_size, generator, places=places).to(self.device)
-
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        return {"coarse": self.config.coarse_loss_weight}
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The error of every pass's colours, and of the visibility network along the last pass's rays."""
@@ -210,10 +162,6 @@ class BlockNeRF(FieldMethod):
             own = [torch.optim.Adam([*self.network.parameters(), *codes], rate)]
         return [*own, *super().optimizers()]
 
-    def learning_rate(self, step: int, progress: float) -> float:
-        c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
-
     def codes(self, image: Int[Tensor, " ray"]) -> Float[Tensor, "ray code"]:
         """The code of each ray's photograph: appearance, then exposure."""
         nothing = torch.zeros(len(image), 0, device=self.device)
@@ -228,8 +176,7 @@ class BlockNeRF(FieldMethod):
 
     @property
     def shown_in(self) -> Appearance:
-        """The appearance of pictures: of the settings, else of the evidence, else the average. Empty where none was
-        learnt."""
+        """Appearance of pictures: of the settings, else of the evidence, else the average; empty without codes."""
         return Appearance(self.appearance.shown(self) if self.appearance else torch.zeros(0, device=self.device))
 
     @property
@@ -238,9 +185,6 @@ class BlockNeRF(FieldMethod):
         return self.exposures.usual_stops if self.exposures else None
 
     @torch.no_grad()
-    def visibility(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> Float[Tensor, " point"]:
-        """Share of each place, seen along a unit direction, that the block's photographs saw (section 4.2.5); 1 where
-        that was not learnt."""
+    def visibility(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
+        """Share of each place, along a unit direction, that the photographs saw (section 4.2.5); 1 if not learnt."""
         return self.sight(points, directions) if self.sight else torch.ones_like(points[:, 0])

@@ -11,21 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.fields.appearance import PhotographCodes
-from ...components.training.lights import spread_of_light
+from ...components.fields.appearance import APPEARANCE, PhotographCodes
+from ...components.training.photometric import spread_of_light
 from ...components.training.schedules import falling
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning
 from ...files.ranges import LearningRate, NonNegative
 from ...gaussians import Gaussians
+from ...kernels.spherical_harmonics import K00
 from ...method.controls import Control
 from .addition import Addition, Step
-from .affine_colours import COLOUR_NUMBERS, fit_colours, recoloured, recoloured_harmonics
 from .cloud import CloudAdam
 from .interval_schedule import short_schedule_lr_scale
-from .sky import SKY_NUMBERS, mean_skies, sky, sky_harmonics, sky_loss
 
 MIN_SPREAD = 0.3  # stops between neighbouring photographs, beyond which each has an appearance
 FULL_SCHEDULE_PASSES = 400  # steps for each photograph, from which on the learning rate is not scaled
@@ -118,8 +118,7 @@ class SplatAppearance(Addition):
         return cloud if code is None else replace(cloud, harmonics=recoloured_harmonics(cloud.harmonics, code))
 
     def code(self, method: Any) -> Float[Tensor, " number"] | None:
-        """The code of the control, else of a photograph given as evidence, else the average; None where photographs do
-        not differ."""
+        """Code of the control, else of a given photograph, else the average; None where photographs do not differ."""
         if not self.is_active:
             return None
         if self.found is not None and "appearance" not in method.settings:
@@ -130,10 +129,7 @@ class SplatAppearance(Addition):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        about = (
-            "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
-        )
-        return (self.codes.control("appearance", about),) if self.is_active else ()
+        return (self.codes.control("appearance", APPEARANCE),) if self.is_active else ()
 
     @property
     def accepts(self) -> tuple[type, ...]:
@@ -142,8 +138,7 @@ class SplatAppearance(Addition):
 
     @torch.no_grad()
     def adapted(self, method: Any, evidence: Photograph) -> SplatAppearance:
-        """The part with the code in which the cloud looks most like the trusted pixels of a photograph; the average,
-        where there is none."""
+        """The part with the code that fits the trusted pixels of a photograph best; the average without any."""
         photograph, background = evidence.to(method.device), method.background[0]
         seen = method.rasterized(photograph.camera)
         target, trusted = photograph.before(background), photograph.mask
@@ -156,3 +151,119 @@ class SplatAppearance(Addition):
         adapted.found = fit_colours(start, seen.rgb[trusted], seen.opacity[trusted], target[trusted], behind)
         method.settings.pop("appearance", None)
         return adapted
+
+
+COLOUR_NUMBERS = 12  # of a photograph's code: the nine of A by rows, the three of b
+ZERO_COLOUR = 0.5  # colour of a Gaussian whose harmonics are zero
+ROUNDS = 12  # of reweighted least squares, with which a code is fitted to a photograph
+MAX_PIXELS = 1 << 14  # evenly chosen, that a code is fitted to
+MIN_RESIDUAL = 0.01  # below which a pixel's weight stays the same
+COLOUR_PRIOR = 3e-3  # weight of the squared change of A and b: a grey wall does not determine how channels mix
+REST_PRIOR = 0.01  # weight of the squared change of the rest of a code, which most pixels do not determine
+
+
+def recoloured(
+    rgb: Float[Tensor, "*#row 3"], opacity: Float[Tensor, "*#row"], code: Float[Tensor, " number"]
+) -> Float[Tensor, "*#row 3"]:
+    """Colours over black in a photograph's appearance: the map is of the scene, and not of its background.
+
+    rgb:     multiplied by the opacity, so that b is too
+    opacity: of each colour
+    """
+    matrix, offset = _map(code)
+    return rgb @ matrix.T + opacity[..., None] * offset
+
+
+def recoloured_harmonics(
+    harmonics: Float[Tensor, "gaussian coefficient 3"], code: Float[Tensor, " number"]
+) -> Float[Tensor, "gaussian coefficient 3"]:
+    """Coefficients whose colours are those of others in a photograph's appearance, from every side.
+
+    A colour is 1/2 + sum_k Y_k h_k, so that h_k' = (I + A) h_k, and the constant takes up what is left of 1/2 and b.
+    The same but where a colour is cut at 0, which comes after this and before `recoloured`.
+    """
+    matrix, offset = _map(code)
+    out = harmonics @ matrix.T
+    constant = out[:, :1] + (ZERO_COLOUR * (matrix.sum(-1) - 1) + offset) / K00
+    return torch.cat([constant, out[:, 1:]], 1)
+
+
+@torch.no_grad()
+def fit_colours(
+    start: Float[Tensor, " number"],
+    rgb: Float[Tensor, "pixel 3"],
+    opacity: Float[Tensor, " pixel"],
+    target: Float[Tensor, "pixel 3"],
+    behind: Float[Tensor, "pixel 9"] | None = None,
+) -> Float[Tensor, " number"]:
+    """The code whose picture is closest to a photograph by mean absolute difference, which is robust to distractors.
+
+    The picture, rgb (I + A)^T + opacity b + (1 - opacity) behind s, is linear in all of it: so least squares whose
+    pixels weigh one over their last error, a few times over (Schlossmacher 1973), get there at once.
+
+    start:   what the code is drawn towards, and what comes back where there is no pixel
+    rgb:     of the scene over black;  target: the photograph, less a background of which nothing is to be found
+    behind:  harmonics of the directions, where a code holds a sky; it stays unless pixels say otherwise
+    """
+    few = slice(None, None, -(-len(target) // MAX_PIXELS) or 1)
+    rgb, opacity, target = rgb[few].double(), opacity[few, None].double(), target[few].double()
+    if not len(target):
+        return start
+    parts = [rgb, opacity] if behind is None else [rgb, opacity, (1 - opacity) * behind[few]]
+    rows, matrix = torch.cat(parts, 1), _columns(start).double()
+    held = torch.full_like(matrix, REST_PRIOR)
+    held[:4] = COLOUR_PRIOR
+    first, drawn = matrix, torch.diag_embed(held.T)
+    for _ in range(ROUNDS):
+        weights = 0.5 / (rows @ matrix - target).abs().clamp_min(MIN_RESIDUAL) / target.numel()
+        normal = torch.einsum("nc,na,nb->cab", weights, rows, rows) + drawn
+        wanted = torch.einsum("nc,na->ca", weights * target, rows) + (held * first).T
+        matrix = torch.linalg.solve(normal, wanted).T
+    return torch.cat([(matrix[:3].T - torch.eye(3).to(matrix)).flatten(), matrix[3:].flatten()]).to(start)
+
+
+def _columns(code: Float[Tensor, " number"]) -> Float[Tensor, "row 3"]:
+    """(I + A)^T, b and the rest of a code, three colours a row."""
+    matrix, offset = _map(code)
+    return torch.cat([matrix.T, offset[None], code[COLOUR_NUMBERS:].view(-1, 3)])
+
+
+def _map(code: Float[Tensor, " number"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
+    """I + A, and b, with which a photograph's code begins."""
+    return torch.eye(3, device=code.device) + code[:9].view(3, 3), code[9:COLOUR_NUMBERS]
+
+
+SKY_BANDS = 3  # of spherical harmonics
+SKY_NUMBERS = 3 * SKY_BANDS**2  # of a photograph's code: the harmonics by rows, three colours each
+
+
+def sky(code: Float[Tensor, " 27"], camera: Camera) -> Float[Tensor, "height width 3"]:
+    """Sky colours at every pixel of one camera."""
+    return sky_harmonics(camera) @ code.view(SKY_BANDS**2, 3)
+
+
+def sky_harmonics(camera: Camera) -> Float[Tensor, "height width 9"]:
+    """Values of the sky's harmonics at every pixel of one camera."""
+    width, height = camera.size[0].tolist()
+    directions = camera.rays(camera.pixels()).directions
+    return kernels.spherical_harmonics(directions, SKY_BANDS).view(height, width, SKY_BANDS**2)
+
+
+def sky_loss(
+    background: Float[Tensor, "height width 3"], photograph: Photograph, opacity: Float[Tensor, "height width"]
+) -> Float[Tensor, ""]:
+    """Absolute error of a sky where pixels are masked out and nothing is opaque: a mask around an object says that its
+    surroundings are not to be learnt, not that they may have any colour."""
+    if photograph.mask is None:
+        return background.new_zeros(())
+    counts = (1 - opacity.detach()) * ~photograph.mask
+    return (counts[..., None] * (background - photograph.rgb).abs()).mean()
+
+
+@torch.no_grad()
+def mean_skies(scene: Scene) -> Float[Tensor, "image 27"]:
+    """Codes of a uniform sky in the mean colour of each training photograph; zeros for the others."""
+    codes = torch.zeros(len(scene.cameras), SKY_NUMBERS)
+    for index in scene.splits["train"].tolist():
+        codes[index, :3] = scene.photograph(index).rgb.flatten(0, 1).mean(0) / K00
+    return codes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar
 
@@ -12,17 +12,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numba import njit, prange
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from ...camera import Camera
-from ...components.training.exchange import exchange
-from ...components.training.row_optimizer import RowOptimizer, adam_moments, adam_rate
+from ...components.training.row_optimizers import RowOptimizer, adam_moments, adam_rate, exchange
 from ...components.training.schedules import falling
-from ...exchange.packing import Stored
+from ...exchange.codes import morton_order
+from ...exchange.packing import Stored, most_important
 from ...files.ranges import LearningRate, between
 from ...gaussians import Gaussians
+from ...gaussians.splatting import splat, view_of
 from ...method import Part
 from .interval_schedule import short_schedule_lr_scale
-from .view_count import view_count, with_view
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
 FULL_SCHEDULE = 2400  # steps from which on the rates of scales and harmonics are not scaled
@@ -223,3 +224,52 @@ def _rows_cpu(p, grad, mean, square, last, rates, t, powers1, powers2, eps):
                 mean[i, j] = kept1 * mean[i, j] + (one - b1) * g
                 square[i, j] = kept2 * square[i, j] + (one - b2) * g * g
                 p[i, j] -= far * rates[j] * mean[i, j] / (np.sqrt(square[i, j]) + eps)
+
+
+VIEW_BITS = 62  # bits of a row; further photographs share them, which may only lower the count
+MIN_VIEWS = {1: 3, 4: 6}  # index of a coefficient, and the view count from which it and those beyond are learnt
+
+
+def with_view(
+    bits: Int[Tensor, " gaussian"], image_index: Int[Tensor, " 1"], visible: Bool[Tensor, " gaussian"]
+) -> Int[Tensor, " gaussian"]:
+    """View bits with those of one photograph. A row is a set: a bit for each photograph."""
+    return bits | visible.long() << image_index % VIEW_BITS
+
+
+def view_count(bits: Int[Tensor, " gaussian"]) -> Int[Tensor, " gaussian"]:
+    """Number of bits that are set: of 2, then 4, then 8 neighbours at once, and these summed by a multiplication."""
+    pairs = bits - (bits >> 1 & 0x5555555555555555)
+    fours = (pairs & 0x3333333333333333) + (pairs >> 2 & 0x3333333333333333)
+    eights = fours + (fours >> 4) & 0x0F0F0F0F0F0F0F0F
+    return eights * 0x0101010101010101 >> 56
+
+
+@torch.no_grad()
+def zero_unobserved_sh(harmonics: Float[Tensor, "gaussian coefficient 3"], count: Int[Tensor, " gaussian"]) -> None:
+    """Set harmonics to zero, in place, for which a Gaussian's view count is too low: view dependence that few
+    directions determine may be anything from elsewhere."""
+    for first, fewest in MIN_VIEWS.items():
+        few = (count < fewest).nonzero()[:, 0]
+        harmonics[few, first:] = 0
+
+
+def picture_share(cloud: Gaussians, camera: Camera, near: float) -> Float[Tensor, " gaussian"]:
+    """Derivative of a picture's brightness in that of each Gaussian."""
+    grey = torch.zeros(len(cloud), 1, 3, device=cloud.means.device, requires_grad=True)
+    with torch.enable_grad():
+        seen = splat(replace(cloud, harmonics=grey), view_of(camera, near), 1)
+        (gain,) = torch.autograd.grad(seen.rgb.sum(), grey)
+    return gain[:, 0].mean(-1)
+
+
+def thinned(
+    cloud: Gaussians, importance: Float[Tensor, " gaussian"], share: float
+) -> tuple[Gaussians, Int[Tensor, " kept"]]:
+    """The cloud without a share of its Gaussians, the least important ones, and indices of the others. They are in
+    Morton order, where neighbours are alike, and each rotation is the quaternion with w >= 0."""
+    kept = most_important(importance, 1 - share).nonzero()[:, 0]
+    kept = kept[torch.from_numpy(morton_order(cloud.means[kept].detach().cpu().numpy()))]
+    upright = normalize(cloud.quaternions, dim=-1)
+    upright = torch.where(upright[:, :1] < 0, -upright, upright)
+    return replace(cloud, quaternions=upright)[kept], kept

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...components.training.regularizers import normalized_distance
-from ...components.training.unseen_views import roughness, unseen_cameras
+from ...components.training.regularizers import normalized_distance, roughness, unseen_cameras
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...gaussians.splatting import splat, view_of

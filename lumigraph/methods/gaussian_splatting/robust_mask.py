@@ -70,8 +70,7 @@ class RobustMask(Addition):
 
     @torch.no_grad()
     def record(self, residual: Float[Tensor, "height width"]) -> None:
-        """Add a photograph's residuals to the histogram. Pixels without any, where nothing is photographed nor
-        rendered, do not count."""
+        """Add a photograph's residuals to the histogram, but for zeros, of pixels without content in either."""
         some = residual[residual > 0]
         self.histogram.mul_(HISTOGRAM_DECAY).add_(torch.histc(some, BINS, 0, 1) / max(len(some), 1))
 

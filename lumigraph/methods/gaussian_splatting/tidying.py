@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ...gaussians import Gaussians
 from .addition import Addition
-from .view_count import zero_unobserved_sh
+from .cloud import zero_unobserved_sh
 
 NEAR_ZONE = 2.5  # times the frame's near distance: up to there a Gaussian needs MIN_NEAR_VIEWS
 MIN_NEAR_VIEWS = 3  # view count of a Gaussian in the near zone

@@ -14,39 +14,24 @@ from torch import Tensor
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
-from ...components.fields.code_space import fitted
+from ...components.fields.appearance import fitted
 from ...components.fields.hash_field import HashNumbers
-from ...components.fields.kept_photographs import Kept
-from ...components.sampling.carving import visual_hull
-from ...components.sampling.occupancy import OccupancyGrid
+from ...components.fields.kept_photographs import Kept, chance, photographed, rays_through
+from ...components.sampling.occupancy import OccupancyGrid, visual_hull
 from ...components.sampling.occupancy_sampler import reached
-from ...components.training.lazy_adam import LazyAdam
-from ...components.training.members import chance, photographed, rays_through
 from ...components.training.photometric import backdrop, residuals
-from ...components.training.schedules import falling
+from ...components.training.row_optimizers import LazyAdam
+from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import (
-    BatchSize,
-    Count,
-    Layers,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Seed,
-    Share,
-    Width,
-    between,
-)
+from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...geometry import look_at
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .hash_instance import HashInstance, HashShape
-from .hypernetwork import HyperNetwork
-from .instance_codes import AVERAGE, InstanceCodes
-from .picture_denoiser import PictureDenoiser
+from .networks import AVERAGE, HashInstance, HashShape, HyperNetwork, InstanceCodes, PictureDenoiser
 
 Tally = Annotated[int, between(0, 100_000)]
 
@@ -89,15 +74,9 @@ class Config:
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
-CPU_TABLE = HashNumbers(5, 4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2)
-TINY_TABLE = HashNumbers(
-    levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8, sh_bands=1
-)
-
-
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of one scene: some rays, cells that may hold something, and the colour behind it."""
+    """Observations of one scene: some rays, cells that may hold something, and the colour behind it."""
 
     rays: Batch
     cells: OccupancyGrid
@@ -120,7 +99,7 @@ class InstanceLesson:
 
 
 class TensorChanges(torch.nn.Module):
-    """What was added to the tensors of an instance by tuning: a row of each, or none."""
+    """Changes of an instance's tensors by tuning: a row of each, or none."""
 
     def __init__(self, rows: Iterable[Float[Tensor, "_ _ _"]]):
         super().__init__()
@@ -150,12 +129,12 @@ class HypNeRF(RayMethod):
     field looks like its photographs and tunes that field to them."""
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
+    learning_rate = exponential_decay
     efforts: ClassVar[Efforts] = {"draft": Effort(50, 2000), "good": Effort(300, 10_000), "best": Effort(1500, 50_000)}
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        c = config
+        c = config or Config()
+        super().__init__(frame, c)
         self.shape = HashShape.of(c.table, c.hidden_width)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
@@ -171,56 +150,23 @@ class HypNeRF(RayMethod):
         self._denoising = False
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU smaller codes, tables and networks of the same design."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            shape_code=64,
-            colour_code=32,
-            code_deviation=0.1,
-            hyper_width=96,
-            hyper_layers=2,
-            members=1024,
-            table=CPU_TABLE,
-            hidden_width=32,
-            steps_per_diagonal=112,
-            transmittance_threshold=1e-3,
-            occupancy_resolution=32,
-            members_per_step=4,
-            rays_per_member=192,
-            targets=2,
-            empty_points=256,
-            learning_rate=4e-3,
-            final_learning_rate=4e-4,
-            denoiser_start=0.8,
-        )
+    def cpu_preset(cls) -> Any:
+        """Smaller codes, tables and networks of the same design."""
+        table = HashNumbers(5, 4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2)
+        c = Config(table, shape_code=64, colour_code=32, code_deviation=0.1, hyper_width=96, hidden_width=32)
+        c = replace(c, steps_per_diagonal=112, transmittance_threshold=1e-3, occupancy_resolution=32, members=1024)
+        c = replace(c, members_per_step=4, rays_per_member=192, targets=2, empty_points=256)
+        return replace(c, learning_rate=4e-3, final_learning_rate=4e-4, denoiser_start=0.8)
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            shape_code=4,
-            colour_code=4,
-            code_deviation=0.1,
-            hyper_width=16,
-            hyper_layers=1,
-            members=16,
-            table=TINY_TABLE,
-            hidden_width=16,
-            steps_per_diagonal=64,
-            occupancy_resolution=16,
-            members_per_step=2,
-            rays_per_member=128,
-            empty_points=64,
-            learning_rate=1e-2,
-            final_learning_rate=5e-3,
-            denoiser_width=4,
-            denoiser_start=0.0,
-            code_steps=8,
-            tune_steps=4,
-            denoise_views=2,
-            denoise_steps=4,
-        )
+        table = HashNumbers(3, 2, log2_hashmap_size=9, base_resolution=4, max_resolution=16)
+        table = replace(table, geometry_features=8, sh_bands=1)
+        c = Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1)
+        c = replace(c, hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64)
+        c = replace(c, members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3)
+        c = replace(c, denoiser_width=4, denoiser_start=0.0, denoise_views=2, denoise_steps=4)
+        return replace(c, code_steps=8, tune_steps=4)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -253,14 +199,11 @@ class HypNeRF(RayMethod):
             members.append(number)
             batch = rays_through(photographs, c.rays_per_member, True, generator).to(self.device)
             background = torch.tensor([scene.frame.background], device=self.device)
-            evidence.append(Evidence(batch, self._cells_of_member(number, scene), background))
+            if number not in self._cells:
+                self._cells[number] = self._cells_of(scene)
+            evidence.append(Evidence(batch, self._cells[number], background))
         rays, picture = patch(photographs[0], scene.frame, generator)  # the last one's
         return InstanceLesson(members, evidence, rays.to(self.device), picture.to(self.device))
-
-    def _cells_of_member(self, number: int, scene: Scene) -> OccupancyGrid:
-        if number not in self._cells:
-            self._cells[number] = self._cells_of(scene)
-        return self._cells[number]
 
     def _cells_of(self, scene: Scene) -> OccupancyGrid:
         """The cells of a scene that no photograph proves empty. Raises LumigraphError for scenes without bounds."""
@@ -292,7 +235,7 @@ class HypNeRF(RayMethod):
         return terms
 
     def _errors(self, instance: HashInstance, evidence: Evidence, generator: torch.Generator) -> dict[str, Tensor]:
-        """Of colours, before random backgrounds where photographs have alpha, and of density where nothing is."""
+        """Errors of colours, before random backgrounds where photographs have alpha, and of density in empty space."""
         batch, cells = evidence.rays, evidence.cells
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
         background = backdrop(batch, evidence.background, generator)
@@ -307,7 +250,7 @@ class HypNeRF(RayMethod):
         return terms
 
     def _denoiser_error(self, batch: InstanceLesson, instance: HashInstance) -> Tensor:
-        """Of a denoised rendering, beside the photograph."""
+        """Squared error of a denoised rendering against the photograph."""
         last = batch.evidence[-1]
         with torch.no_grad():
             seen = self._seen(instance, last.cells, batch.rays, last.background).rgb
@@ -321,7 +264,7 @@ class HypNeRF(RayMethod):
         background: Float[Tensor, "#ray 3"],
         jitter: Float[Tensor, " ray"] | None = None,
     ) -> Rendering:
-        """What rays see of an instance, of all samples in cells: few lie far behind what is seen."""
+        """Rendering of an instance from all samples in cells: few lie far behind visible surfaces."""
         samples = cells.sample(rays, self.frame.near, self.step_length, jitter=jitter)
         density, rgb = instance(*samples.along(rays))
         self.figures |= {"rays": len(rays), "samples": len(samples)}
@@ -334,9 +277,6 @@ class HypNeRF(RayMethod):
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         networks = [*self.hyper.parameters(), *self.denoiser.parameters()]
         return [torch.optim.Adam(networks, fused=True, **common), LazyAdam([self.codes.rows], **common)]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        return falling(self.config.learning_rate, self.config.final_learning_rate, progress)
 
     def before_step(self, step: int, progress: float) -> None:
         self._shown, self._denoising = None, progress >= self.config.denoiser_start
@@ -360,14 +300,14 @@ class HypNeRF(RayMethod):
 
     def _filled(self, instance: HashInstance) -> OccupancyGrid:
         """The cells where a field holds something."""
-        cells, generator = OccupancyGrid(1.0, self.config.occupancy_resolution).to(self.device), self.random(0)
+        c, generator = self.config, self.random(0)
+        cells = OccupancyGrid(1.0, c.occupancy_resolution).to(self.device)
+
+        def density(points: Points) -> Densities:
+            return instance.density(points) * self._inside(points)
+
         for _ in range(GRID_UPDATES):
-            cells.update(
-                lambda points: instance.density(points) * self._inside(points),
-                self.config.occupancy_threshold,
-                generator,
-                decay=1.0,
-            )
+            cells.update(density, c.occupancy_threshold, generator, decay=1.0)
         return cells
 
     def _told(self) -> HashInstance:
@@ -508,9 +448,7 @@ class HypNeRF(RayMethod):
         samples, _ = reached(rays, samples, instance, None, self.config.transmittance_threshold)
         return [Look("samples", samples, *instance(*samples.along(rays)))]
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, nothing beyond the bounds, and sRGB-encoded colour seen along unit directions."""
         density, rgb = self.shown[0](points, directions)
         return density * self._inside(points), rgb
@@ -529,7 +467,7 @@ def untuned(shape: HashShape) -> TensorChanges:
 
 
 def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-    """Whether points of [-1, 1]^3 lie in cells that may hold something."""
+    """Mask of the points of [-1, 1]^3 in cells that may hold something."""
     x, y, z = ((points + 1) * (cells.resolution / 2)).long().clamp(0, cells.resolution - 1).unbind(-1)
     return cells.occupied[0, x, y, z]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,14 +15,13 @@ from torch.nn.functional import softplus
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Samples
-from ...capture.fewer import spread_out
-from ...components.fields.dense import in_chunks
+from ...capture.views import spread_out
 from ...components.fields.encodings import FrequencyEncoding
-from ...components.fields.kept_photographs import KeptPhotographs, padded
+from ...components.fields.kept_photographs import KeptPhotographs, chance, padded, photographed, rays_through
+from ...components.fields.layers import in_chunks
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
 from ...components.sampling.spaces import space_of
-from ...components.training.members import chance, photographed, rays_through
-from ...components.training.schedules import falling
+from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
@@ -41,10 +40,9 @@ from ...files.ranges import (
 )
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
-from .picture_encoder import STRIDE, PictureEncoder
-from .picture_lookup import look_up
-from .residual_network import ResidualNetwork
+from .networks import STRIDE, PictureEncoder, ResidualNetwork, look_up
 
 Views = Annotated[int, between(1, 64)]
 
@@ -110,7 +108,7 @@ class Sources:
 
 @dataclass(frozen=True)
 class SourceLesson:
-    """Of several scenes, in order: the photographs that are looked at, and rays through others."""
+    """Source photographs of several scenes, in order, and rays through others."""
 
     unit: ClassVar[str] = "rays"
 
@@ -129,12 +127,12 @@ class PixelNeRF(RayMethod):
     """
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
+    learning_rate = exponential_decay
     efforts: ClassVar[Efforts] = {"draft": Effort(10, 1000), "good": Effort(200, 20_000), "best": Effort(2000, 200_000)}
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        c = config
+        c = config or Config()
+        super().__init__(frame, c)
         self.encode = FrequencyEncoding(3, c.position_frequencies, base=1.5)
         self.encoder = PictureEncoder(c.encoder_widths, c.encoder_blocks, c.encoder_pool, bool(c.encoder_weights))
         shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, c.blocks, c.view_blocks, not c.bfloat16)
@@ -144,52 +142,19 @@ class PixelNeRF(RayMethod):
         self._boxed = True
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller encoder and network of the same design."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            hidden_width=64,
-            encoder_widths=(32, 32, 64, 128),
-            encoder_blocks=(2, 2, 2),
-            encoder_pool=False,
-            coarse_samples=20,
-            fine_samples=12,
-            depth_samples=0,
-            networks=1,
-            coarse_loss_weight=0.1,
-            density="softplus",
-            density_scale=10.0,
-            members_per_step=3,
-            rays_per_member=128,
-            boxed=0.5,
-            learning_rate=1e-3,
-            final_learning_rate=1e-4,
-            warmup=0.02,
-            empty_threshold=1e-2,
-        )
+    def cpu_preset(cls) -> Any:
+        """A smaller encoder and network of the same design."""
+        c = Config(hidden_width=64, encoder_widths=(32, 32, 64, 128), encoder_blocks=(2, 2, 2), encoder_pool=False)
+        c = replace(c, coarse_samples=20, fine_samples=12, depth_samples=0, networks=1, empty_threshold=1e-2)
+        c = replace(c, density="softplus", density_scale=10.0, members_per_step=3, rays_per_member=128, boxed=0.5)
+        return replace(c, coarse_loss_weight=0.1, learning_rate=1e-3, final_learning_rate=1e-4, warmup=0.02)
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            hidden_width=16,
-            blocks=2,
-            view_blocks=1,
-            encoder_widths=(8, 8, 8, 8),
-            encoder_blocks=(1, 1, 1),
-            encoder_pool=False,
-            coarse_samples=12,
-            fine_samples=4,
-            depth_samples=4,
-            density="softplus",
-            density_scale=5.0,
-            source_views=2,
-            members_per_step=1,
-            rays_per_member=96,
-            targets=2,
-            learning_rate=1e-2,
-            final_learning_rate=3e-3,
-        )
+        c = Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16)
+        c = replace(c, blocks=2, view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2)
+        c = replace(c, coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96)
+        return replace(c, learning_rate=1e-2, final_learning_rate=3e-3)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -241,15 +206,8 @@ class PixelNeRF(RayMethod):
         self.figures |= {"mse": float(terms["fine"].detach()), "views": len(batch.sources[0])}
         return terms
 
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        return {"coarse": self.config.coarse_loss_weight}
-
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.parameters(), self.config.learning_rate)]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        return falling(self.config.learning_rate, self.config.final_learning_rate, progress, self.config.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
         self._sources, self._boxed = None, progress < self.config.boxed
@@ -281,7 +239,7 @@ class PixelNeRF(RayMethod):
         return told
 
     def evidence_bytes(self, scene: Scene) -> int:
-        """What is kept and found of its photographs."""
+        """Bytes of the photographs and their features."""
         sizes = scene.cameras.size[scene.splits["train"]]
         cells = len(sizes) * int(torch.ceil(sizes.amax(0) / STRIDE).prod())
         numbers = self.encoder.width * 4 + len(self.networks) * self.config.view_blocks * self.config.hidden_width
@@ -295,7 +253,7 @@ class PixelNeRF(RayMethod):
 
     @property
     def sources(self) -> Sources:
-        """What it looks at. Raises LumigraphError where nothing was given."""
+        """Source photographs as features. Raises LumigraphError without any."""
         if self._sources is None:
             if not self.kept:
                 raise LumigraphError("pixelnerf shows what it was given photographs of, and it was given none")
@@ -311,7 +269,7 @@ class PixelNeRF(RayMethod):
         return self._sources
 
     def _seen(self, lesson: SourceLesson) -> list[Sources]:
-        """What the encoder finds in the photographs of each scene, of all at once."""
+        """Features of the photographs of each scene, encoded all at once."""
         both = zip(lesson.sources, lesson.frames, strict=True)
         pictures = [photograph.before(frame.background) for photographs, frame in both for photograph in photographs]
         cameras = [Camera.cat([photograph.camera for photograph in photographs]) for photographs in lesson.sources]
@@ -366,7 +324,7 @@ class PixelNeRF(RayMethod):
     def _again(
         self, shares: Float[Tensor, "ray sample"], weights: Float[Tensor, "ray sample"], generator: Any
     ) -> Float[Tensor, "ray again"]:
-        """Where to look again: by the weights found, and around the depth found."""
+        """Places of the fine samples: by the coarse weights, and around the coarse depth."""
         c, count, device = self.config, len(shares), self.device
         evenly = stratified(count, c.fine_samples, generator, device)
         places = [inverse_transform(midpoints(shares), weights[:, 1:-1], evenly)]
@@ -378,13 +336,8 @@ class PixelNeRF(RayMethod):
         return torch.cat(places, -1)
 
     def _ask(
-        self,
-        network: int,
-        points: Float[Tensor, "point 3"],
-        directions: Float[Tensor, "point 3"],
-        sources: Sources,
-        where: Tensor | None = None,
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        self, network: int, points: Points, directions: Directions, sources: Sources, where: Tensor | None = None
+    ) -> tuple[Densities, Colours]:
         """Density per scene unit and colour of points seen along directions (section 4.2, eq. 4 to 6)."""
         cameras, c = sources.cameras, self.config
         turned = cameras.pose[:, :, :3].mT  # the world's axes in each camera's
@@ -403,8 +356,6 @@ class PixelNeRF(RayMethod):
         density, rgb = in_chunks(answer, points, directions, where=where)
         return density, rgb
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions. Both depend on the direction."""
         return self._ask(len(self.networks) - 1, points, directions, self.sources)

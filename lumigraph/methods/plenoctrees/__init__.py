@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -13,11 +13,11 @@ from torch import Tensor
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
-from ...components.fields.teacher import logit, teacher_of
+from ...components.fields.teacher import density_of, logit, teacher_of
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
 from ...components.sampling.spaces import Box
-from ...components.training.lazy_rmsprop import LazyRMSprop
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.row_optimizers import LazyRMSprop
 from ...components.training.schedules import falling, held
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
@@ -40,10 +40,9 @@ from ...files.ranges import (
 from ...method import Field, FieldMethod, Sampler
 from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
-from .baking import Baking, averaged_harmonics, bake, density_of, fill, met
-from .harmonic_field import HarmonicHash, HarmonicNetwork, Teacher
-from .leaf_sampler import LeafSampler
-from .leaves import Leaves, ask_for_octree
+from .baking import Baking, averaged_harmonics, bake, fill, met
+from .harmonic_field import HarmonicHash, HarmonicNetwork, HarmonicTeacher
+from .leaves import LeafSampler, Leaves, ask_for_octree
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]
 
@@ -91,7 +90,7 @@ class PlenOctrees(FieldMethod):
     """
 
     Config = Config
-    teacher: Teacher | None
+    teacher: HarmonicTeacher | None
     teacher_sampler: OccupancySampler | None
     begun: Tensor
 
@@ -120,45 +119,20 @@ class PlenOctrees(FieldMethod):
         self._progress, self._optimizers = 0.0, list[torch.optim.Optimizer]()
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a hash table, three bands, and what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            table=CPU_LEVELS,
-            occupancy=OccupancyNumbers(1 << 15, transmittance_threshold=0.01, occupancy_threshold=0.15),
-            field="hash",
-            hidden_width=32,
-            sh_bands=3,
-            sparsity_points=1024,
-            steps_per_diagonal=384,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-            decay_start=0.3,
-            teacher_share=0.5,
-            octree_depth=8,
-            leaf_points=8,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table, three bands, and a shallower octree."""
+        occupancy = OccupancyNumbers(1 << 15, transmittance_threshold=0.01, occupancy_threshold=0.15)
+        c = Config(CPU_LEVELS, occupancy, field="hash", hidden_width=32, sh_bands=3, steps_per_diagonal=384)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, sparsity_points=1024)
+        return replace(c, teacher_share=0.5, octree_depth=8, leaf_points=8)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
-        return Config(
-            table=TINY_LEVELS,
-            occupancy=OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16),
-            field="hash",
-            hidden_width=16,
-            hidden_layers=1,
-            sh_bands=2,
-            sparsity_points=64,
-            steps_per_diagonal=128,
-            learning_rate=2e-2,
-            final_learning_rate=1e-2,
-            teacher_share=0.5,
-            octree_depth=4,
-            leaf_points=2,
-            rays_per_step=128,
-        )
+        occupancy = OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16)
+        c = Config(TINY_LEVELS, occupancy, field="hash", hidden_width=16, hidden_layers=1, sh_bands=2)
+        c = replace(c, steps_per_diagonal=128, learning_rate=2e-2, final_learning_rate=1e-2, sparsity_points=64)
+        return replace(c, teacher_share=0.5, octree_depth=4, leaf_points=2, rays_per_step=128)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -196,7 +170,7 @@ class PlenOctrees(FieldMethod):
 
     @torch.no_grad()
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each leaf adds to one picture. Raises LumigraphError while there is no octree."""
+        """Share of each leaf in one picture. Raises LumigraphError while there is no octree."""
         leaves, rays = self._leaves(), camera.rays(camera.pixels()).to(self.device)
         total = torch.zeros(len(leaves), device=self.device)
         for i in range(0, len(rays), self.rays_per_chunk):
@@ -258,13 +232,13 @@ class PlenOctrees(FieldMethod):
         self._leave_field()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As of any module; where what was saved is baked, there is no field any more."""
+        """Load as any module does; without a field where a baked octree was saved."""
         if not any(name.startswith("teacher.") for name in state_dict):
             self._leave_field()
         return super().load_state_dict(state_dict, strict, assign)
 
     def _bake(self, cameras: Camera) -> None:
-        """What was learnt becomes leaves, and is dropped."""
+        """Bake the field into leaves, and drop it."""
         assert self.teacher is not None
         chance, numbers = self.random(-1), self._baking
         mask = met(self, cameras, numbers, chance)

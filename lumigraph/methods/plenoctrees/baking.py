@@ -19,7 +19,6 @@ from ...camera import Camera
 from ...camera.rays import Rays
 from ...errors import LumigraphError
 from ...kernels import composite
-from ...method.capabilities import HasDensity, can
 from ...system.memory import free_on, gigabytes
 from ...volume import weights_of
 from .leaves import Leaves, codes_of
@@ -38,7 +37,7 @@ Geometry = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], F
 
 @dataclass(frozen=True)
 class Baking:
-    """How a field is baked.
+    """Numbers of baking.
 
     depth:     levels of the octree
     points:    random points of a leaf over which density and harmonics are averaged
@@ -74,13 +73,6 @@ def bake(
     leaves.keep(seen(leaves, cameras, numbers, generator))
     if not len(leaves):
         raise LumigraphError("No camera sees anything dense in this field, so no octree can be made; train it longer")
-
-
-def density_of(teacher: Any) -> Density:
-    """Density at points, of whatever has `field`."""
-    if can(teacher, HasDensity):
-        return teacher.density
-    return lambda points: teacher.field(points, torch.nn.functional.normalize(points + 1e-6, dim=-1))[0]
 
 
 def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays:
@@ -138,7 +130,7 @@ def dense_cells(
 
 
 def overlapping(mask: Bool[Tensor, "x y z"], low: Float[Tensor, "cell 3"], side: float) -> Bool[Tensor, " cell"]:
-    """Which cubes hold part of a marked cell."""
+    """Mask of the cubes that overlap a marked cell."""
     n, total = len(mask), torch.nn.functional.pad(mask.int().cumsum(0).cumsum(1).cumsum(2), (1, 0, 1, 0, 1, 0))
     first = ((low * 0.5 + 0.5) * n + 1e-4).floor().long().clamp(0, n)
     last = (((low + side) * 0.5 + 0.5) * n - 1e-4).ceil().long().clamp(0, n)
@@ -186,7 +178,7 @@ def averaged_density(leaves: Leaves, density: Density, count: int, generator: to
 
 
 def seen(leaves: Leaves, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, " row"]:
-    """Which leaves have enough weight somewhere in the pictures, from random rays of all of them."""
+    """Mask of the leaves with enough weight on some of many random rays through all pictures."""
     most = torch.zeros(len(leaves), device=leaves.codes.device)
     for _ in range(0, min(RAYS_PER_CELL << 2 * numbers.depth, MAX_RAYS), RAYS_PER_CHUNK):
         rays = random_rays(cameras, RAYS_PER_CHUNK, generator).to(most.device)

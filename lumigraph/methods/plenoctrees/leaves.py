@@ -16,6 +16,9 @@ from ...exchange.baked import Octree
 from ...exchange.packing import Stored
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
+from ...method import Pass, Sampler
+from ...method.field import Densities, Points
+from ...method.sampler import RayCodes
 from ...system.memory import free_on, gigabytes
 from .harmonic_field import SphericalHarmonicsField
 
@@ -52,8 +55,7 @@ class Leaves(SphericalHarmonicsField):
 
     @staticmethod
     def bytes_of(rows: int, basis: int, learning: bool) -> int:
-        """What so many leaves take with their tree; where they learn, twice more: their mean squares, and what a
-        step touches."""
+        """Bytes of leaves with their tree; learning takes twice more: mean squares, and the rows of a step."""
         return rows * (4 * (1 + 3 * basis) * (3 if learning else 1) + 64)
 
     @property
@@ -75,7 +77,7 @@ class Leaves(SphericalHarmonicsField):
     def seen(
         self, rays: Rays, near: float, stop: float, background: Float[Tensor, "#ray 3"], part: Subtree | None = None
     ) -> Rendering:
-        """What rays see before a background colour. part: the rows through which gradients go; all by default"""
+        """Rendering of rays before a background colour. part: the rows through which gradients go; all by default"""
         tree, density, harmonics = part or (self.tree, self.densities, self.harmonics)
         thickness = density[:, 0].relu() * float(self.size)
         tables = thickness, harmonics.view(-1, self.basis, 3)
@@ -120,9 +122,7 @@ class Leaves(SphericalHarmonicsField):
         value, _ = leaves(tree, torch.where(inside[:, None], place, 0).long())
         return torch.where(inside & (value < 0), -1 - value, -1)
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point harmonic"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Float[Tensor, "point harmonic"]]:
         """Density and harmonics of the leaf that each point is in; zeros where there is none."""
         rows = self.rows_at(points)
         return self._rows(self.densities, rows)[:, 0].relu(), self._rows(self.harmonics, rows)
@@ -170,8 +170,7 @@ class Leaves(SphericalHarmonicsField):
 
     @torch.no_grad()
     def coarser(self, depth: int) -> Leaves:
-        """The same with so many levels at most: a cell holds the mean density of what lies in it, and the harmonics
-        that it has on average where it is dense."""
+        """The octree with fewer levels: a cell has the mean density, and the harmonics weighted by density."""
         codes, levels = self.codes.long(), levels_of(self.codes.long())
         over = (levels - depth).clamp_min(0)
         merged, which = torch.unique(codes >> 3 * over, return_inverse=True)
@@ -229,3 +228,27 @@ def codes_of(place: Int[Tensor, "row 3"], depth: int) -> Int[Tensor, " row"]:
     """Codes of cells of one level, from their whole numbers along each axis."""
     x, y, z = place.unbind(-1)
     return code_of(x, y, z, depth)
+
+
+class LeafSampler(Sampler):
+    """Samples at the leaves of an octree, from near to far until rays terminate.
+
+    near:          distance from a camera at which its rays begin
+    stop:          transmittance at which a ray terminates
+    rays_per_step: rays of a step
+    """
+
+    rays_per_chunk = 1 << 18
+
+    def __init__(self, near: float, stop: float, rays_per_step: int):
+        super().__init__()
+        self.near, self.stop = near, stop
+        self.batch_size = self.expected_rays = rays_per_step
+
+    def sample(  # type: ignore[override]
+        self, rays: Rays, field: Leaves, code: RayCodes | None = None, generator: torch.Generator | None = None
+    ) -> list[Pass]:
+        found = field.crossed(rays, self.near, self.stop)
+        density = field.densities[found.rows, 0].relu()
+        directions = rays.directions[found.samples.ray_index]
+        return [Pass("leaves", found.samples, density, field.harmonics[found.rows], directions)]

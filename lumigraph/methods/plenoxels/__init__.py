@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -14,14 +14,12 @@ from ...camera import Camera
 from ...components.fields.teacher import logit, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import ProposalNumbers, sampler_for
 from ...components.sampling.spaces import NDC, Space, space_of
-from ...components.training.exposure import Exposure, Setting
-from ...components.training.lazy_rmsprop import LazyRMSprop
-from ...components.training.photometric import backdrop, residuals
+from ...components.training.photometric import Exposure, Setting, backdrop, residuals
+from ...components.training.regularizers import cauchy
+from ...components.training.row_optimizers import LazyRMSprop
 from ...components.training.schedules import falling
-from ...components.training.sparsity import cauchy
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
@@ -29,8 +27,9 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Posi
 from ...kernels import total_variation
 from ...kernels.harmonic_grid import BANDS
 from ...method import Field, FieldMethod
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
-from .sparse_voxels import Cells, Part, SparseVoxels
+from .sparse_voxels import Cells, SparseVoxels, VoxelRows
 
 Resolution = Annotated[int, between(4, 1024)]
 DensityRate = Annotated[float, between(1e-6, 1e4)]
@@ -38,8 +37,7 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers for synthetic scenes (section 3, and the authors' release); `Plenoxels.preset` says what a
-    plain CPU does otherwise."""
+    """The paper's numbers for synthetic scenes (section 3, and its release); `Plenoxels.preset` has a CPU's."""
 
     occupancy: OccupancyNumbers = OccupancyNumbers(
         samples_per_step=1 << 20,
@@ -113,24 +111,18 @@ class HarmonicField(Field):
         self.config, self.space = config, space
         first, _ = config.resolutions(space.is_open)
         self.voxels = SparseVoxels(cells_of(space, first), config.initial_density)
-        self.touched: tuple[Tensor, Part]
+        self.touched: tuple[Tensor, VoxelRows]
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density, and as features the points' coordinates."""
         places = self.space.warp(points)
         return self.voxels.density_at(places).relu() * self.space.stretch(points), places
 
-    def colour(
-        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
         return self.voxels.at(features, directions)[1].sigmoid()
 
-    def forward(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        voxels: SparseVoxels | Part = self.voxels
+    def forward(self, points: Points, directions: Directions, code: Tensor | None = None) -> tuple[Densities, Colours]:
+        voxels: SparseVoxels | VoxelRows = self.voxels
         if torch.is_grad_enabled():
             rows = self.voxels.touched(self.space.warp(points))
             voxels = self.voxels.part(rows)
@@ -172,60 +164,22 @@ class Plenoxels(FieldMethod):
         return self.network.voxels
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            base_resolution=128,
-            max_resolution=192,
-            open_base_resolution=64,
-            open_max_resolution=192,
-            rays_per_step=4096,
-            occupancy=OccupancyNumbers(
-                samples_per_step=1 << 16, transmittance_threshold=1e-3, occupancy_threshold=0.02, occupancy_decay=0.9
-            ),
-            refine_until=0.4,
-            step_size=1.0,
-            density_learning_rate=40.0,
-            final_density_learning_rate=4.0,
-            density_delay=0.2,
-            harmonics_learning_rate=0.15,
-            final_harmonics_learning_rate=0.02,
-            tv_share=0.1,
-            tv_interval=8,
-            sparsity=0.0,
-        )
+    def cpu_preset(cls) -> Any:
+        occupancy = OccupancyNumbers(1 << 16, 1e-3, occupancy_threshold=0.02, occupancy_decay=0.9)
+        c = Config(occupancy, base_resolution=128, max_resolution=192, open_base_resolution=64, open_max_resolution=192)
+        c = replace(c, refine_until=0.4, step_size=1.0, rays_per_step=4096, tv_share=0.1, tv_interval=8, sparsity=0.0)
+        c = replace(c, density_learning_rate=40.0, final_density_learning_rate=4.0, density_delay=0.2)
+        return replace(c, harmonics_learning_rate=0.15, final_harmonics_learning_rate=0.02)
 
     @classmethod
     def smallest(cls) -> Any:
         """A grid of three sizes with every loss, within some twenty quick steps."""
-        return Config(
-            base_resolution=8,
-            max_resolution=32,
-            open_base_resolution=8,
-            open_max_resolution=32,
-            refine_until=0.5,
-            step_size=1.0,
-            occupancy=OccupancyNumbers(
-                samples_per_step=1 << 20,
-                occupancy_resolution=16,
-                occupancy_threshold=1e-2,
-                occupancy_interval=4,
-                occupancy_decay=0.9,
-            ),
-            rays_per_step=128,
-            density_delay=0.1,
-            density_learning_rate=60.0,
-            final_density_learning_rate=10.0,
-            harmonics_learning_rate=0.2,
-            final_harmonics_learning_rate=0.05,
-            tv_share=0.5,
-            tv_interval=2,
-            sparsity=1e-5,
-            beta=1e-4,
-            exposure_correction="yes",
-        )
+        occupancy = replace(Config().occupancy, occupancy_resolution=16, occupancy_interval=4)
+        c = Config(occupancy, base_resolution=8, max_resolution=32, open_base_resolution=8, open_max_resolution=32)
+        c = replace(c, refine_until=0.5, step_size=1.0, rays_per_step=128, tv_share=0.5, tv_interval=2)
+        c = replace(c, density_learning_rate=60.0, final_density_learning_rate=10.0, density_delay=0.1)
+        c = replace(c, harmonics_learning_rate=0.2, final_harmonics_learning_rate=0.05)
+        return replace(c, sparsity=1e-5, beta=1e-4, exposure_correction="yes")
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -236,7 +190,7 @@ class Plenoxels(FieldMethod):
     # Compression
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each voxel adds to one picture; see `components.sampling.importance`."""
+        """Share of each voxel in one picture; see `components.sampling.importance`."""
 
         def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
             return self.voxels.density_at(self.network.space.warp(points))[:, None]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from ... import kernels
-from ...components.training.exchange import exchange
+from ...components.training.row_optimizers import exchange
 from ...kernels import Nodes
 from ...kernels.harmonic_grid import COEFFICIENTS
 from ...kernels.sparse_grid.cpu import CHUNK, corners
@@ -54,14 +54,14 @@ class SparseVoxels(nn.Module):
 
     @staticmethod
     def bytes_of(cells: Cells, learning: bool) -> int:
-        """What a grid takes at least: its index, and the values of as many nodes as are left of most scenes; where it
+        """Bytes of a grid at least: its index, and the values of as many nodes as are left of most scenes; where it
         learns, as much again for their mean squares."""
         nodes = (cells[0] + 1) * (cells[1] + 1) * (cells[2] + 1)
         return 4 * nodes + int(SHARE * nodes) * 4 * (1 + 3 * COEFFICIENTS) * (2 if learning else 1)
 
     @property
     def nodes(self) -> Nodes:
-        """Which row each node has. Made when first asked for, and again where the numbers were loaded or moved."""
+        """Row of each node; made on first use, and again where the numbers were loaded or moved."""
         made = self._made
         if made is None or made[0] is not self.numbers or made[1] != self.numbers._version:
             x, y, z = (self.cells + 1).tolist()
@@ -82,12 +82,12 @@ class SparseVoxels(nn.Module):
         self, places: Float[Tensor, "sample 3"], directions: Float[Tensor, "sample 3"]
     ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]:
         """Density and colour at coordinates, before activation."""
-        return Part(self.nodes, self.density, self.harmonics).at(places, directions)
+        return VoxelRows(self.nodes, self.density, self.harmonics).at(places, directions)
 
-    def part(self, rows: Int[Tensor, " some"]) -> Part:
+    def part(self, rows: Int[Tensor, " some"]) -> VoxelRows:
         """A small table of some rows, through which a sparse gradient reaches them: what a step touches."""
         density, harmonics = (embedding(rows, table, sparse=True) for table in (self.density, self.harmonics))
-        return Part(self.nodes.part(rows), density, harmonics)
+        return VoxelRows(self.nodes.part(rows), density, harmonics)
 
     @torch.no_grad()
     def touched(self, places: Float[Tensor, "sample 3"]) -> Int[Tensor, " some"]:
@@ -159,7 +159,7 @@ class SparseVoxels(nn.Module):
         self.weights = torch.zeros(len(numbers), device=numbers.device)
 
 
-class Part:
+class VoxelRows:
     """Some rows of a grid as a table of their own."""
 
     def __init__(self, nodes: Nodes, density: Float[Tensor, "row 1"], harmonics: Float[Tensor, "row 27"]):

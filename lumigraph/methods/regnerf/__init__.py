@@ -7,29 +7,25 @@ about, and patches such as no photograph has, say that the field explains each p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor
 
 from ...camera.rays import Look, Rays, Rendering
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.frustum_field import FrustumField
-from ...components.fields.hash_field import CPU_TABLE, HashField, HashNumbers
+from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
+from ...components.fields.hash_field import HashField, HashNumbers
 from ...components.sampling.cone_sampler import ConeSampler
-from ...components.sampling.hierarchical_sampler import RayNumbers
-from ...components.sampling.occupancy_mask import MaskNumbers
-from ...components.sampling.occupancy_sampler import CPU_STEPS, MIN_RESOLUTION, OccupancyNumbers, StepNumbers
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
+from ...components.sampling.occupancy import MaskNumbers
+from ...components.sampling.occupancy_sampler import MIN_RESOLUTION, OccupancyNumbers, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
-from ...components.training.coarse_to_fine import BandSchedule, joining_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.regularizers import near_thickness, normalized_distance
-from ...components.training.schedules import falling, held
-from ...components.training.unseen_views import patches, roughness, unseen_cameras
+from ...components.training.regularizers import near_thickness, normalized_distance, patches, roughness, unseen_cameras
+from ...components.training.schedules import BandSchedule, falling, held, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ...method import FieldMethod
@@ -39,8 +35,7 @@ from .patch_flow import SIDE, PatchFlow
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers with a section, then mip-NeRF's of the network and Instant-NGP's of the hash table;
-    `RegNeRF.preset` has those of a plain CPU."""
+    """The paper's numbers, mip-NeRF's of the network, Instant-NGP's of the table; `RegNeRF.preset` has a CPU's."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)
     rays: RayNumbers = RayNumbers(128, 128)
@@ -117,7 +112,7 @@ class Glimpses(Batch):
 class RegNeRF(FieldMethod):
     """Mip-NeRF's network or a hash table, with regularisation of patches at unobserved views."""
 
-    Config = Config
+    Config, further_bytes = Config, staticmethod(sampling_bytes)
     network: HashField | FrustumField
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -143,59 +138,20 @@ class RegNeRF(FieldMethod):
         self._progress = 0.0
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a hash table, for after a laptop's minutes a network is still a blur;
-        where a network is asked for all the same, a smaller one. Fewer patches, too; and what the paper does in its
-        first some hundred steps takes a larger share of the fewer there are."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            field="hash",
-            unseen_patches=8,
-            annealing=0.25,
-            depth_settling=0.25,
-            network=NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16),
-            rays=RayNumbers(32, 16, rays_per_step=1024),
-            mask=MaskNumbers(occupancy_resolution=128),
-            hidden_width=128,
-            learning_rate=4e-3,
-            final_learning_rate=2e-4,
-            coarse_loss_weight=0.0,
-            warmup=0.02,
-            table=CPU_TABLE,
-            steps=CPU_STEPS,
-            table_learning_rate=2e-2,
-            table_width=32,
-            samples_per_step=1 << 15,
-            transmittance_threshold=1e-3,
-            table_occupancy_threshold=0.15,
-            hash_weight_decay=0.3,
-            huber_delta=0.3,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table, for after a laptop's minutes a network is still a blur; with --field network a smaller one.
+        Fewer patches, and a larger share of the budget for what the paper does in its first hundreds of steps."""
+        network = NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16)
+        c = Config(**CPU_NETWORK, network=network, unseen_patches=8, annealing=0.25, depth_settling=0.25)
+        c = replace(c, field="hash", table=CPU_HASH["table"], steps=CPU_HASH["steps"], table_width=32)
+        c = replace(c, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15)
+        return replace(c, table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny networks and two patches: every part, within some twenty quick steps."""
-        return Config(
-            network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6),
-            rays=RayNumbers(16, 12, rays_per_step=192),
-            mask=MaskNumbers(occupancy_resolution=16),
-            hidden_width=32,
-            learning_rate=5e-3,
-            final_learning_rate=5e-4,
-            warmup=0.1,
-            unseen_patches=2,
-            flow_steps=8,
-        )
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        c = config
-        if c.field == "hash":
-            grids = c.occupancy.further_bytes(frame, learning) + c.proposals.further_bytes(frame, learning)
-            return grids + c.table.activation_bytes(c.samples_per_step, c.table_width) * learning
-        masked = c.mask.occupancy_resolution > 0  # then the number of samples is not known beforehand
-        return 0 if masked else c.network.activation_bytes(c.rays.samples_per_step, c.hidden_width) * learning
+        network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6)
+        return Config(**TINY_NETWORK, network=network, unseen_patches=2, flow_steps=8)
 
     # Learning
 
@@ -210,10 +166,6 @@ class RegNeRF(FieldMethod):
             cameras = unseen_cameras(data.cameras[data.splits["train"]], count, generator)
             unseen = patches(cameras, SIDE, STRIDES, generator)
         return Glimpses(seen.rays, seen.rgb, seen.alpha, seen.extra, unseen).to(self.device)
-
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        return {"coarse": self.config.coarse_loss_weight}
 
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         c, generator, unseen = self.config, self.random(step), batch.unseen
@@ -245,7 +197,7 @@ class RegNeRF(FieldMethod):
         return terms
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
-        """What patches that nobody photographed cost: how rough their depth is, how unlikely their colours are."""
+        """Loss terms of unobserved patches: roughness of their depth, negative log likelihood of their colours."""
         c, shape, terms = self.config, (-1, SIDE, SIDE), {}
         opacity = seen.opacity.view(shape)
         place = (seen.extra["places"][:, 0] / seen.opacity.clamp_min(1e-3)).view(shape)
@@ -259,7 +211,7 @@ class RegNeRF(FieldMethod):
         return terms
 
     def _before_cameras(self, rays: Rays, look: Look) -> Tensor:
-        """How thick what stands in the first share of each ray is, mean of all rays."""
+        """Optical thickness of the first share of each ray, mean of all rays."""
         space = self.network.space
         share = torch.full((len(rays), 1), self.config.occlusion_range, device=rays.origins.device)
         until = space.distance(share, rays, *space.interval(rays))[:, 0]
@@ -293,6 +245,6 @@ def joined(first: Rays, second: Rays) -> Rays:
 
 
 def part(whole: Rendering, rays: slice) -> Rendering:
-    """What some of the rays saw."""
+    """Rendering of some of the rays."""
     extra = {name: values[rays] for name, values in whole.extra.items()}
     return Rendering(whole.rgb[rays], whole.depth[rays], whole.opacity[rays], extra)

@@ -1,4 +1,4 @@
-"""How likely a small patch of colours is, judged by patches of photographs (Niemeyer 2022, section 3.4).
+"""Likelihood of a small patch of colours under a flow of photographs' patches (Niemeyer 2022, section 3.4).
 
 A normalising flow: an exact density, learnt by making patches into Gaussian noise and counting how much each step
 stretches them. The paper's learnt from millions of photographs; this one learns for seconds, from the user's own.
@@ -36,7 +36,7 @@ class Coupling(nn.Module):
         self.network = nn.Sequential(nn.Linear(half, WIDTH), nn.ReLU(), nn.Linear(WIDTH, WIDTH), nn.ReLU(), last)
 
     def forward(self, x: Float[Tensor, "patch number"]) -> tuple[Tensor, Float[Tensor, " patch"]]:
-        """What comes of patches, its halves exchanged, and the log of how much that stretched them."""
+        """Transformed patches, with their halves exchanged, and the log determinant."""
         kept, moved = x.chunk(2, -1)
         raw, shift = self.network(kept).chunk(2, -1)
         log_scale = STIFF * torch.tanh(raw / STIFF)
@@ -74,8 +74,7 @@ class PatchFlow(nn.Module):
         return nats / x.shape[1]
 
     def learn(self, scene: Scene, steps: int, generator: torch.Generator, seconds: float = math.inf) -> None:
-        """Learn from patches of a scene's training photographs, in several sizes, for so many steps, or seconds if
-        these are over sooner."""
+        """Learn from patches of the training photographs in several sizes, for some steps, or at most some seconds."""
         begin = time.perf_counter()
         known = photographed(scene, generator).to(self.mean)
         centred = known.flatten(1) - known.flatten(1).mean(0)

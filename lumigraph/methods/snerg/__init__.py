@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
@@ -17,21 +17,13 @@ from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.teacher import teacher_of
-from ...components.sampling.occupancy_sampler import (
-    CPU_OCCUPANCY,
-    CPU_STEPS,
-    TINY_STEPS,
-    OccupancyNumbers,
-    StepNumbers,
-)
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
-from ...components.training.exchange import exchange
-from ...components.training.lazy_adam import LazyAdam
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.regularizers import cauchy
+from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling, held
-from ...components.training.sparsity import cauchy
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError, LumigraphWarning
 from ...exchange.baked import Atlas
@@ -52,10 +44,10 @@ from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.spherical_harmonics import K00
 from ...method import FieldMethod, Pass
 from ...method.capabilities import HasField, can
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
-from .baked_voxels import BakedVoxels, rounded
+from .baked_voxels import BakedVoxels, VisibilityGrid, rounded, smoothed
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
-from .visibility_grid import VisibilityGrid, smoothed
 
 
 @dataclass(frozen=True)
@@ -157,51 +149,21 @@ class SNeRG(FieldMethod):
         self._adam: torch.optim.Adam | None = None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a hash table with Instant-NGP's numbers there, fewer voxels in smaller
-        blocks, and voxels that learn on after baking."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            table=CPU_LEVELS,
-            occupancy=CPU_OCCUPANCY,
-            steps=CPU_STEPS,
-            field="hash",
-            deferred_share=0.6,
-            voxel_share=0.8,
-            resolution=400,
-            visibility_resolution=128,
-            rays_per_step=4096,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-            decay_start=0.3,
-            view_learning_rate=5e-3,
-            hidden_layers=2,
-            hidden_width=32,
-            hash_weight_decay=0.3,
-            huber_delta=0.3,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table, fewer voxels in smaller blocks, and voxels that learn on after baking."""
+        c = Config(**CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3)
+        c = replace(c, deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128)
+        return replace(c, rays_per_step=4096, hash_weight_decay=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table, a grid of three sizes and a few thousand voxels, in all stages within some twenty steps."""
-        return Config(
-            table=TINY_LEVELS,
-            occupancy=OccupancyNumbers(2048, transmittance_threshold=1e-3, occupancy_resolution=16),
-            steps=TINY_STEPS,
-            field="hash",
-            deferred_share=0.6,
-            voxel_share=0.6,
-            resolution=32,
-            block_size=8,
-            visibility_resolution=16,
-            rays_per_step=512,
-            learning_rate=2e-2,
-            final_learning_rate=2e-3,
-            view_learning_rate=5e-3,
-            hidden_layers=1,
-            hidden_width=16,
-        )
+        occupancy = OccupancyNumbers(2048, transmittance_threshold=1e-3, occupancy_resolution=16)
+        table = TINY_HASH | {"table": TINY_LEVELS, "occupancy": occupancy}
+        c = Config(**table, field="hash", hidden_layers=1, hidden_width=16, rays_per_step=512)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=2e-3, view_learning_rate=5e-3, visibility_resolution=16)
+        return replace(c, deferred_share=0.6, voxel_share=0.6, resolution=32, block_size=8)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -224,12 +186,12 @@ class SNeRG(FieldMethod):
 
     @property
     def _bounded(self) -> bool:
-        """Whether voxels hold only a part of what there is."""
+        """True if voxels hold the box of interest of an open capture alone."""
         return self.sampler.is_open and self.voxels.space is None
 
     @property
     def _values(self) -> Float[Tensor, "voxel 8"]:
-        """Of voxels: as they are learnt, or as eight bits tell them."""
+        """Values of voxels: as they are learnt, or of eight bits."""
         return self.tuned.values if self.stage == VOXELS else self.voxels.values
 
     def _marched(self, rays: Rays) -> RaySum:
@@ -299,9 +261,7 @@ class SNeRG(FieldMethod):
     def _density_of(self, alpha: Float[Tensor, " point"], points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         return self.voxels.density(alpha, self.voxels.length(points, self.voxels.edge))
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions if nothing is before or behind."""
         if self.stage == FIELD:
             density, (diffuse, features) = self.network.geometry(points)
@@ -362,17 +322,16 @@ class SNeRG(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c, spent = self.config, self._spent(progress)
+        over = min(1.0, progress / c.deferred_share)
         return {
-            "field": held(
-                c.learning_rate, c.final_learning_rate, step, min(1.0, progress / c.deferred_share), c.decay_start
-            ),
+            "field": held(c.learning_rate, c.final_learning_rate, step, over, c.decay_start),
             "view": falling(c.view_learning_rate, 0.1 * c.view_learning_rate, spent),
             "voxels": falling(c.voxel_learning_rate, 0.1 * c.voxel_learning_rate, spent / max(self._voxel_share, 1e-9)),
         }
 
     @property
     def _voxel_share(self) -> float:
-        """Of the budget after baking, in which voxels learn."""
+        """Share of the budget after baking in which voxels learn."""
         return max(self.config.voxel_share, TAUGHT_VOXEL_SHARE) if self.of_another else self.config.voxel_share
 
     def _spent(self, progress: float) -> float:

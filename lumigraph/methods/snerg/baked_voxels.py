@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool3d, max_pool3d
 
 from ... import kernels
 from ...camera.rays import Rays, Samples
@@ -14,6 +15,7 @@ from ...components.sampling.spaces import Contraction
 from ...exchange.baked import Atlas
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.block_march.reference import contracted, steps
+from ...method import Part
 from ...volume import packed
 from .deferred_field import ViewDependence
 
@@ -72,7 +74,7 @@ class BakedVoxels(nn.Module):
 
     @property
     def values(self) -> Float[Tensor, "voxel 8"]:
-        """What eight bits tell."""
+        """Values of eight bits."""
         return self._known[1]
 
     @property
@@ -94,13 +96,13 @@ class BakedVoxels(nn.Module):
     def march(
         self, rays: Rays, values: Float[Tensor, "voxel 8"], near: float, stop: float
     ) -> tuple[Float[Tensor, "ray 8"], Float[Tensor, " ray"]]:
-        """What lies along rays, one voxel a step, accumulated front to back; and opacity times distance, in scene
+        """Values along rays, one voxel a step, accumulated front to back; and opacity times distance, in scene
         units. near, stop: as of `kernels.block_march`, near in scene units"""
         totals, distance = kernels.block_march(*self._along(rays, near), self.blocks, values, stop)
         return totals, distance * self.edge
 
     def at(self, points: Float[Tensor, "point 3"], values: Float[Tensor, "voxel 8"]) -> Float[Tensor, "point 8"]:
-        """What is blended at points of the scene; nothing beyond the grid. A march of one step finds it."""
+        """Interpolated values at points of the scene, by a march of one step; zero beyond the grid."""
         zeros = points.new_zeros(len(points))
         ahead = points.new_tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
         return kernels.block_march(self._in_voxels(points), ahead, zeros, zeros + 0.5, self.blocks, values)[0]
@@ -134,7 +136,7 @@ class BakedVoxels(nn.Module):
         return samples, torch.cat(found) if found else values[:0]
 
     def length(self, points: Float[Tensor, "point 3"], edge: Tensor | float) -> Float[Tensor, " point"]:
-        """Of a voxel with such an edge, where it lies in the scene, in scene units; along the way out."""
+        """Length along the way out of a voxel with such an edge, in scene units."""
         radius = points.norm(dim=-1) if self.space else points.new_zeros(len(points))
         return edge * radius.clamp_min(1).square()
 
@@ -167,3 +169,66 @@ class BakedVoxels(nn.Module):
 def rounded(values: Float[Tensor, "voxel 8"]) -> UInt8[Tensor, "voxel 8"]:
     """Values in [0, 1] in 256 steps."""
     return (values.clamp(0, 1) * STEPS).round().to(torch.uint8)
+
+
+DECAY = 0.95  # of a weight, at each interval
+MIN_WEIGHT = 0.01  # weight in some ray's colour from which on a cell is visible
+
+
+class VisibilityGrid(Part):
+    """A grid of n^3 cells over [-1, 1]^3 (Hedman 2021, section 5.1, culls by visibility likewise).
+
+    weight:   the largest recent weight of a sample in each cell in its ray's colour
+    interval: steps after which weights decay
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("weight",)
+    weight: Tensor
+
+    def __init__(self, resolution: int, interval: int):
+        super().__init__()
+        self.interval = interval
+        self.register_buffer("weight", torch.zeros(1, resolution, resolution, resolution))
+
+    @torch.no_grad()
+    def record(self, points: Float[Tensor, "sample 3"], weights: Float[Tensor, " sample"]) -> None:
+        """Record what rays see. weights: of samples at these points, in their rays' colours"""
+        inside = self.inside(points)
+        cells = self.cells(points[inside])
+        self.weight.view(-1).scatter_reduce_(0, cells, weights[inside].detach(), "amax")
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        if step % self.interval == 0:
+            self.weight *= DECAY
+
+    def release(self) -> None:
+        """Drop all weights."""
+        self.weight = self.weight.new_zeros(1, 1, 1, 1)
+
+    @property
+    def resolution(self) -> int:
+        return self.weight.shape[-1]
+
+    @property
+    def visible(self) -> Bool[Tensor, "x y z"]:
+        """Cells that rays see, and those around them."""
+        return max_pool3d((self.weight > MIN_WEIGHT).float(), 3, 1, 1)[0] > 0
+
+    def inside(self, points: Float[Tensor, "sample 3"]) -> Bool[Tensor, " sample"]:
+        return (points.abs() < 1).all(-1)
+
+    def cells(self, points: Float[Tensor, "sample 3"]) -> Int[Tensor, " sample"]:
+        """Numbers of the cells that hold points."""
+        n = self.resolution
+        x, y, z = self.along(points).unbind(-1)
+        return (x * n + y) * n + z
+
+    def along(self, coordinates: Tensor) -> Tensor:
+        """Numbers of the cells that hold coordinates, along their axis."""
+        n = self.resolution
+        return ((coordinates + 1) * (0.5 * n)).long().clamp(0, n - 1)
+
+
+def smoothed(vectors: Float[Tensor, "x y z 3"]) -> Float[Tensor, "x y z 3"]:
+    """The mean of each cell's vectors and those around it."""
+    return avg_pool3d(vectors.permute(3, 0, 1, 2)[None], 3, 1, 1)[0].permute(1, 2, 3, 0)

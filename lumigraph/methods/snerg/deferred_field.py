@@ -13,14 +13,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...components.fields.activations import truncated_exp
-from ...components.fields.dense import Dense
+from ...components.fields.coordinate_network import PositionNetwork
 from ...components.fields.hash_field import OPEN_RESOLUTION, TableNumbers, new_table
-from ...components.fields.mlp import MLP
-from ...components.fields.position_network import PositionNetwork
+from ...components.fields.layers import MLP, Dense, truncated_exp
 from ...components.sampling.spaces import Space
 from ...exchange.baked import ViewNetwork
 from ...method import Field
+from ...method.field import Colours, Densities, Directions, Points
 
 FEATURES = 4
 OUTPUTS = 1 + 3 + FEATURES
@@ -48,16 +47,12 @@ class DeferredField(Field):
     def raw(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, "point 8"]:
         """Outputs before their activations, at coordinates of the space."""
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Deferred]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Deferred]:
         raw = self.raw(self.space.warp(points))
         density = truncated_exp(raw[:, 0]) * self.space.stretch(points)
         return density, (torch.sigmoid(raw[:, 1:4]), torch.sigmoid(raw[:, 4:]))
 
-    def colour(
-        self, features: Deferred, directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Deferred, directions: Directions, code: Tensor | None = None) -> Colours:
         return features[0]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -12,17 +12,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera import Camera
-from ...components.fields.mlp import MLP
-from ...components.fields.teacher import teacher_of
+from ...components.fields.layers import MLP
+from ...components.fields.teacher import distil, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Space, space_of
-from ...components.training.distillation import distil
-from ...components.training.exchange import exchange
-from ...components.training.lazy_adam import LazyAdam
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
@@ -31,9 +28,9 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .factorised import FactorGrid, nodes_in
-from .truncation import truncate
+from .factorised import FactorGrid, nodes_in, truncate
 
 Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with as many nodes
 Components = Annotated[int, between(1, 1024)]  # of each factor
@@ -135,9 +132,7 @@ class TensorField(Field):
         low, high = self.box
         return (self.space.warp(points) - low) / (high - low)
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density: softplus of the sum over all components (eq. 5); 0 outside the box. Features: places in the cube."""
         c, places = self.config, self.places(points)
         inside = ((places > 0) & (places < 1)).all(-1)  # points before the plane of a forward capture are on it
@@ -145,9 +140,7 @@ class TensorField(Field):
         density = c.density_scale * nn.functional.softplus(total + c.density_shift) * inside
         return density * self.space.stretch(points) if self.space.is_open else density, places
 
-    def colour(
-        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
         """S(B [products], d) (eq. 6); in memory one feature of all samples after another, as networks read them."""
         return self.shade((self.basis.weight @ self.appearance_grid(features).t()).t(), directions)
 
@@ -204,54 +197,25 @@ class TensoRF(FieldMethod):
         self._optimizer: torch.optim.Optimizer | None = None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            density_components=16,
-            appearance_components=16,
-            initial_resolution=96,
-            final_resolution=200,
-            open_final_resolution=320,
-            hidden_width=64,
-            feature_frequencies=0,
-            rays_per_step=4096,
-            occupancy=OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05),
-            open_samples_per_step=1 << 15,
-            step_ratio=1.0,
-            density_shift=-8.0,
-            l1_weight=0.0,
-            final_l1_weight=0.0,
-            tv_interval=8,
-            weight_threshold=1e-3,
-        )
+    def cpu_preset(cls) -> Any:
+        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05)
+        c = Config(occupancy, initial_resolution=96, final_resolution=200, open_final_resolution=320)
+        c = replace(c, appearance_components=16, hidden_width=64, feature_frequencies=0, density_shift=-8.0)
+        c = replace(c, open_samples_per_step=1 << 15, step_ratio=1.0, weight_threshold=1e-3)
+        return replace(c, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8)
 
     @classmethod
     def smallest(cls) -> Any:
         """Few components and nodes, all upsamplings, a grid of three sizes, within some twenty quick steps."""
-        return Config(
-            density_components=4,
-            appearance_components=6,
-            initial_resolution=8,
-            final_resolution=16,
-            open_final_resolution=16,
-            appearance_features=8,
-            hidden_width=16,
-            feature_frequencies=1,
-            direction_frequencies=1,
-            density_shift=-3.0,
-            step_ratio=1.0,
-            rays_per_step=256,
-            occupancy=OccupancyNumbers(4096, occupancy_resolution=16, occupancy_threshold=0.005),
-            learning_rate=0.05,
-            network_learning_rate=1e-2,
-            final_learning_rate=5e-3,
-        )
+        occupancy = OccupancyNumbers(4096, occupancy_resolution=16, occupancy_threshold=0.005)
+        c = Config(occupancy, initial_resolution=8, final_resolution=16, open_final_resolution=16)
+        c = replace(c, density_components=4, appearance_components=6, appearance_features=8, hidden_width=16)
+        c = replace(c, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0)
+        return replace(c, rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        """What the factors grow by, and what a step keeps of its samples."""
+        """Growth of the factors, and the samples that a step keeps."""
         box = torch.tensor(((-1.0,) * 3, (1.0,) * 3) if frame.is_open else frame.bounds, device="cpu")
         resolutions = config.initial_resolution, config.finest(frame.is_open)
         first, last = (Factors(config.factors, nodes_in(box, n)).rows for n in resolutions)
@@ -261,7 +225,7 @@ class TensoRF(FieldMethod):
         return super().further_bytes(frame, config, learning) + grown + step * learning
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """Where photographs say what is transparent, the grid's box is that of the visual hull from the beginning."""
+        """Shrink the grid's box to the visual hull of photographs with alpha."""
         super().begin(data, seconds)
         if not self.sampler.is_open and data.images.has_alpha:
             self._shrink()
@@ -325,7 +289,7 @@ class TensoRF(FieldMethod):
         self.sampler.settle(self.density, chance)
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each node of planes and lines adds to one picture, by its share in interpolating there."""
+        """Share of each node of planes and lines in one picture, by its interpolation weights."""
         network, factors = self.network, self.network.density_grid.factors
         ones = torch.ones(factors.rows, 1, device=self.device, requires_grad=True)
 

@@ -8,8 +8,7 @@ from types import ModuleType
 
 from ...errors import LumigraphError
 from .. import categories
-from ..options import Pictures
-from ..stage import SyntheticStage
+from ..stage import Pictures, SyntheticStage
 
 
 def available() -> list[str]:
@@ -23,10 +22,7 @@ def options(name: str) -> type[Pictures]:
 
 def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: int) -> SyntheticStage:
     """Build a scene. size: of the pictures, pixels; views: for training; seed: fixes where cameras stand; further: what
-    else its `Options` have.
-
-    Raises LumigraphError for a name that nothing here has.
-    """
+    else its `Options` have. Raises LumigraphError for a name that nothing here has."""
     return scene(name).stage(size, views, seed, **further)
 
 

@@ -27,7 +27,7 @@ LEAVES = Material(Mottle((0.38, 0.53, 0.25), (0.15, 0.28, 0.13), size=0.07, cont
 
 
 def shell():
-    """Floor, ceiling and four walls, each its own: whoever turns around sees where they are."""
+    """Floor, ceiling and four walls, each of its own material, so that every view is distinct."""
     up, middle = (CEILING - FLOOR) / 2, (CEILING + FLOOR) / 2
     boards = Material(Stripes((0.60, 0.43, 0.27), (0.45, 0.30, 0.18), period=0.11, share=0.5))
     on_side = Pose.about((1, 0, 0), 90)

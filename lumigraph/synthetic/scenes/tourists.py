@@ -206,7 +206,7 @@ def visits(count: int, random: np.random.Generator, size: int) -> Camera:
 
 
 def world(day: Day, others: tuple[Object, ...] = ()) -> World:
-    """The square on a day, with whoever is there. The numbers of masks are the same without anybody."""
+    """The square on a day, with passers-by. The numbers of masks are the same without them."""
     return World((*front(), *tower(-0.94), *tower(0.94), *square(), *others), day.lights, day.sky)
 
 

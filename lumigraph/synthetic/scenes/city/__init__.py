@@ -11,6 +11,7 @@ Lengths in metres, z = 0 is the road.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from typing import Annotated, Any
@@ -20,10 +21,12 @@ import torch
 
 from ....files.ranges import between
 from ...cameras import look_at, pinhole
-from ...options import Pictures
-from ...stage import SyntheticStage
-from ...world import World, joined
-from . import light, plan, streets, traffic
+from ...stage import Pictures, SyntheticStage
+from ...world import Object, Pose, World, joined
+from ..tourists import Day
+from . import plan
+from .plan import LANE, OUTSKIRTS, PITCH, Crossing
+from .streets import car, standing
 
 CITY = 1  # of the pictures that are kept: another number traces them anew
 HEIGHT = 2.1  # of the cameras
@@ -33,6 +36,15 @@ SPEED = 8.0  # metres per second
 HOLD_OUT = 8
 SHAPE = 0.75  # height of a picture, of its width
 ERROR = 10.0  # metres of which errors of poses are so many percent: a street's width
+SWEEP = (-60.0, 75.0)  # azimuth of the sun as the drive begins and ends, degrees
+MIN_ELEVATION, MAX_ELEVATION = 30.0, 58.0  # of the sun at the ends of the drive, and half-way
+CLOUD = (0.45, 0.12, 0.75)  # when a cloud is before the sun, for how long (shares of the drive), what it takes
+EXPOSURE_STOPS = 0.55  # amplitude by which the cameras' exposure follows the scene
+EXPOSURE_CYCLES = 5  # per drive
+CAR_SPACING = 26.0  # metres of a lane per car
+MIN_SPEED, MAX_SPEED = 5.0, 11.0  # metres per second
+MIN_CAR_DISTANCE = 6.0  # between the centres of two cars
+MIN_CAMERA_DISTANCE = 7.5  # from the car with the cameras
 
 
 @dataclass(frozen=True)
@@ -69,7 +81,9 @@ class Drive:
         return -(-self.photographs // len(RIG))
 
     def exposure(self, number: int) -> float:
-        return light.exposure(self.share(number), RIG[number % len(RIG)][2])
+        """Light that one camera of the rig takes, of what it would take otherwise."""
+        gain = RIG[number % len(RIG)][2]
+        return gain * 2 ** (EXPOSURE_STOPS * math.sin(2 * math.pi * EXPOSURE_CYCLES * self.share(number)))
 
     def time(self, number: int) -> float:
         """Seconds since the drive began."""
@@ -85,29 +99,32 @@ class Drive:
         return look_at(eye, eye + gaze)
 
     def world(self, number: int, lasting: bool) -> World:
-        """The city as one photograph finds it. lasting: without cars that drive"""
-        today = light.day(self.share(number), self.exposure(number))
+        """The city in one photograph. lasting: without cars that drive
+
+        Its lengths are metres: the sky has hardly any haze, and ambient occlusion within arm's reach.
+        """
+        today = day(self.share(number), self.exposure(number))
         parts = [still(self.crossings, self.seed)]
         if not lasting:
             parts.append(driving(self, number // len(RIG)))
-        return joined(parts, light.lights(today), light.sky(today))
+        return joined(parts, today.lights, replace(today.sky, haze=0.0012, reach=1.5))
 
 
 @cache
 def still(crossings: int, seed: int) -> World:
-    return streets.standing(plan.crossings(crossings), seed)
+    return standing(plan.crossings(crossings), seed)
 
 
 @lru_cache(16)
 def driving(drive: Drive, stop: int) -> World:
-    """Who drives about while the rig takes its photographs."""
+    """Cars that drive while the rig takes its photographs."""
     eye = route(drive.crossings, drive.stops)[0][stop]
-    return World(tuple(traffic.traffic(everybody(drive.crossings, drive.seed), drive.time(stop * len(RIG)), eye)))
+    return World(tuple(traffic(everybody(drive.crossings, drive.seed), drive.time(stop * len(RIG)), eye)))
 
 
 @cache
-def everybody(crossings: int, seed: int) -> list[traffic.Driver]:
-    return traffic.drivers(plan.crossings(crossings), seed)
+def everybody(crossings: int, seed: int) -> list[Driver]:
+    return drivers(plan.crossings(crossings), seed)
 
 
 @cache
@@ -149,3 +166,78 @@ def stage(size: int = 320, views: int = 400, seed: int = 0, crossings: int = 6) 
         called=called,
         error=ERROR,
     )
+
+
+def day(share: float, exposure: float) -> Day:
+    """The light when a share of the drive is over."""
+    begin, end = SWEEP
+    middle, width, most = CLOUD
+    overcast = most * math.exp(-(((share - middle) / width) ** 2))
+    sun = begin + share * (end - begin), MIN_ELEVATION + (MAX_ELEVATION - MIN_ELEVATION) * math.sin(math.pi * share)
+    return Day(sun, overcast, (1.0, 1.0, 1.0), exposure)
+
+
+@dataclass(frozen=True)
+class Lane:
+    """A straight way through the whole city: where it begins, which way it leads (degrees), how long it is."""
+
+    begin: tuple[float, float]
+    turn: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A car on its lane: where it was at the beginning, how quick it is, what it is like."""
+
+    lane: Lane
+    start: float
+    speed: float
+    seed: int
+
+    def pose(self, time: float) -> Pose:
+        way = (self.start + self.speed * time) % self.lane.length
+        return Pose.at(*self.lane.begin, 0, turn=self.lane.turn) @ Pose.at(way, 0, 0)
+
+
+def lanes(places: list[Crossing]) -> Iterator[Lane]:
+    """Both lanes of every street, which goes on to the outskirts."""
+    columns, rows = (max(place[axis] for place in places) + 1 for axis in range(2))
+    out = OUTSKIRTS - 6.0
+    for j in range(rows):
+        long = PITCH * (columns - 1) + 2 * out
+        yield Lane((-out, PITCH * j - LANE), 0.0, long)
+        yield Lane((long - out, PITCH * j + LANE), 180.0, long)
+    for i in range(columns):
+        long = PITCH * (rows - 1) + 2 * out
+        yield Lane((PITCH * i + LANE, -out), 90.0, long)
+        yield Lane((PITCH * i - LANE, long - out), 270.0, long)
+
+
+def drivers(places: list[Crossing], seed: int) -> list[Driver]:
+    random = np.random.default_rng([seed, 0x7AFF])
+    found = []
+    for lane in lanes(places):
+        count = max(round(lane.length / CAR_SPACING), 1)
+        starts = (np.arange(count) + random.uniform(0.2, 0.8, count)) * lane.length / count
+        speed = random.uniform(MIN_SPEED, MAX_SPEED)  # nobody overtakes
+        found += [Driver(lane, float(s), speed, int(random.integers(1 << 30))) for s in starts]
+    return found
+
+
+def traffic(everybody: list[Driver], time: float, eye: np.ndarray) -> Iterator[Object]:
+    """The cars on the streets at a moment, but for those in another's way. eye: where the photographs are taken"""
+    there = [eye]
+    for driver in everybody:
+        pose = driver.pose(time)
+        place = np.array(pose.position[:2])
+        gaps = np.linalg.norm(np.array(there) - place, axis=-1)
+        if gaps[0] > MIN_CAMERA_DISTANCE and gaps[1:].min(initial=np.inf) > MIN_CAR_DISTANCE:
+            there.append(place)
+            yield from (replace(part, pose=pose @ part.pose) for part in parts(driver.seed))
+
+
+@cache
+def parts(seed: int) -> tuple[Object, ...]:
+    """Parts of one car."""
+    return tuple(car(Pose(), np.random.default_rng(seed), "traffic"))

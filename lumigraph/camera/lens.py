@@ -1,0 +1,552 @@
+"""Lenses: where on the picture a direction lands, and which direction a pixel looks along.
+
+A lens works in the camera's own frame: +x right, +y down, +z forward. It is a value holding one row of numbers per
+camera of a batch. A new kind of lens is a new subclass with `unproject` and `project`; nothing else changes.
+"""
+
+from __future__ import annotations
+
+import math
+import typing
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..errors import LumigraphError
+from ..files.ranges import Tally, typed
+from . import loops
+
+FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
+MAX_FLAT_ANGLE = math.radians(89.0)  # from the axis, on a flat image plane: tan is still harmless in float32
+NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
+CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is about its square
+# What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
+PARAMETER_RANGES = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
+PARAMETER_RANGES |= {"offset": (-1e6, 1e6)}
+DEFAULT_RANGE = (-1e9, 1e9)  # for further parameters of a new kind of lens
+NO_INDEX = torch.empty(0, dtype=torch.int64)
+
+
+@dataclass(frozen=True)
+class Named:
+    """Fields of a lens in a file that all kinds share."""
+
+    kind: str
+
+
+@dataclass(frozen=True)
+class MixedParts:
+    """Fields of lenses of several kinds in a file; see `Mixed`."""
+
+    parts: list[Any]
+    part: list[Tally]
+
+
+class Lens(ABC):
+    """Base class of lenses. Subclasses are frozen dataclasses of tensors with leading axis camera. In every method
+    `index` names the camera of each pixel or point; None means camera 0 for all."""
+
+    kinds: ClassVar[dict[str, type[Lens]]] = {}
+    in_pixels: ClassVar[tuple[str, ...]] = ("focal", "centre")  # what scales with the picture
+
+    def __init_subclass__(cls) -> None:
+        Lens.kinds[cls.__name__.lower()] = cls
+
+    @abstractmethod
+    def unproject(
+        self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None
+    ) -> Float[Tensor, "ray 3"]:
+        """Unit directions in the camera's frame. A pixel that nothing reaches gets the outermost direction there is."""
+
+    @abstractmethod
+    def project(
+        self, points: Float[Tensor, "point 3"], index: Int[Tensor, " point"] | None = None
+    ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
+        """Pixels of points in the camera's frame, and whether the lens sees them at all.
+
+        False behind the camera and beyond a distortion's fold-over; their pixels are finite but mean nothing.
+        Whether a pixel lies inside the picture is another question.
+        """
+
+    def origins(
+        self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None
+    ) -> Float[Tensor, "ray 3"] | None:
+        """Origins of rays in the camera's frame, in scene units; None where all begin at the camera's centre."""
+        return None
+
+    def solid_angle(
+        self,
+        pixels: Float[Tensor, "ray 2"],
+        directions: Float[Tensor, "ray 3"],
+        index: Int[Tensor, " ray"] | None = None,
+    ) -> Float[Tensor, " ray"]:
+        """Solid angle of each pixel, in steradians. `directions` are those that `unproject` gave."""
+        half_x, half_y = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
+        across = self.unproject(pixels + half_x, index) - self.unproject(pixels - half_x, index)
+        down = self.unproject(pixels + half_y, index) - self.unproject(pixels - half_y, index)
+        return torch.linalg.cross(across, down).norm(dim=-1)
+
+    def resized(self, scale: Float[Tensor, "#camera 2"]) -> Lens:
+        """The same lens behind a picture with (x, y) scaled pixels."""
+        return type(self)(**{k: v * scale if k in self.in_pixels else v for k, v in self._numbers().items()})
+
+    def enlarged(self, scale: float) -> Lens:
+        """The same lens in a world so many times as large."""
+        return self
+
+    def __len__(self) -> int:
+        return len(next(iter(self._numbers().values())))
+
+    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+        """The lenses of some cameras; an int gives a batch of one."""
+        return self._map(lambda x: x[one_or_more(index)])
+
+    def to(self, device: torch.device | str) -> Lens:
+        return self._map(lambda x: x.to(device))
+
+    @property
+    def device(self) -> torch.device:
+        return next(iter(self._numbers().values())).device
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain lists and a name; `Lens.from_json` turns them back exactly."""
+        return {"kind": type(self).__name__.lower(), **{k: v.tolist() for k, v in self._numbers().items()}}
+
+    @staticmethod
+    def from_json(data: Any, where: Any = "a lens") -> Lens:
+        """Read the lenses of cameras from a file's JSON. Raises LumigraphError, naming `where`, for what are none."""
+        kind = Lens.kinds.get(typed(Named, data, where).kind)
+        if kind is None:
+            raise LumigraphError(f"{where} has a lens of kind {data['kind']!r}; there are {', '.join(Lens.kinds)}")
+        return kind._from_json(data, where)
+
+    @classmethod
+    def _from_json(cls, data: dict[str, Any], where: Any) -> Lens:
+        found = {}
+        for name, shape in typing.get_type_hints(cls).items():
+            if name in data and hasattr(shape, "dim_str"):  # as in "camera 2", or "camera" alone
+                _, *numbers = shape.dim_str.split()
+                row: Any = tuple[(float,) * int(numbers[0])] if numbers else float  # type: ignore[misc]
+                found[name] = torch.tensor(typed(list[row], data[name], f"{where}: {name}"), dtype=torch.float32)
+        lacking = [x.name for x in fields(cls) if x.name not in found and x.default is MISSING]  # type: ignore[arg-type]
+        if lacking or len({len(values) for values in found.values()}) != 1:
+            raise LumigraphError(
+                f"{where} has lenses without all the numbers of their kind, {data['kind']}; correct it"
+            )
+        lens = cls(**found)
+        if (fault := lens.fault()) is not None:
+            raise LumigraphError(f"{where} has a lens whose {fault}; correct it")
+        return lens
+
+    def fault(self) -> str | None:
+        """Describe the first invalid parameter in a few words; None if all are valid."""
+        for name, values in self._numbers().items():
+            least, most = PARAMETER_RANGES.get(name, DEFAULT_RANGE)
+            bad = ~((values >= least) & (values <= most))
+            if bad.any():
+                return f"{name} is {float(values[bad][0]):g}, which is not between {least:g} and {most:g}"
+        return None
+
+    @staticmethod
+    def cat(lenses: Sequence[Lens]) -> Lens:
+        """One batch from several, which becomes `Mixed` where they are of different kinds."""
+        first = lenses[0]
+        if isinstance(first, Mixed) or any(type(lens) is not type(first) for lens in lenses):
+            return mix([one for lens in lenses for one in (lens[i] for i in range(len(lens)))])
+        return type(first)(**{k: torch.cat([getattr(lens, k) for lens in lenses]) for k in first._numbers()})
+
+    def _numbers(self) -> dict[str, Tensor]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Lens:
+        return type(self)(**{k: change(v) for k, v in self._numbers().items()})
+
+
+@dataclass(frozen=True)
+class Pinhole(Lens):
+    """A flat image behind a point: (u, v) = f (x, y) / z + c.
+
+    focal, centre: pixels
+    """
+
+    focal: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"]
+
+    def unproject(self, pixels, index=None):
+        x, y = ((pixels - rows(self.centre, index)) / rows(self.focal, index)).unbind(-1)
+        return through_plane(x, y)
+
+    def project(self, points, index=None):
+        plane, valid = onto_plane(points)
+        return plane * rows(self.focal, index) + rows(self.centre, index), valid
+
+    def solid_angle(self, pixels, directions, index=None):
+        # A pixel is 1 / (fx fy) of the plane z = 1, seen obliquely and from further away: cos^3.
+        z = directions[:, 2]
+        return z * z * z / area(self.focal, index)
+
+
+@dataclass(frozen=True)
+class OpenCV(Lens):
+    """A flat image with rational radial and tangential distortion (OpenCV's camera model; Brown 1971).
+
+        (x, y) -> (x, y) q(r^2) + (2 p1 xy + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 xy)
+        q(s) = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
+
+    focal, centre: pixels
+    distortion:    k1 k2 p1 p2 k3 k4 k5 k6, in OpenCV's order; zeros for what a calibration lacks
+    """
+
+    focal: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"]
+    distortion: Float[Tensor, "camera 8"]
+
+    @cached_property
+    def fold(self) -> Float[Tensor, "camera 1"]:
+        """Radius on the plane z = 1 up to which the radial distortion only grows."""
+        r = torch.linspace(0, MAX_FLAT_ANGLE, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device).tan()
+        k1, k2, _, _, k3, k4, k5, k6 = self.distortion.double().T[:, :, None]
+        s = r * r
+        bent = r * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
+        return last_growing(r, bent).to(self.focal.dtype)
+
+    def unproject(self, pixels, index=None):
+        if self._by_loop(pixels):
+            directions = torch.empty(len(pixels), 3)
+            inputs = (pixels, NO_INDEX if index is None else index, self.focal, self.centre, self.distortion, self.fold)
+            # Each ray stops by itself here, so one beside a fold, where steps merely halve, costs the others no steps.
+            loops.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * CONVERGED_STEP, directions.numpy())
+            return directions
+        target = (pixels - rows(self.centre, index)) / rows(self.focal, index)
+        target_x, target_y = target.T.contiguous()
+        distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
+        x, y = within(target_x, target_y, limit)
+        for _ in range(NEWTON_STEPS):
+            (bent_x, bent_y), (xx, xy, yy) = bend(x, y, distortion)
+            off_x, off_y = bent_x - target_x, bent_y - target_y
+            share = 1 / (xx * yy - xy * xy).clamp_min(1e-3)  # the determinant is positive up to the fold
+            step_x, step_y = share * (yy * off_x - xy * off_y), share * (xx * off_y - xy * off_x)
+            x, y = within(x - step_x, y - step_y, limit)
+            if small(step_x) and small(step_y):
+                break
+        return through_plane(x, y)
+
+    def project(self, points, index=None):
+        plane, valid = onto_plane(points)
+        x, y = plane.unbind(-1)
+        inside = torch.hypot(x, y) <= rows(self.fold, index)[:, 0]
+        bent, _ = bend(x, y, columns(self.distortion, index))
+        pixels = torch.stack(bent, -1) * rows(self.focal, index) + rows(self.centre, index)
+        return pixels, valid & inside
+
+    def solid_angle(self, pixels, directions, index=None):
+        if self._by_loop(directions):
+            angle = torch.empty(len(directions))
+            tensors = directions, NO_INDEX if index is None else index, self.focal, self.distortion, angle
+            loops.solid_angle(*(x.numpy() for x in tensors))
+            return angle
+        x, y, z = directions.T.contiguous()
+        _, (xx, xy, yy) = bend(x / z, y / z, columns(self.distortion, index))
+        return z * z * z / ((xx * yy - xy * xy).clamp_min(1e-3) * area(self.focal, index))
+
+    def _by_loop(self, given: Tensor) -> bool:
+        """True if the faster CPU loops apply: single precision, no gradients."""
+        tensors = (given, *self._numbers().values())
+        return all(x.is_cpu and x.dtype == torch.float32 and not x.requires_grad for x in tensors)
+
+
+@dataclass(frozen=True)
+class Fisheye(Lens):
+    """The angle from the axis, rather than its tangent, sets the distance from the centre (Kannala & Brandt 2006).
+
+        distance = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+
+    As OpenCV's fisheye model, but seeing behind itself where theta passes 90 degrees.
+    focal, centre: pixels
+    distortion:    k1 k2 k3 k4
+    """
+
+    focal: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"]
+    distortion: Float[Tensor, "camera 4"]
+
+    @cached_property
+    def fold(self) -> Float[Tensor, "camera 1"]:
+        """Angle from the axis up to which the distance from the centre only grows, at most pi."""
+        theta = torch.linspace(0, math.pi, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device)
+        distance, _ = stretch(theta, self.distortion.double().T[:, :, None].unbind())
+        return last_growing(theta, distance).to(self.focal.dtype)
+
+    def unproject(self, pixels, index=None):
+        target = (pixels - rows(self.centre, index)) / rows(self.focal, index)
+        distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
+        distance = target.square().sum(-1).sqrt()
+        theta = torch.minimum(distance, limit)
+        for _ in range(NEWTON_STEPS):
+            value, slope = stretch(theta, distortion)
+            step = (value - distance) / slope.clamp_min(1e-3)
+            theta = torch.minimum((theta - step).clamp_min(0), limit)
+            if small(step):
+                break
+        sideways = target * (theta.sin() / distance.clamp_min(1e-12))[:, None]
+        return torch.cat([sideways, theta.cos()[:, None]], -1)
+
+    def project(self, points, index=None):
+        sideways = points[:, :2]
+        away = sideways.norm(dim=-1)
+        theta = torch.atan2(away, points[:, 2])
+        distance, _ = stretch(theta, columns(self.distortion, index))
+        plane = sideways * (distance / away.clamp_min(1e-12))[:, None]
+        valid = (theta <= rows(self.fold, index)[:, 0]) & ((away > 0) | (points[:, 2] > 0))
+        return plane * rows(self.focal, index) + rows(self.centre, index), valid
+
+    def solid_angle(self, pixels, directions, index=None):
+        # sin(theta) dtheta dphi of the sphere becomes distance ddistance dphi of the picture.
+        away = directions[:, :2].norm(dim=-1).clamp_min(1e-6)
+        theta = torch.atan2(away, directions[:, 2])
+        distance, slope = stretch(theta, columns(self.distortion, index))
+        return away / (distance * slope.clamp_min(1e-3) * area(self.focal, index))
+
+
+@dataclass(frozen=True)
+class Equirectangular(Lens):
+    """The whole sphere on one picture: longitude across, latitude down. The top looks along -y.
+
+    size:   (width, height) in pixels of 360 by 180 degrees
+    centre: the pixel that looks along +z; half the size where nothing is said. Another one shows a part of the sphere
+    """
+
+    in_pixels: ClassVar[tuple[str, ...]] = ("size", "centre")
+    size: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.centre is None:
+            object.__setattr__(self, "centre", self.size / 2)  # type: ignore[unreachable]
+
+    def unproject(self, pixels, index=None):
+        share = (pixels - rows(self.centre, index)) / rows(self.size, index)
+        longitude, latitude = 2 * math.pi * share[:, 0], math.pi * share[:, 1]
+        level = latitude.cos()
+        return torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1)
+
+    def project(self, points, index=None):
+        x, y, z = points.unbind(-1)
+        pixels = self._at(torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z)), index)
+        return pixels, (points != 0).any(-1)
+
+    def solid_angle(self, pixels, directions, index=None):
+        level = (1 - directions[:, 1] ** 2).clamp_min(1e-12).sqrt()
+        return 2 * math.pi**2 * level / area(self.size, index)
+
+    def _at(self, longitude: Tensor, latitude: Tensor, index: Tensor | None) -> Tensor:
+        """The pixel of each longitude and latitude, radians."""
+        share = torch.stack([longitude / (2 * math.pi), latitude / math.pi], -1)
+        return share * rows(self.size, index) + rows(self.centre, index)
+
+
+@dataclass(frozen=True)
+class OmnidirectionalStereo(Equirectangular):
+    """One eye's panorama whose rays leave a level circle, the viewing circle, along its tangents (Peleg 2001).
+
+    Whichever way one turns, the eyes are beside each other: a ray of longitude a begins at s (cos a, 0, -sin a).
+    A point at a distance R from the vertical axis appears turned by asin(s / R) against what the circle's middle sees.
+
+    offset: s in scene units, from the middle between the eyes to this one, positive to the right
+    """
+
+    offset: Float[Tensor, "camera 1"] = field(kw_only=True)
+
+    def enlarged(self, scale):
+        return replace(self, offset=self.offset * scale)
+
+    def origins(self, pixels, index=None):
+        longitude = 2 * math.pi * ((pixels - rows(self.centre, index)) / rows(self.size, index))[:, 0]
+        right = torch.stack([longitude.cos(), torch.zeros_like(longitude), -longitude.sin()], -1)
+        return rows(self.offset, index) * right
+
+    def project(self, points, index=None):
+        x, y, z = points.unbind(-1)
+        (offset,) = columns(self.offset, index)
+        beyond = x * x + z * z - offset * offset
+        away = beyond.clamp_min(0).sqrt()  # level distance along the ray
+        longitude = torch.atan2(x * away - z * offset, z * away + x * offset)
+        return self._at(longitude, torch.atan2(y, away), index), (beyond > 0) | ((offset == 0) & (y != 0))
+
+
+@dataclass(frozen=True)
+class Mixed(Lens):
+    """Lenses of several kinds in one batch, as from two sorts of camera at one place.
+
+    parts: one batch of lenses for each kind
+    part:  which of them each camera has; the cameras of one part are in its order
+    """
+
+    parts: tuple[Lens, ...]
+    part: Int[Tensor, " camera"]
+
+    @property
+    def row(self) -> Int[Tensor, " camera"]:
+        """Each camera's place within its part."""
+        mine = self.part[:, None] == torch.arange(len(self.parts), device=self.part.device)
+        return (mine.cumsum(0) - 1).gather(1, self.part[:, None])[:, 0]
+
+    def unproject(self, pixels, index=None):
+        return self._by_part(lambda lens, row, pixels: (lens.unproject(pixels, row),), index, pixels)[0]
+
+    def project(self, points, index=None):
+        pixels, valid = self._by_part(lambda lens, row, points: lens.project(points, row), index, points)
+        return pixels, valid
+
+    def origins(self, pixels, index=None):
+        if all(lens.origins(pixels[:0]) is None for lens in self.parts):
+            return None
+
+        def ask(lens: Lens, row: Tensor, pixels: Tensor) -> tuple[Tensor]:
+            begin = lens.origins(pixels, row)
+            return (pixels.new_zeros(len(pixels), 3) if begin is None else begin,)
+
+        return self._by_part(ask, index, pixels)[0]
+
+    def solid_angle(self, pixels, directions, index=None):
+        return self._by_part(lambda lens, row, *x: (lens.solid_angle(*x, row),), index, pixels, directions)[0]
+
+    def enlarged(self, scale):
+        return Mixed(tuple(lens.enlarged(scale) for lens in self.parts), self.part)
+
+    def resized(self, scale):
+        scale = scale.expand(len(self), 2)
+        return Mixed(tuple(lens.resized(scale[self.part == k]) for k, lens in enumerate(self.parts)), self.part)
+
+    def to(self, device):
+        return Mixed(tuple(lens.to(device) for lens in self.parts), self.part.to(device))
+
+    def to_json(self):
+        return {"kind": "mixed", "parts": [lens.to_json() for lens in self.parts], "part": self.part.tolist()}
+
+    @classmethod
+    def _from_json(cls, data, where):
+        parts = tuple(Lens.from_json(part, where) for part in typed(MixedParts, data, where).parts)
+        part = torch.tensor(typed(MixedParts, data, where).part, dtype=torch.int64)
+        if sorted(part.tolist()) != [k for k, lens in enumerate(parts) for _ in range(len(lens))]:
+            raise LumigraphError(f"{where} has lenses of several kinds that do not fit together; correct it")
+        return cls(parts, part)
+
+    def fault(self):
+        return next(filter(None, (lens.fault() for lens in self.parts)), None)
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+        kept = one_or_more(index)
+        pairs = zip(self.part[kept].tolist(), self.row[kept].tolist(), strict=True)
+        return mix([self.parts[part][row] for part, row in pairs])
+
+    def _by_part(self, ask: Callable[..., tuple[Tensor, ...]], index: Tensor | None, *inputs: Tensor) -> list[Tensor]:
+        """Ask each part about its own rows of the inputs, and put the answers back in their places."""
+        if index is None:
+            index = self.part.new_zeros(len(inputs[0]))
+        part, row = self.part[index], self.row[index]
+        places = [(part == k).nonzero()[:, 0] for k in range(len(self.parts))]
+        answers = [ask(self.parts[k], row[at], *(x[at] for x in inputs)) for k, at in enumerate(places)]
+        order = torch.cat(places).argsort()
+        return [torch.cat(column)[order] for column in zip(*answers, strict=True)]
+
+
+def mix(lenses: Sequence[Lens]) -> Lens:
+    """One batch of single lenses: of their kind if they have one in common, else Mixed."""
+    kinds = sorted({type(lens) for lens in lenses}, key=lambda kind: kind.__name__)
+    parts = tuple(Lens.cat([lens for lens in lenses if type(lens) is kind]) for kind in kinds)
+    if len(parts) == 1:
+        return parts[0]
+    return Mixed(parts, torch.tensor([kinds.index(type(lens)) for lens in lenses], device=parts[0].device))
+
+
+def rows(table: Tensor, index: Tensor | None) -> Tensor:
+    """One row for each ray; without an index the first, left to broadcast."""
+    return table[:1] if index is None else table.index_select(0, index)
+
+
+def columns(table: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
+    """The same, each column by itself and contiguous, which is faster to compute with."""
+    return table[:1].T.unbind() if index is None else table.T.contiguous().index_select(1, index).unbind()
+
+
+def area(sides: Tensor, index: Tensor | None) -> Tensor:
+    """x times y of one row for each ray."""
+    return columns(sides.prod(-1, keepdim=True), index)[0]
+
+
+def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
+    """An index that keeps the camera axis: an int becomes a slice of length one."""
+    if isinstance(index, int):
+        return slice(index, index + 1 if index != -1 else None)
+    return index
+
+
+def small(step: Tensor) -> bool:
+    """True where Newton's method has converged."""
+    return not len(step) or step.detach().abs().max().item() < CONVERGED_STEP
+
+
+def through_plane(x: Float[Tensor, " ray"], y: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
+    """Unit directions through points (x, y, 1)."""
+    z = torch.rsqrt(1 + x * x + y * y)
+    return torch.stack([x * z, y * z, z], -1)
+
+
+def onto_plane(points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
+    """Points drawn towards the eye onto the plane z = 1, and whether they were in front of it."""
+    z = points[:, 2:]
+    valid = z > 1e-6 * points.norm(dim=-1, keepdim=True)
+    return points[:, :2] / torch.where(valid, z, 1), valid[:, 0]
+
+
+def within(x: Tensor, y: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """Points of the plane, drawn back onto the disc of a radius."""
+    shrink = (limit * torch.rsqrt((x * x + y * y).clamp_min(1e-12))).clamp_max(1)
+    return x * shrink, y * shrink
+
+
+def polynomial(s: Tensor, *coefficients: Tensor | float) -> Tensor:
+    """c0 + c1 s + c2 s^2 + ... (Horner)."""
+    *lower, value = coefficients
+    for c in reversed(lower):
+        value = c + s * value
+    return torch.as_tensor(value)
+
+
+def bend(
+    x: Tensor, y: Tensor, distortion: Sequence[Tensor]
+) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
+    """OpenCV's distortion of (x, y, 1), and its Jacobian, which is symmetric: (dx'/dx, dx'/dy = dy'/dx, dy'/dy)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+    s = x * x + y * y
+    below = polynomial(s, 1, k4, k5, k6)
+    q = polynomial(s, 1, k1, k2, k3) / below
+    slope = 2 * (polynomial(s, k1, 2 * k2, 3 * k3) - q * polynomial(s, k4, 2 * k5, 3 * k6)) / below  # 2 dq/ds
+    across, down = p1 * y + p2 * x, p1 * x + p2 * y
+    bent_x, bent_y = x * (q + 2 * across) + p2 * s, y * (q + 2 * across) + p1 * s
+    xx = q + x * x * slope + 2 * across + 4 * p2 * x
+    yy = q + y * y * slope + 2 * across + 4 * p1 * y
+    return (bent_x, bent_y), (xx, x * y * slope + 2 * down, yy)
+
+
+def stretch(theta: Tensor, distortion: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """The fisheye's distance from the centre at each angle, and its slope."""
+    k1, k2, k3, k4 = distortion
+    s = theta * theta
+    return theta * polynomial(s, 1, k1, k2, k3, k4), polynomial(s, 1, 3 * k1, 5 * k2, 7 * k3, 9 * k4)
+
+
+def last_growing(at: Float[Tensor, " sample"], values: Float[Tensor, "camera sample"]) -> Float[Tensor, "camera 1"]:
+    """The last sample before a curve first stops growing."""
+    growing = (values.diff(dim=-1) > 0).cumprod(-1).sum(-1, keepdim=True)
+    return at[growing]

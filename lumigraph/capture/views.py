@@ -1,0 +1,118 @@
+"""Scenes with other photographs to learn from: fewer, to see how many a method needs; all; or all at several sizes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ..camera import Camera
+from ..datasets.images import ImageSource, LayerSource, load
+from ..datasets.scene import Scene
+from ..errors import LumigraphError
+from ..metrics import WINDOW
+
+
+def with_fewer_views(scene: Scene, views: int) -> Scene:
+    """The scene with so many photographs in its "train" split, spread evenly over the cameras; see `spread_out`.
+
+    Held-out photographs, frame and sparse points stay what all photographs gave, so that scores can be compared.
+    Raises LumigraphError for fewer than one, and for more than there are.
+    """
+    train = scene.splits["train"]
+    if not 1 <= views <= len(train):
+        raise LumigraphError(
+            f"{scene.source} has {len(train)} photographs to learn from, so --views cannot be {views}; "
+            f"give a number from 1 to {len(train)}"
+        )
+    kept = spread_out(scene.cameras[train])[:views].sort().values
+    return replace(scene, splits=scene.splits | {"train": train[kept]})
+
+
+def with_all_views(scene: Scene) -> Scene:
+    """The scene with every photograph in its "train" split, those that test as well."""
+    return replace(scene, splits=scene.splits | {"train": torch.arange(len(scene.cameras))})
+
+
+def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:
+    """Cameras in an order whose every beginning is spread evenly over all of them.
+
+    The first is the one nearest the mean, each further one the farthest from those before it (farthest point sampling,
+    Gonzalez 1985). How far apart two are is told by their positions, in units of the positions' deviation, and by where
+    they look. Among equals the first comes first.
+    """
+    position, direction = cameras.position, cameras.pose[:, :, 2]
+    centred = position - position.mean(0)
+    deviation = centred.square().sum(-1).mean().sqrt().clamp_min(1e-9)
+    points = torch.cat([centred / deviation, direction], -1)
+    order = [int(distances(points, points.mean(0)).argmin())]
+    nearest = distances(points, points[order[0]])
+    while len(order) < len(points):
+        nearest[order[-1]] = -1.0  # taken, and no further for any other at the same place
+        order.append(int(nearest.argmax()))
+        nearest = torch.minimum(nearest, distances(points, points[order[-1]]))
+    return torch.tensor(order)
+
+
+def distances(points: Float[Tensor, "point axis"], origin: Float[Tensor, " axis"]) -> Float[Tensor, " point"]:
+    return (points - origin).norm(dim=-1)
+
+
+def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path | None = None) -> Scene:
+    """The scene with every photograph `scales` times, each half as large as the one before, as if taken from further
+    away (Barron 2021, Mip-NeRF, section 4.1: trained on and tested together).
+
+    Copies are means over squares of pixels, colours weighted by alpha; rows and columns that fill no square are left
+    out. They are called NAME@1/2, NAME@1/4 and so on, share their photograph's split and image index, and follow behind
+    all photographs as they are. Frame and points stay. Layers follow, as `resized` has it.
+
+    The paper weights each pixel's loss by its footprint. `Scene.sample_rays` draws photographs evenly, and their pixels
+    evenly, so that a pixel of a copy reduced f times is drawn f^2 times as often: the same in expectation, with less
+    variance.
+    memory, cache: as in `open_scene`
+    Raises LumigraphError where the smallest copies would be too small to compare, or trust no pixel.
+    """
+    if scales == 1:
+        return scene
+    shortest = int(scene.cameras.size.min())
+    most = max((shortest // WINDOW).bit_length(), 1)
+    if not 1 <= scales <= most:
+        raise LumigraphError(
+            f"{scene.source} cannot be had at {scales} scales, for each halves the last and {WINDOW} pixels are the "
+            f"least; give --scales a number from 1 to {most}"
+        )
+    count, factors = len(scene), [2**k for k in range(scales)]
+    names = [name if f == 1 else f"{name}@1/{f}" for f in factors for name in scene.names]
+    sizes = torch.cat([scene.cameras.size // f for f in factors]).tolist()
+    copies = [(i, f) for f in factors for i in range(count)]
+    pictures = [
+        ImageSource((width, height), partial(reduced, scene, i, f))
+        for (i, f), (width, height) in zip(copies, sizes, strict=True)
+    ]
+    images = load(pictures, memory, cache)
+    for name, pixels in zip(names, images.trusted_pixels.tolist(), strict=True):
+        if not pixels:
+            raise LumigraphError(
+                f"{scene.source}: the mask trusts no whole pixel of {name}; give a smaller number of --scales"
+            )
+    splits = {split: torch.cat([index + k * count for k in range(scales)]) for split, index in scene.splits.items()}
+    cameras = Camera.cat([scene.cameras.reduced(f) for f in factors])
+    layers = {
+        name: layer.like(images, [LayerSource(partial(layer.reduced, i, f)) for i, f in copies])
+        for name, layer in scene.layers.items()
+    }
+    about = {name: torch.cat([values] * scales) for name, values in scene.about.items()}
+    return replace(scene, cameras=cameras, images=images, splits=splits, names=names, layers=layers, about=about)
+
+
+def reduced(scene: Scene, index: int, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """A photograph's bytes so many times smaller, and which of them to trust."""
+    photograph = scene.photograph(index).reduced(factor)
+    channels = [photograph.rgb] if photograph.alpha is None else [photograph.rgb, photograph.alpha[..., None]]
+    pixels = torch.cat(channels, -1).mul(255).round().clamp(0, 255).byte().numpy()
+    return pixels, None if photograph.mask is None else photograph.mask.numpy()

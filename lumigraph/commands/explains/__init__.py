@@ -1,1 +1,0 @@
-"""Explanations of `lumigraph explain`: one file each, a dataclass of options and a thin run()."""

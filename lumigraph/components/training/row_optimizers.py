@@ -1,0 +1,201 @@
+"""Optimizers for tables of which a step touches some rows, and the exchange of a table for one of another size."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor, nn
+
+
+class RowOptimizer(torch.optim.Optimizer):
+    """Optimizer whose parameters are tables (row, ...), and which leaves alone what has no gradient, moments and all.
+
+    A kind of it writes `moments` and `update`; `exchange` puts a table of other rows into a table's place.
+    """
+
+    @abstractmethod
+    def moments(self, p: Tensor) -> dict[str, Tensor]:
+        """Moments of a parameter before its first step."""
+
+    @abstractmethod
+    def update(self, p: Tensor, grad: Tensor, state: dict[str, Tensor], group: dict[str, Any]) -> None:
+        """Take one step with a parameter and its moments, in place."""
+
+    @torch.no_grad()
+    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
+        """Take one step with all parameters that have a gradient."""
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is None:
+                    continue
+                if not (state := self.state[p]):
+                    state.update(self.moments(p))
+                self.update(p, p.grad, state, group)
+
+
+def adam_moments(p: Tensor) -> dict[str, Tensor]:
+    """Adam's moments before the first step: steps taken, means of the gradient and of its square."""
+    return {"step": torch.zeros(()), "mean": torch.zeros_like(p), "square": torch.zeros_like(p)}
+
+
+def adam_rate(group: dict[str, Any], steps: float) -> float:
+    """Learning rate times both bias corrections of Adam; epsilon is far below anything that they could change."""
+    b1, b2 = group["betas"]
+    return group["lr"] * math.sqrt(1 - b2**steps) / (1 - b1**steps)
+
+
+def exchange(
+    module: nn.Module,
+    name: str,
+    values: Tensor,
+    optimizer: torch.optim.Optimizer | None,
+    state: dict[str, Any] | None = None,
+) -> None:
+    """A new parameter for a module's old one, whose size the graph of the last step still remembers.
+
+    optimizer: updates the new one from now on; None where there is none yet
+    state:     what it remembers of the new one; nothing by default, so that its moments begin at zero
+    """
+    old = getattr(module, name)
+    new = nn.Parameter(values.to(old.device))
+    setattr(module, name, new)
+    if optimizer is not None:
+        optimizer.state.pop(old, None)
+        if state:
+            optimizer.state[new] = state
+        for group in optimizer.param_groups:
+            group["params"] = [new if p is old else p for p in group["params"]]
+
+
+BLOCK = 64  # elements that are passed over together where no gradient has a bit set
+
+
+class LazyAdam(RowOptimizer):
+    """Adam (Kingma and Ba 2015) that leaves an element alone, moments and all, where its gradient is exactly zero.
+
+    So a hash table's entries that no sample touched do not drift (Müller 2022, section 4). Defaults are that paper's.
+    weight_decay: decoupled (Loshchilov and Hutter 2019): each step takes lr * weight_decay of what it touches
+    A group's "rates", if given, multiply the rate of each row of its parameters.
+    """
+
+    def __init__(
+        self,
+        params,
+        lr: float = 1e-2,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-15,
+        weight_decay: float = 0.0,
+    ):
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay, "rates": None})
+
+    def moments(self, p):
+        return adam_moments(p)
+
+    def update(self, p, grad, state, group):
+        state["step"] += 1
+        (b1, b2), rate = group["betas"], adam_rate(group, float(state["step"]))
+        keep = 1 - group["lr"] * group["weight_decay"]
+        tensors, rates = (p, grad, state["mean"], state["square"]), group["rates"]
+        if rates is not None and len(rates) != len(p):
+            raise ValueError(f"{len(rates)} rates are given for {len(p)} rows")
+        if p.is_cuda:
+            rate = rate if rates is None else rate * rates.view(-1, *[1] * (p.dim() - 1))
+            _touched(*tensors, rate, b1, b2, group["eps"], keep)
+            return
+        numbers = [np.float32(x) for x in (rate, b1, b2, group["eps"], keep)]
+        arrays = [x.detach().view(-1).numpy() for x in tensors]
+        if rates is None:
+            _touched_cpu(*arrays, *numbers)
+        else:
+            _touched_rows_cpu(*arrays, rates.numpy(), *numbers)
+
+
+def _touched(p, grad, mean, square, rate, b1, b2, eps, keep):
+    touched = grad != 0
+    mean.copy_(torch.where(touched, b1 * mean + (1 - b1) * grad, mean))
+    square.copy_(torch.where(touched, b2 * square + (1 - b2) * grad * grad, square))
+    p.copy_(torch.where(touched, keep * p - rate * mean / (square.sqrt() + eps), p))
+
+
+@njit(inline="always")
+def _move(p, grad, mean, square, i, rate, b1, b2, eps, keep):
+    g, one = grad[i], np.float32(1)
+    if g != 0:
+        mean[i] = b1 * mean[i] + (one - b1) * g
+        square[i] = b2 * square[i] + (one - b2) * g * g
+        p[i] = keep * p[i] - rate * mean[i] / (np.sqrt(square[i]) + eps)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _touched_cpu(p, grad, mean, square, rate, b1, b2, eps, keep):
+    bits = grad.view(np.int32)
+    for block in prange((len(p) + BLOCK - 1) // BLOCK):
+        first, last = block * BLOCK, min(len(p), (block + 1) * BLOCK)
+        some = np.int32(0)
+        for i in range(first, last):
+            some |= bits[i]
+        if some:
+            for i in range(first, last):
+                _move(p, grad, mean, square, i, rate, b1, b2, eps, keep)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _touched_rows_cpu(p, grad, mean, square, rates, rate, b1, b2, eps, keep):
+    width = len(p) // len(rates)
+    for row in prange(len(rates)):
+        if rates[row] > 0:
+            for i in range(row * width, (row + 1) * width):
+                _move(p, grad, mean, square, i, rate * rates[row], b1, b2, eps, keep)
+
+
+class LazyRMSprop(RowOptimizer):
+    """RMSprop (Hinton 2012) that looks at no row but those that a sparse gradient names:
+
+        s = beta s + (1 - beta) g^2,    p = p - lr g / (sqrt(s) + eps)
+
+    An element's first gradient begins its mean: s = g^2, as in the release of Fridovich-Keil and Yu (2022), whose
+    numbers the defaults are. Each parameter is a table (row, column). A sparse gradient names each row once, as that of
+    `torch.nn.functional.embedding(rows, table, sparse=True)` with rows that all differ; of a dense one all rows count.
+    """
+
+    def __init__(self, params, lr: float = 1e-2, beta: float = 0.95, eps: float = 1e-8):
+        super().__init__(params, {"lr": lr, "beta": beta, "eps": eps})
+
+    def moments(self, p):
+        return {"square": torch.zeros_like(p)}
+
+    def update(self, p, grad, state, group):
+        numbers = group["lr"], group["beta"], group["eps"]
+        if grad.is_sparse:
+            rows, grad = grad._indices()[0], grad._values().contiguous()
+        else:
+            rows, grad = torch.arange(len(p), device=p.device), grad.contiguous()
+        if p.is_cuda:
+            _rows(p, rows, grad, state["square"], *numbers)
+        else:
+            tensors = (x.detach().numpy() for x in (p, rows, grad, state["square"]))
+            _rows_cpu(*tensors, *(np.float32(x) for x in numbers))
+
+
+def _rows(p, rows, grad, square, rate, beta, eps):
+    old = square[rows]
+    new = torch.where(old == 0, grad * grad, beta * old + (1 - beta) * grad * grad)
+    square[rows] = new
+    p[rows] -= rate * grad / (new.sqrt() + eps)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _rows_cpu(p, rows, grad, square, rate, beta, eps):
+    zero, one = np.float32(0), np.float32(1)
+    for i in prange(len(rows)):
+        row = rows[i]
+        for c in range(p.shape[1]):
+            g, old = grad[i, c], square[row, c]
+            new = g * g if old == zero else beta * old + (one - beta) * g * g
+            square[row, c] = new
+            p[row, c] -= rate * g / (np.sqrt(new) + eps)

@@ -1,0 +1,197 @@
+"""Networks of HyP-NeRF: the hypernetwork, the field of an instance, the denoiser of pictures, the codes of members."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from ... import kernels
+from ...components.fields.appearance import axes_of
+from ...components.fields.hash_field import HashNumbers, side_by_side
+from ...components.fields.layers import truncated_exp
+from ...method import Field
+from ...method.controls import blend
+from ...method.field import Colours, Densities, Directions, Points
+
+TABLE, CALM = 1e-4, 0.1  # of a table's first entries; of what codes change at first, beside what all have in common
+
+
+class HyperNetwork(nn.Module):
+    """One perceptron for each tensor (Sen 2023, section 3.2; as Sitzmann 2020 has it): its last bias is the tensor that
+    all instances have in common, and its last layer's weights say how they differ.
+
+    codes:  for each tensor, numbers of the code that it is made of
+    width, layers: of the hidden layers
+    shapes: of the tensors; the first one is a table, all others are layers without biases
+    """
+
+    def __init__(self, codes: Sequence[int], width: int, layers: int, shapes: Sequence[tuple[int, int]]):
+        super().__init__()
+        self.shapes = tuple(shapes)
+        self.hidden, self.last = nn.ModuleList(), nn.ModuleList()
+        for number, (code, (rows, columns)) in enumerate(zip(codes, self.shapes, strict=True)):
+            widths = [code, *[width] * layers]
+            pairs = zip(widths, widths[1:], strict=False)
+            self.hidden.append(nn.Sequential(*(x for a, b in pairs for x in (nn.Linear(a, b), nn.ReLU()))))
+            last = nn.Linear(width, rows * columns)
+            bound = TABLE if number == 0 else math.sqrt(6 / columns)
+            nn.init.uniform_(last.bias, -bound, bound)
+            nn.init.normal_(last.weight, std=CALM * bound / math.sqrt(width))
+            self.last.append(last)
+
+    def forward(self, codes: Sequence[Float[Tensor, "member _"]]) -> list[list[Float[Tensor, "_ _"]]]:
+        """Each member's tensors. codes: for each tensor, those of all members"""
+        networks = zip(self.hidden, self.last, self.shapes, codes, strict=True)
+        made = [last(hidden(code)).unflatten(1, shape).unbind(0) for hidden, last, shape, code in networks]
+        return [list(tensors) for tensors in zip(*made, strict=True)]
+
+
+@dataclass(frozen=True)
+class HashShape:
+    """Shapes of a field's tensors: the table, then the density network's layers, then those of the colour network.
+
+    levels: of the table, which covers [-1, 1]^3
+    density, colour: widths of the networks' layers, inputs first
+    bands:  of spherical harmonics, in which the colour network sees directions
+    """
+
+    levels: kernels.HashLevels
+    density: tuple[int, ...]
+    colour: tuple[int, ...]
+    bands: int
+
+    @staticmethod
+    def of(numbers: HashNumbers, hidden_width: int) -> HashShape:
+        n, width = numbers, hidden_width
+        density = (n.width, *[width] * n.density_layers, n.geometry_features)
+        colour = (n.geometry_features + n.sh_bands**2, *[width] * n.colour_layers, 3)
+        return HashShape(n.levels_of(), density, colour, n.sh_bands)
+
+    @property
+    def tensors(self) -> list[tuple[int, int]]:
+        """The shape of each tensor."""
+        layers = [(b, a) for widths in (self.density, self.colour) for a, b in zip(widths, widths[1:], strict=False)]
+        return [(self.levels.entries, self.levels.features), *layers]
+
+    @property
+    def of_colour(self) -> list[bool]:
+        """True for the tensors of the colour network."""
+        return [i >= len(self.density) for i in range(len(self.tensors))]
+
+
+class HashInstance(Field):
+    """Density and colour at points (Müller 2022, figure 3), differentiable in all tensors."""
+
+    def __init__(self, shape: HashShape, tensors: Sequence[Float[Tensor, "_ _"]]):
+        super().__init__()
+        self.shape, self.tensors = shape, [*tensors]
+
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:
+        table, layers = self.tensors[0], self.tensors[1 : len(self.shape.density)]
+        encoded = kernels.hash_encode(points * 0.5 + 0.5, table.contiguous(), self.shape.levels)
+        geometry = kernels.perceptron(encoded, *layers)
+        return truncated_exp(geometry[:, 0]), geometry
+
+    def colour(
+        self, features: Float[Tensor, "point geometry"], directions: Directions, code: Tensor | None = None
+    ) -> Colours:
+        harmonics = kernels.spherical_harmonics(directions, self.shape.bands)
+        return kernels.perceptron(side_by_side(features, harmonics), *self.tensors[len(self.shape.density) :]).sigmoid()
+
+
+class PictureDenoiser(nn.Module):
+    """A correction of a picture, from a neighbourhood of about 30 pixels: convolutions at full resolution around others
+    at half of it, with a larger receptive field.
+
+    width: channels
+    """
+
+    def __init__(self, width: int):
+        super().__init__()
+        self.first = nn.Conv2d(3, width, 3, padding=1)
+        self.down = nn.Conv2d(width, 2 * width, 3, stride=2, padding=1)
+        self.inner = nn.ModuleList(
+            nn.Conv2d(2 * width, 2 * width, 3, padding=dilation, dilation=dilation) for dilation in (1, 2, 3)
+        )
+        self.up = nn.Conv2d(2 * width, width, 1)
+        self.last = nn.Conv2d(width, 3, 3, padding=1)
+        nn.init.normal_(self.last.weight, std=1e-3)
+
+    def forward(self, pictures: Float[Tensor, "picture 3 height width"]) -> Float[Tensor, "picture 3 height width"]:
+        """sRGB-encoded colours, not clamped."""
+        fine = F.relu(self.first(2 * pictures - 1))
+        coarse = F.relu(self.down(fine))
+        for layer in self.inner:
+            coarse = coarse + F.relu(layer(coarse))
+        above = F.interpolate(self.up(coarse), fine.shape[-2:], mode="bilinear", align_corners=False)
+        return pictures + self.last(F.relu(fine + above))
+
+
+AVERAGE = "average"
+
+
+class InstanceCodes(nn.Module):
+    """Numbers of each member, zeros of those that are not learnt from.
+
+    most:  members that there are room for
+    width: numbers of a code
+    """
+
+    def __init__(self, most: int, width: int):
+        super().__init__()
+        self.rows = nn.Parameter(torch.zeros(most, width))
+
+    @torch.no_grad()
+    def begin(self, members: Int[Tensor, " member"], deviation: float, generator: torch.Generator) -> None:
+        """Random codes for the members to learn from."""
+        drawn = deviation * torch.randn(len(members), self.rows.shape[1], generator=generator)
+        self.rows[members.to(self.rows.device)] = drawn.to(self.rows.device)
+
+    def forward(self, members: Int[Tensor, " member"]) -> Float[Tensor, "member code"]:
+        return self.rows[members]
+
+    @property
+    def learnt(self) -> Bool[Tensor, " member"]:
+        """The members whose codes were learnt."""
+        return (self.rows != 0).any(-1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Numbers of the members whose codes were learnt, as text."""
+        return tuple(str(number) for number in self.learnt.nonzero()[:, 0].tolist())
+
+    @property
+    def average(self) -> Float[Tensor, " code"]:
+        """The mean of the codes that were learnt; zeros where none was."""
+        known = self.rows.detach()[self.learnt]
+        return known.mean(0) if len(known) else self.rows.detach()[0]
+
+    @property
+    def axes(self) -> Float[Tensor, "axis code"]:
+        """Along which the codes that were learnt differ, each as long as their deviation along it: `average + w @ axes`
+        is distributed as the Gaussian that fits them, where w is of the standard normal distribution."""
+        return axes_of(self.rows.detach()[self.learnt])
+
+    def along(self, code: Float[Tensor, " code"]) -> Float[Tensor, " axis"]:
+        """Coordinates of a code along the axes, in deviations from the average."""
+        axes = self.axes
+        return (code - self.average) @ axes.T / axes.square().sum(-1)
+
+    def drawn(self, generator: torch.Generator) -> Float[Tensor, " code"]:
+        """A code from the Gaussian that fits those that were learnt."""
+        axes = self.axes
+        return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
+
+    def code_of(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
+        """The code that a control's value stands for: a member's, the average, one of the others by its name, or one
+        between two, as `controls.blend` takes values apart."""
+        known = {AVERAGE: self.average} | others
+        first, second, share = blend(value)
+        a, b = (known[x] if x in known else self.rows.detach()[int(x)] for x in (first, second))
+        return torch.lerp(a, b, share)

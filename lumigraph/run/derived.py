@@ -1,0 +1,263 @@
+"""Runs made of runs: records of compressions, conversions and inferences; runs that a prior makes; picked Gaussians.
+
+compress.json, convert.json    results, in the run that was made
+config.json                    `converted`, `inferred`: how the run began
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from .. import files
+from ..camera import Camera
+from ..datasets.scene import Frame, Scene
+from ..errors import LumigraphError
+from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
+from ..files.ranges import Count, Lasted, Name, Seed, Share, Tally, typed
+from ..method import Method
+from ..method.capabilities import CanPrune, needs
+from ..method.prior import Prior
+from .checkpoint import Checkpoints, State
+from .folder import Run, check_new
+from .opened import Opened
+from .settings import Settings
+
+LearntFrom = Literal["photographs", "renderings of the source"]
+
+
+@dataclass(frozen=True)
+class Record:
+    """A file in the folder of a run that was made of another."""
+
+    file: ClassVar[str]
+
+    def write(self, folder: Path) -> None:
+        files.write_json(folder / self.file, asdict(self), ours=True)
+
+    @classmethod
+    def read(cls, folder: Path) -> Any:
+        """The record in a run's folder; None in other runs. Raises LumigraphError for a damaged record."""
+        return files.read_json(folder / cls.file, cls) if files.is_file(folder / cls.file) else None
+
+
+@dataclass(frozen=True)
+class Origin:
+    """An entry of config.json: how the run began."""
+
+    key: ClassVar[str]
+
+    def within(self, settings: Settings) -> Settings:
+        """Settings with this entry."""
+        return replace(settings, said=settings.said | {self.key: asdict(self)})
+
+    @classmethod
+    def of(cls, settings: Settings, file: Path) -> Any:
+        """Read from settings; None for a run that began otherwise. file: to name what is damaged in it"""
+        entry = settings.said.get(cls.key)
+        return None if entry is None else typed(cls, entry, f"{file}: {cls.key}")
+
+
+@dataclass(frozen=True)
+class Compressed(Record):
+    """A run before and after compression.
+
+    source:       the run it was made of
+    bytes_before, bytes_after: of the model's weights
+    folder_before, folder_after: of the whole runs
+    psnr_before, psnr_after: of held-out views in dB; before is None where there are renderings alone to compare with
+    compared_with: reference of the held-out views and of the tuning
+    pruned:       share of importance that went;  codebook, apart, coarser: see `packing.Recipe`
+    steps, seconds: of tuning
+    """
+
+    file = "compress.json"
+
+    source: str
+    method: str
+    bytes_before: Tally
+    bytes_after: Tally
+    folder_before: Tally
+    folder_after: Tally
+    psnr_after: float
+    compared_with: Literal["photographs", "renderings of the run"]
+    views: Count
+    pruned: Share
+    codebook: Tally
+    apart: Share
+    coarser: Tally
+    steps: Tally
+    seconds: Lasted
+    psnr_before: float | None = None
+
+    @property
+    def times(self) -> float:
+        """Compression ratio of the model."""
+        return self.bytes_before / max(self.bytes_after, 1)
+
+
+@dataclass(frozen=True)
+class ConversionStart(Origin):
+    """A conversion that is under way, as `converted` in config.json.
+
+    source:      the run or file that is converted
+    learnt_from: data of the student's further training
+    taking_over: seconds that beginning as the teacher took
+    """
+
+    key = "converted"
+
+    source: str
+    learnt_from: LearntFrom
+    taking_over: Lasted
+
+
+@dataclass(frozen=True)
+class MeasuredModel:
+    """Teacher or student of a conversion.
+
+    bytes:   of the model, as it is stored
+    seconds: that rendering a view took
+    psnr:    of held-out views against their photographs, in dB; None where these are not at hand
+    """
+
+    method: Name
+    bytes: Tally
+    seconds: Lasted
+    psnr: float | None = None
+
+
+@dataclass(frozen=True)
+class Converted(Record):
+    """Teacher and student of a conversion.
+
+    source, learnt_from, taking_over: see `ConversionStart`
+    how:     by the teacher's field, its Gaussians, the depth that it shows, or its pictures alone
+    psnr:    of the student's held-out views against the teacher's, in dB
+    steps, seconds: of further training
+    """
+
+    file = "convert.json"
+
+    source: str
+    how: Literal["field", "gaussians", "depth", "pictures"]
+    learnt_from: LearntFrom
+    teacher: MeasuredModel
+    student: MeasuredModel
+    psnr: float
+    views: Count
+    taking_over: Lasted
+    steps: Tally
+    seconds: Lasted
+
+
+@dataclass(frozen=True)
+class Inferred(Origin):
+    """prior: the run that made it; views: photographs in use; seconds: that it took; seed: of the random code of a run
+    without photographs"""
+
+    key = "inferred"
+
+    prior: Name
+    views: Tally
+    seconds: Lasted
+    seed: Seed | None = None
+
+
+def infer(made_by: Run, prior: Prior, scene: Scene, output: Path, options: dict[str, Any]) -> Run:
+    """The run of one scene, in a new or empty folder, that a prior makes of its photographs to learn from.
+
+    options: what `open_dataset` was told of the scene, to open it again
+    """
+    check_new(output)
+    begin = time.perf_counter()
+    method = prior.infer(scene)
+    seconds = time.perf_counter() - begin
+    run = Run.create(output, method, scene, seed=made_by.settings.seed, options=options)
+    return kept(run, method, Inferred(str(made_by.folder.resolve()), len(scene.splits["train"]), round(seconds, 3)))
+
+
+def draw(made_by: Run, prior: Prior, seed: int, output: Path) -> Run:
+    """The run of an object drawn from the prior, in a new or empty folder. seed: of its random code"""
+    check_new(output)
+    begin = time.perf_counter()
+    method = prior.draw(seed)
+    seconds = time.perf_counter() - begin
+    run = Run.create(output, method, Drawn(f"{made_by.title}, seed {seed}", method.frame), seed=seed)
+    return kept(run, method, Inferred(str(made_by.folder.resolve()), 0, round(seconds, 3), seed))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The Dataset that a drawn object has learnt from: none."""
+
+    kind: ClassVar[str] = "a random code"
+
+    source: str
+    frame: Frame
+    splits: dict[str, Tensor] = field(default_factory=dict)
+    names: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def preview(self) -> Camera | None:
+        return None
+
+
+def kept(run: Run, method: Method, said: Inferred) -> Run:
+    """The run with its method saved, and what config.json says of how it was made."""
+    run.settings = said.within(run.settings)
+    run.settings.write(run.folder / "config.json")
+    run.save(State(seconds=said.seconds), method, [], torch.Generator().manual_seed(0))
+    return run
+
+
+def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
+    """Raises LumigraphError unless what is picked may go there: to a file, see `files.claim`, or of a run to a new
+    folder."""
+    if not names_splats(output):
+        if not isinstance(opened, Run):
+            raise LumigraphError(
+                f"{opened.path} is no run, so it cannot become another one; give --output a file that ends in "
+                f"{', '.join(SUFFIXES)}"
+            )
+        check_new(output)
+    else:
+        claim_splats(output, overwrite, reads)
+
+
+def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, why: dict[str, Any]) -> None:
+    """Write the Gaussians that a mask picks of something that opens; the order is that of its method's `gaussians()`.
+
+    output: a splat file in the source's frame, or a folder for a run at the same step, for `resume`: its settings,
+            cameras and history, its optimizers' state of the Gaussians left
+    why:    what the run's config.json says about it, under "cleaned"
+    Raises LumigraphError as `check_output` does, and for a method that cannot learn on with fewer.
+    """
+    check_output(opened, output)
+    if names_splats(output):
+        write_gaussians(output, opened.source_gaussians()[keep])
+        return
+    assert isinstance(opened, Run)
+    method, generator = needs(opened.method(), CanPrune), torch.Generator()
+    optimizers = method.optimizers()
+    opened.restore_training(optimizers, generator)
+    method.prune(keep)
+    settings = replace(
+        opened.settings, said=opened.settings.said | {"cleaned": {"source": str(opened.folder.resolve())} | why}
+    )
+    with files.replacing_folder(output) as partial:
+        for name in ("cameras.json", "metrics.jsonl"):
+            if (opened.folder / name).exists():
+                shutil.copy2(opened.folder / name, partial / name)
+        if (opened.folder / "previews").is_dir():
+            shutil.copytree(opened.folder / "previews", partial / "previews")
+        Checkpoints(partial, opened.method_name).save(opened.state, method, optimizers, generator)
+        settings.write(partial / "config.json")
