@@ -25,7 +25,7 @@ from rich.table import Table
 
 from lumigraph import files
 from lumigraph.capture.pictures import list_images
-from lumigraph.geometry.choice import evenly
+from lumigraph.geometry import evenly
 from lumigraph.system.console import console
 
 VIDEO_FRAMES = 10

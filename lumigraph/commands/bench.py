@@ -59,7 +59,7 @@ class Cells:
     """Compare only this number of held-out views, evenly spread."""
     lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
     """Files with the weights of LPIPS, as for `lumigraph eval`."""
-    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
     reader: ReaderOption = None
     scales: Annotated[Scales, option("N")] = 1

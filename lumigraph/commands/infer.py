@@ -35,7 +35,7 @@ class Infer:
     views: Annotated[Count | None, option("N", "the prior's number in training")] = None
     """Number of input photographs, spread evenly over the cameras. If the scene has no more, all are input, and none is
     held out unless the source names its test photographs."""
-    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce photographs by this whole number; a larger one is faster and loses detail."""
     reader: ReaderOption = None
     device: DeviceOption = "auto"

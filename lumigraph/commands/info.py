@@ -21,7 +21,7 @@ class Info:
 
     what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
     """Folder of a run, of photographs or of meshes, a picture, a mesh, procedural:NAME, a splat file, a composition."""
-    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce a scene's photographs by this whole number before reading."""
     reader: ReaderOption = None
 

@@ -209,7 +209,7 @@ class Train:
     """Training time in seconds; longer gives a higher PSNR. Compiling kernels on first use is not counted."""
     steps: StepsOption = None
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
-    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
     reader: ReaderOption = None
     views: Annotated[Count | None, option("N", "all")] = None

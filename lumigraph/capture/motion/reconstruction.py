@@ -47,7 +47,7 @@ from .stages import Stages, key_of
 MIN_VIEWS = 3  # photographs of a model
 MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
-FEATURE_BUDGETS = (
+FEATURE_BUDGETS = ((80, MAX_FEATURES), (200, 4096))  # most photographs, and features of each; matching is quadratic
     (80, MAX_FEATURES),
     (200, 4096),
 )  # most photographs, and features of each; matching costs their square
