@@ -127,7 +127,7 @@ def open_scene(
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
     source:    a folder, an image file, or "procedural:<name>"
-    downscale: how many times to reduce what the lenses were calibrated for; None gives 1100 pixels where there are over 1320
+    downscale: factor of the reduction from the size of calibration; None gives 1100 pixels where there are over 1320
     reader:    a name of `readers.NAMES`; None looks into the folder
     memory:    bytes of images to keep in memory, before they go to a file; None means a share of the machine's
     cache:     where that file goes; None means the user's cache folder

@@ -48,9 +48,6 @@ MIN_VIEWS = 3  # photographs of a model
 MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
 FEATURE_BUDGETS = ((80, MAX_FEATURES), (200, 4096))  # most photographs, and features of each; matching is quadratic
-    (80, MAX_FEATURES),
-    (200, 4096),
-)  # most photographs, and features of each; matching costs their square
 MIN_FEATURE_BUDGET = 2048
 MAX_SECOND_SIDE = 3200  # pixels of the longer side, for photographs that found no place
 SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
