@@ -53,6 +53,19 @@ def test_noise_of_rays_is_not_taken_for_a_trend():
     assert trend.error > 0.06 and not trend.falling
 
 
+def test_photographs_of_another_size_do_not_count():
+    rows = lines(0.3, 0.0)
+    for row in rows:
+        small = row["step"] < 0.7 * rows[-1]["step"]
+        row["statistics"] = {"reduction": 2 if small else 1}
+        row["psnr"] = 30.0 if small else 26.0
+        row["mean_loss"] *= 0.5 if small else 1
+    trend = loss_trend(rows, by_photograph=False)
+    assert trend.falling and trend.share == pytest.approx(0.3, abs=0.02)
+    assert trend.fall == pytest.approx(1 - 0.7**0.6, abs=0.01)  # of 0.3 over a half
+    assert last_psnr(rows) == 26.0
+
+
 def test_too_few_lines_say_nothing():
     assert loss_trend([], False) is None and loss_trend(lines(0.2, 0.0)[:6], False) is None
     assert loss_trend(lines(0.2, 0.5, passes=7), by_photograph=True) is None  # three whole passes

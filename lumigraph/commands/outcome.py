@@ -11,6 +11,7 @@ from ..method import Method, RayMethod
 from .common import say, show, typed
 
 SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
+FULL_SIZE_SHARE = 0.45  # share of training below which a trend spans less than its second half
 MIN_GROWTH = 2.5  # times the budget so far that a suggestion has at least
 NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "export": "make a page to share"}
 
@@ -35,7 +36,8 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
         rows["PSNR of training photographs"] = f"{psnr:.2f} dB"
     if trend:
         how = f"fell by {100 * trend.fall:.0f} %" if trend.falling else "did not fall any more"
-        rows["loss"] = f"{how} over the second half of training"
+        whole = trend.share > FULL_SIZE_SHARE
+        rows["loss"] = f"{how} {'over the second half of training' if whole else 'with photographs at full size'}"
     if isinstance(data, Scene) and (moved := cameras_moved(method, data.cameras[data.splits["train"]])):
         rows["cameras moved by"] = str(moved)
     enough = state.step >= method.steps_for("draft", data)

@@ -22,7 +22,7 @@ from ..files import claim, write_bytes
 from ..metrics import scores_of
 from ..run import Run
 from ..system.progress import clock, short
-from ..training.verdict import cameras_moved
+from ..training.verdict import cameras_moved, of_final_size
 
 MAX_FILM_BYTES = 12 << 20  # bytes; larger ones are named instead of embedded
 STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
@@ -130,8 +130,10 @@ def curves(run: Run) -> str:
     charts, own = [], methods.colour(run.method_name)
     if any("psnr" in row for row in rows):
         psnr = [row.get("psnr", math.nan) for row in rows]
+        full = of_final_size(rows)
+        note = f"photographs at full size from step {full[0]['step']} on" if len(full) < len(rows) else ""
         for x, label in ((seconds, "seconds of training"), (steps, "step")):
-            charts.append(line_chart([Series("PSNR", x, psnr, own)], label, "PSNR of training batches, dB"))
+            charts.append(line_chart([Series("PSNR", x, psnr, own)], label, "PSNR of training batches, dB", note=note))
     names = dict.fromkeys(name for row in rows for name in row["terms"])
     losses = [
         Series(name, steps, [row["terms"].get(name, math.nan) for row in rows], own + i) for i, name in enumerate(names)

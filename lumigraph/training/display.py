@@ -29,7 +29,7 @@ FIRST_LINE_SECONDS = 3.0  # seconds to the first line with a time left
 LINE_INTERVALS = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
 LINE_SHARE = 0.1  # of the time so far that passes between lines, within these limits
 SMOOTHING = 0.8  # share of the smoothed PSNR that another value leaves
-OMITTED_STATISTICS = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
+OMITTED_STATISTICS = {"mse", "rays", "samples", "visible_samples", "reduction"}  # statistics, as PSNR and by the second
 NAMES = {"gaussians": "Gaussians"}  # of statistics, for people
 
 
@@ -67,6 +67,7 @@ class TrainingDisplay:
         self._count = 0  # of what was learnt from, since then
         self._unit = ""  # what these are
         self._loss: float | None = None
+        self._reduction = 1.0  # of photographs, at the last look
         self._next = 0.0
 
     @property
@@ -119,6 +120,11 @@ class TrainingDisplay:
         self._unit = batch.unit
         if not row:
             return
+        before, self._reduction = self._reduction, row["statistics"].get("reduction", 1.0)
+        if self._reduction < before:
+            self.psnr = None
+            size = "full size" if self._reduction == 1 else f"1/{self._reduction:.0f} of their size"
+            self._line(f"Photographs are at {size} from step {step:,} on; sharper ones have a lower PSNR at first")
         if "psnr" in row:
             now = row["psnr"]
             self.psnr = now if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * now

@@ -29,18 +29,20 @@ def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
 
 @dataclass(frozen=True)
 class Trend:
-    """Trend of the loss over the second half of training.
+    """Trend of the loss over the second half of training, or over the part of it with photographs of the final size.
 
-    fall:  from the half's beginning to its end, as a share of the loss; negative where it rose
+    fall:  from its beginning to its end, as a share of the loss; negative where it rose
     error: one standard deviation of that
+    share: of training that it spans
     """
 
     fall: float
     error: float
+    share: float = 0.5
 
     @property
     def falling(self) -> bool:
-        return self.fall > max(FALLING_SHARE, FALL_DEVIATIONS * self.error)
+        return self.fall > max(2 * self.share * FALLING_SHARE, FALL_DEVIATIONS * self.error)
 
 
 def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
@@ -51,7 +53,7 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
     pass, in which each photograph has its turn once, so that only what was learnt is left.
     """
     found = [row for row in rows if "mean_loss" in row]
-    half = [row for row in found if row["step"] > found[-1]["step"] / 2]
+    half = [row for row in of_final_size(found) if row["step"] > found[-1]["step"] / 2]
     least, most = STRETCH_COUNTS
     passes = int(half[-1]["passes"] - half[0]["passes"]) if half and by_photograph else most
     stretches = min(len(half), passes, most)
@@ -65,7 +67,14 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
     slope = (offset @ log) / (offset @ offset)
     scatter = log - log.mean() - slope * offset
     deviation = math.sqrt((scatter @ scatter) / (stretches - 2) / (offset @ offset))
-    return Trend(1 - math.exp(slope * length), deviation * length)
+    return Trend(1 - math.exp(slope * length), deviation * length, length / half[-1]["step"])
+
+
+def of_final_size(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Lines of metrics.jsonl from steps whose photographs were reduced as in the last one. Errors of smaller pictures
+    are smaller, so that others do not compare."""
+    times = [row.get("statistics", {}).get("reduction", 1.0) for row in rows]
+    return [row for row, reduction in zip(rows, times, strict=True) if reduction == times[-1]]
 
 
 def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
@@ -76,7 +85,8 @@ def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
 
 
 def last_psnr(rows: Sequence[dict[str, Any]]) -> float | None:
-    """The PSNR of training photographs in dB, its mean over the last quarter of training; None where there is none."""
-    found = [(row["step"], row["psnr"]) for row in rows if "psnr" in row]
+    """The PSNR of training photographs in dB, its mean over the last quarter of training, at their final size; None
+    where there is none."""
+    found = [(row["step"], row["psnr"]) for row in of_final_size(rows) if "psnr" in row]
     last = [psnr for step, psnr in found if step > 3 / 4 * found[-1][0]]
     return sum(last) / len(last) if last else None

@@ -185,7 +185,8 @@ class GaussianSplatting(Method):
         self.drawn += 1
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
         photograph = data.photograph(int(train[order[place]]))
-        return photograph.reduced(self.reduction(min(photograph.rgb.shape[:2]))).to(self.device)
+        self.figures["reduction"] = times = self.reduction(min(photograph.rgb.shape[:2]))
+        return photograph.reduced(times).to(self.device)
 
     def reduction(self, shorter: int) -> int:
         """Factor by which photographs are smaller now. shorter: pixels along the shorter side"""
@@ -231,7 +232,7 @@ class GaussianSplatting(Method):
         if now.camera.image_index is not None:
             self.cloud.record_view(now.camera.image_index, now.picture.centres.grad.ne(0).any(-1))
         super().after_step(step)
-        self.figures = {"mse": float(now.residual.square().mean()), "gaussians": len(self.cloud)}
+        self.figures |= {"mse": float(now.residual.square().mean()), "gaussians": len(self.cloud)}
         self.current = None
 
     @torch.no_grad()
