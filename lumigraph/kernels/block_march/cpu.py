@@ -34,7 +34,7 @@ def placed(o, d, t, ball):
 
 @njit(inline="always")
 def nearest(o, d, ball):
-    """Distance backwards along a ray to its point nearest to the ball's centre, and the squared distance of that point."""
+    """Distance backwards along a ray to its point nearest to the ball's centre, and that point's squared distance."""
     middle = TWO * ball - HALF
     u, v, w = o[0] - middle, o[1] - middle, o[2] - middle
     along = u * d[0] + v * d[1] + w * d[2]
