@@ -10,7 +10,7 @@ from numba import get_num_threads, njit, prange
 from .._lanes import LANES, fetch_like, filled, highest, put, turn, where
 from .._operation import differentiable, empty
 
-FAST = {"cache": True, "fastmath": True, "error_model": "numpy"}  # of each compiled function, so of `_product` too
+FAST = {"cache": True, "fastmath": True, "error_model": "numpy"}
 BLOCK = 32  # samples, whose values of one feature are lanes; a buffer has feature f of sample s at [f BLOCK + s]
 TILE = 8  # outputs that are summed up together: each weight that is read serves BLOCK products
 ROW = (0,) * BLOCK
@@ -66,7 +66,7 @@ def _eight(values, x, depth, weights, w, down, across, out, y, gate, finish):
     put(out, (y + 7) * BLOCK, finish(h, out, gate + 7))
 
 
-@njit(**FAST)
+@njit(inline="always")
 def _product(values, x, depth, weights, w, down, across, count, out, y, gate, finish):
     """y_o = finish(sum_i w_io x_i, gate_o) for `count` outputs o.
 
