@@ -58,7 +58,7 @@ def riddles(sources: Sources) -> list[str]:
 
 
 def test_docstrings_name_the_thing(house):
-    at_most(94, riddles(house))
+    at_most(0, riddles(house))
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def namesakes(sources: Sources) -> list[str]:
 
 
 def test_a_class_name_stands_once(house):
-    at_most(16, namesakes(house))
+    at_most(0, namesakes(house))
 
 
 def test_a_namesake_is_noticed():

@@ -68,7 +68,7 @@ Two = tuple[Name, Name]
 
 
 @dataclass(frozen=True)
-class Means:
+class QuantizedMeans:
     """Ends of log(1 + |x|), with the sign of x, and the pictures of low and high bytes."""
 
     mins: Ends
@@ -102,7 +102,7 @@ class Meta:
     """Content of meta.json in version 2. antialias: earlier name of the model "antialiased"."""
 
     count: Tally
-    means: Means
+    means: QuantizedMeans
     scales: CodebookImage
     quats: Quats
     sh0: CodebookImage
@@ -112,7 +112,7 @@ class Meta:
 
 
 @dataclass(frozen=True)
-class OldMeans(Means):
+class OldMeans(QuantizedMeans):
     shape: tuple[Tally, ...]
 
 
@@ -240,7 +240,7 @@ class _Pictures:
             why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
             raise LumigraphError(f"{path}: {shown(name)} cannot be read as a picture ({why}); get it again") from fault
 
-    def means(self, about: Means) -> Vectors:
+    def means(self, about: QuantizedMeans) -> Vectors:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)
         shares = (high << 8 | low) / 65535
         folded = np.array(about.mins) + shares * (np.array(about.maxs) - np.array(about.mins))

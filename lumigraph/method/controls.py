@@ -89,8 +89,8 @@ class Control:
 
 
 def blend(value: str) -> tuple[str, str, float]:
-    """What a value of a control that blends lies between, and its share of the way from the first to the second;
-    a choice alone is all the way at itself. The share is NaN where the text says none."""
+    """Two choices between which a value of a blending control lies, and its share of the way from the first to the
+    second; 0 for a choice alone, NaN where the text has no share."""
     first, *rest = value.split(":")
     if not rest:
         return first, first, 0.0

@@ -31,8 +31,8 @@ ENCODED = 2.2  # stops of light to one of sRGB-encoded colours
 
 @torch.no_grad()
 def spread_of_light(scene: Scene) -> float | None:
-    """How much brighter or darker, redder or bluer neighbouring photographs show the same places, in stops: the root
-    mean square over photographs and channels of the median log2 ratio. None where the scene has no points to tell by.
+    """Difference of neighbouring photographs' exposure and colour at the same places, in stops: the root mean square
+    over photographs and channels of the median log2 ratio. None where the scene has no points to compare.
 
     Neighbours see about the same side of things and the same things before others, so that what is left is the light
     and the camera's reading of it.

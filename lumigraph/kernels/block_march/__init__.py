@@ -154,12 +154,12 @@ def cases(generator: torch.Generator):
         yield _contracted(rays, size, block, share, most, stop, generator)
 
 
-def benchmark_case(generator: torch.Generator, size: int = 2**14):
-    """Rays through a shell in a grid of 256 voxels an axis, in blocks of 30."""
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """Rays through a shell in a grid of 256 voxels an axis, in blocks of 30; 64 times fewer than `size`."""
     place = torch.arange(256.0) - 127.5
     radius = (place[:, None, None] ** 2 + place[:, None] ** 2 + place**2).sqrt()
     places = ((radius > 90) & (radius < 94)).nonzero()
-    origins, directions, enter, leave = _rays(size, (256, 256, 256), generator)
+    origins, directions, enter, leave = _rays(size // 64, (256, 256, 256), generator)
     values = 0.3 * torch.rand(len(places), CHANNELS, generator=generator)
     return origins, directions, enter, leave, Blocks.of(places, (256, 256, 256), 30), values.requires_grad_(), 1e-3
 

@@ -19,7 +19,7 @@ SURE_STEP = np.float32(0.9)  # voxels of a step, in a count of steps that must n
 
 @njit(inline="always")
 def placed(o, d, t, ball):
-    """Where in the grid a ray is at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
+    """Place in the grid of a ray at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
     x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
     if ball > ZERO:
         middle = TWO * ball - HALF
@@ -34,7 +34,7 @@ def placed(o, d, t, ball):
 
 @njit(inline="always")
 def nearest(o, d, ball):
-    """How far behind a ray's origin it is nearest to the middle of the ball, and the square of how near."""
+    """Distance backwards along a ray to its point nearest to the ball's centre, and that point's squared distance."""
     middle = TWO * ball - HALF
     u, v, w = o[0] - middle, o[1] - middle, o[2] - middle
     along = u * d[0] + v * d[1] + w * d[2]

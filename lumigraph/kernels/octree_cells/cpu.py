@@ -31,7 +31,7 @@ def in_cells(o, d, r, side):
 
 @njit(inline="always")
 def through_cube(ray, side, near):
-    """Where a ray enters the cube and leaves it."""
+    """Distances at which a ray enters the cube and leaves it."""
     ox, oy, oz, _, _, _, ix, iy, iz = ray
     a, b, c = -ox * ix, -oy * iy, -oz * iz
     d, e, f = (side - ox) * ix, (side - oy) * iy, (side - oz) * iz
@@ -53,7 +53,7 @@ def place_at(ray, t, side):
 
 @njit(inline="always")
 def leaf(cells, path, level, depth, x, y, z):
-    """What the undivided cell at a place holds, and its level. path: the nodes down to `level`, to which it adds"""
+    """Value and level of the undivided cell at a place. path: the nodes down to `level`, to which it adds"""
     node = path[level]
     while True:
         shift = depth - level - 1
@@ -67,7 +67,7 @@ def leaf(cells, path, level, depth, x, y, z):
 
 @njit(inline="always")
 def leave(x, y, z, shift, ray, t):
-    """Where a ray leaves the cell of side 2^shift at a place, and the place beyond."""
+    """Distance at which a ray leaves the cell of side 2^shift at a place, and the place beyond."""
     ox, oy, oz, dx, dy, dz, ix, iy, iz = ray
     size = np.int64(1) << shift
     lx, ly, lz = x >> shift << shift, y >> shift << shift, z >> shift << shift
@@ -102,7 +102,7 @@ def cross(cells, rows, path, level, depth, x, y, z, ray, t):
 
 @njit(inline="always")
 def outside(u, v, w, side):
-    """Whether a place lies beyond the cube."""
+    """True for a place beyond the cube."""
     return u < 0 or v < 0 or w < 0 or u >= side or v >= side or w >= side
 
 

@@ -42,7 +42,7 @@ def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
 
 @triton.jit
 def leaf(cells, x, y, z, going, DEPTH: tl.constexpr):
-    """What the undivided cell at a place holds, and the logarithm of its side."""
+    """Value of the undivided cell at a place, and the logarithm of its side."""
     node = tl.zeros_like(x)
     value = tl.zeros_like(x)
     shift = tl.zeros_like(x) + DEPTH
@@ -59,7 +59,7 @@ def leaf(cells, x, y, z, going, DEPTH: tl.constexpr):
 
 @triton.jit
 def leave(x, y, z, shift, ray, t, DEPTH: tl.constexpr):
-    """Where rays leave the cells of side 2^shift at their places, and the places beyond."""
+    """Distances at which rays leave the cells of side 2^shift at their places, and the places beyond."""
     ox, oy, oz = ray[0]
     dx, dy, dz = ray[1]
     ix, iy, iz = ray[2]
@@ -84,7 +84,7 @@ def leave(x, y, z, shift, ray, t, DEPTH: tl.constexpr):
 
 @triton.jit
 def inside(u, v, w, DEPTH: tl.constexpr):
-    """Whether places lie in the cube."""
+    """True for places in the cube."""
     side = 1 << DEPTH
     return (u >= 0) & (v >= 0) & (w >= 0) & (u < side) & (v < side) & (w < side)
 

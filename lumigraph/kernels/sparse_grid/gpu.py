@@ -20,7 +20,7 @@ def _along(x, cells):
 
 @triton.jit
 def cell_of(points, i, here, X, Y, Z):
-    """Of X Y Z cells the one that holds each point, its place in the cell, along which axes it lies inside the cube."""
+    """Cell of X Y Z that holds each point, its place in the cell, and the axes along which it lies in the cube."""
     x, y, z = load_row(points, i, here)
     (cx, fx), (cy, fy), (cz, fz) = _along(x, X), _along(y, Y), _along(z, Z)
     inside = (x >= 0.0) & (x <= 1.0), (y >= 0.0) & (y <= 1.0), (z >= 0.0) & (z <= 1.0)
