@@ -281,10 +281,10 @@ def test_the_worker_ends_when_nobody_listens(tmp_path):
 
 def test_a_film_of_the_whole_sphere_becomes_flat_views(tmp_path):
     """A walk through a room, as a spherical camera films it; the views are where and what pinhole cameras see."""
-    walls, width, count = [pattern(seed) for seed in range(6)], 640, 8
+    walls, width, count = [pattern(seed) for seed in range(6)], 512, 6
     poses = []
-    for i, a in enumerate(np.linspace(0, 2, count)):
-        eye = np.array([1 + i / 5, 1.2 + 0.5 * np.sin(2 * a), 1.6 + 0.2 * np.cos(3 * a)])
+    for i, a in enumerate(np.linspace(0, 1.5, count)):
+        eye = np.array([1 + i / 4, 1.2 + 0.5 * np.sin(2 * a), 1.6 + 0.2 * np.cos(3 * a)])
         poses.append(look_at(eye, eye + [np.cos(a), np.sin(a), 0]))
     film = tmp_path / "film.mp4"
     with open_video(film, 5) as video:
