@@ -62,7 +62,7 @@ def draw(pose: np.ndarray, walls: list[np.ndarray], inward: np.ndarray | None = 
         axis = i % 3
         with np.errstate(divide="ignore", invalid="ignore"):
             away = (WALL * (i // 3) - eye[axis]) / directions[..., axis]
-        hits = eye + away[..., None] * directions
+            hits = eye + away[..., None] * directions
         u, v = (np.delete(hits, axis, -1) / WALL * (len(wall) - 1)).transpose(2, 0, 1)
         shown = (away > 0) & (away < nearest) & (u >= 0) & (v >= 0) & (u < len(wall) - 1) & (v < len(wall) - 1)
         nearest[shown] = away[shown]
