@@ -18,11 +18,11 @@ import torch
 from budgets import budget
 from PIL import Image
 from scipy.spatial import KDTree
-from views import draw, look_at, pattern, spoil, write_views
+from views import draw, look_at, panorama, pattern, pinhole, spoil, write_views
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
-from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction, worker
+from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction, sphere, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
@@ -36,8 +36,12 @@ from lumigraph.capture.transforms import read as read_transforms
 from lumigraph.commands import capture as command
 from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
+from lumigraph.export.video import open_video
 
 pytestmark = budget("capture", 20)
+
+
+TURNED = (("view01.jpg", 6, "ROTATE_90"), ("view05.jpg", 3, "ROTATE_180"), ("view08.jpg", 8, "ROTATE_270"))
 
 
 class Told:
@@ -61,6 +65,11 @@ def captured(tmp_path_factory):
     base = tmp_path_factory.mktemp("capture")
     photos = base / "photos"
     poses = write_views(photos)
+    for name, orientation, undo in TURNED:
+        with Image.open(photos / name) as image:
+            stored, exif = image.transpose(Image.Transpose[undo]), image.getexif()
+        exif[0x0112] = orientation
+        stored.save(photos / name, quality=95, exif=exif)
     bad = spoil(photos)
     before = digests(photos)
     told = Told()
@@ -92,6 +101,14 @@ def test_all_good_photographs_are_placed_where_they_were_taken(captured):
     focal = result["cameras"][0]["parameters"][0]
     assert focal == pytest.approx(300, rel=0.03)
     assert not any("one place" in sentence or "folded" in sentence for sentence in result["warnings"])
+
+
+def test_photographs_with_several_orientations_share_a_lens(captured):
+    _, _, _, scene, result, _ = captured
+    assert {name for name, _, _ in TURNED} <= set(result["registered"]) and len(result["cameras"]) == 1
+    for name, _, _ in TURNED:
+        with Image.open(scene / "images" / name) as image:
+            assert image.size == (320, 240) and 0x0112 not in image.getexif()
 
 
 def test_exactly_the_bad_ones_are_named(captured):
@@ -262,6 +279,75 @@ def test_the_worker_ends_when_nobody_listens(tmp_path):
     assert process.wait(timeout=20) == 1
 
 
+def test_a_film_of_the_whole_sphere_becomes_flat_views(tmp_path):
+    """A walk through a room, as a spherical camera films it; the views are where and what pinhole cameras see."""
+    walls, width, count = [pattern(seed) for seed in range(6)], 512, 6
+    poses = []
+    for i, a in enumerate(np.linspace(0, 1.5, count)):
+        eye = np.array([1 + i / 4, 1.2 + 0.5 * np.sin(2 * a), 1.6 + 0.2 * np.cos(3 * a)])
+        poses.append(look_at(eye, eye + [np.cos(a), np.sin(a), 0]))
+    film = tmp_path / "film.mp4"
+    with open_video(film, 5) as video:
+        for pose in poses:
+            video.add(torch.from_numpy(np.array(draw(pose, walls, panorama(width)))))
+    scene = tmp_path / "scene"
+    result = reconstruct([film], scene, MotionOptions(camera="spherical"))
+    assert len(result["registered"]) == count and result["error"] < 1
+    assert [camera["model"] for camera in result["cameras"]] == ["EQUIRECTANGULAR"]
+    fronts = {f"{i:06d}_front.jpg": pose for i, pose in enumerate(poses)}
+    assert np.median(aligned_error(scene, fronts)) < 0.01
+    flat = pycolmap.Reconstruction(scene / "sparse/0")
+    flat.update_point_3d_errors()
+    assert flat.compute_mean_reprojection_error() < 1 and flat.compute_mean_track_length() > 3
+    opened = open_scene(scene)
+    assert len(opened) == 5 * count and not opened.warnings
+    side = round(width / np.pi)
+    for view, turn in sphere.TURNS.items():
+        seen = draw(np.concatenate([poses[3][:, :3] @ turn, poses[3][:, 3:]], 1), walls, pinhole(side, side, side / 2))
+        with Image.open(scene / "images" / f"000003_{view}.jpg") as image:
+            coarse = [np.asarray(one.resize((24, 24), Image.Resampling.BOX), int) for one in (image, seen)]
+        assert np.abs(coarse[0] - coarse[1]).mean() < 8, view
+
+
+def test_of_two_scenes_the_larger_is_used_and_the_other_named(tmp_path):
+    photos = tmp_path / "photos"
+    write_views(photos, 5)
+    walls = [pattern(seed) for seed in range(60, 63)]
+    for i in range(3):
+        draw(look_at(np.array([3 - 0.3 * i, 1 + 0.4 * i, 1.2])), walls).save(photos / f"z{i}.jpg", quality=95)
+    result = reconstruct([photos], tmp_path / "scene", MotionOptions(max_size=320))
+    assert result["registered"] == [f"view{i:02d}.jpg" for i in range(5)]
+    assert result["other_models"] == [[f"z{i}.jpg" for i in range(3)]]
+    [said] = result["warnings"]
+    assert "3 photographs fit together, but not with the rest: z0.jpg" in said and "capture them alone" in said
+
+
+def test_a_camera_that_only_turned_shows_no_parallax(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    walls, eye = [pattern(seed) for seed in range(3)], np.array([2.0, 2.1, 1.2])
+    for i in range(4):
+        aim = eye + [-np.cos(0.3 + 0.2 * i), -np.sin(0.3 + 0.2 * i), -0.2]
+        draw(look_at(eye, aim), walls).save(photos / f"{i}.jpg", quality=95)
+    with pytest.raises(LumigraphError, match="taken from one place, so that nothing shows parallax.* a step apart"):
+        reconstruct([photos], tmp_path / "scene")
+
+
+def test_turns_are_told_from_planes():
+    """A camera of unknown focal length that turns, and one that moves before a wall, to the side or around it."""
+    lens, noise = np.array([[900.0, 0, 400], [0, 900, 300], [0, 0, 1]]), np.random.default_rng(0)
+
+    def seen(motion: np.ndarray) -> tuple:
+        return lens @ motion @ np.linalg.inv(lens) * -3 + noise.normal(0, 1e-5, (3, 3)), (800, 600), (800, 600)
+
+    turns = [look_at(np.zeros(3), np.array([1, a, b]))[:, :3] for a in (-0.3, -0.1, 0.2) for b in (0, 0.2)]
+    between = [a.T @ b for i, a in enumerate(turns) for b in turns[:i]]
+    wall = [np.eye(3) + np.outer([x, y, 0], [0, 0, 1.0]) for x in (0.05, 0.4) for y in (0, 0.3)]
+    around = [r + np.outer([0.3, 0.1, 0.1], [0.1, 0, 1.0]) for r in between]
+    counted = [diagnosis.count_turns([seen(m) for m in motions]) for motions in (between, wall, around, [])]
+    assert counted == [len(between), 0, 0, 0]
+
+
 def test_nothing_fits_together(tmp_path, capsys, monkeypatch):
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -283,13 +369,18 @@ def test_nothing_fits_together(tmp_path, capsys, monkeypatch):
         (["two", "--output", "taken"], "is no capture"),
         (["two", "--max-size", "50"], "from 200 to"),
         (["two", "--frames", "1"], "at least 3"),
+        (["black"], "4 photographs, and every one is black; open one to see"),
+        (["same"], "1 photograph that can be used, and 3 are the least (3 more show what 0.jpg shows)"),
     ],
 )
 def test_bad_input_gets_one_sentence(tmp_path, capsys, monkeypatch, what, sentence):
     monkeypatch.chdir(tmp_path)
     walls = [pattern(seed) for seed in range(3)]
-    for folder in ("two", "taken"):
+    for folder in ("two", "taken", "black", "same"):
         Path(folder).mkdir()
+    for i in range(4):
+        draw(look_at(np.array([3.0, 1.0, 1.0])), walls).save(f"same/{i}.jpg")
+        Image.effect_noise((90, 60), 1).point(lambda value: max(value - 127, 0)).save(f"black/{i}.jpg")
     for i in range(2):
         draw(look_at(np.array([3.0, 1.0 + i, 1.0])), walls).save(f"two/{i}.jpg")
     Path("taken/notes.txt").write_text("mine")
@@ -354,6 +445,8 @@ def test_who_shares_a_lens():
     assert len(group_by_lens(phone + scan, False, "single")) == 1
     with pytest.raises(LumigraphError, match="one size"):
         group_by_lens(tourists, False, "single")
+    with pytest.raises(LumigraphError, match="100x80 pixels, and a panorama .* twice as wide"):
+        group_by_lens(scan, False, "spherical")
     assert prior(phone) == (91.0, True) and prior(scan) == (120.0, False)
 
 
@@ -407,7 +500,7 @@ def test_a_fold_is_a_jump():
     carried[30:, :, :3] = look_at(np.zeros(3), np.array([1.0, -1, 0]))[:, :3]
     assert jumps(carried) == [] and [i for i, _ in jumps(carried, [29])] == [29]
     names = [f"{i}" for i in range(50)]
-    shared = Matches(dict.fromkeys(names, 500), {("30", "29"): 80}, 0, 0)
+    shared = Matches(dict.fromkeys(names, 500), {("30", "29"): 80}, 0)
     assert folds(names, carried, shared, True) and not folds(names, carried, replace(shared, shared={}), True)
 
 
@@ -435,7 +528,6 @@ def test_exposure_rotation_and_reasons():
     matches = Matches(
         {name: 500 for name in "abcdef"} | {"g": 3},
         {("a", "b"): 90, ("b", "c"): 60, ("e", "d"): 30, ("a", "f"): 20},
-        3,
         3,
     )
     assert "one place" in diagnosis.about_rotation(10.0, matches)[0]

@@ -7,12 +7,14 @@ import math
 import os
 import shutil
 import struct
+import sys
 import zlib
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
+import pillow_heif
 import pytest
 import torch
 from PIL import Image
@@ -21,6 +23,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 from lumigraph.capture.photos import Intake, gather, is_bare, is_video
 from lumigraph.capture.photos.judge import MIN_SHARPNESS, blurred, judge, sharpness
 from lumigraph.capture.photos.video import Odometer, choose, extract
+from lumigraph.capture.pictures import find_file, list_images, read_image, reads_heic, upright_size
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.export.video import open_video
 
@@ -146,6 +149,47 @@ def test_nothing_to_see_is_said_in_one_sentence(tmp_path, make, says):
         gather([make(tmp_path)], tmp_path / "work")
 
 
+def heic(path: Path, image: Image.Image, exif: Image.Exif) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pillow_heif.encode("RGB", image.size, image.tobytes(), path, exif=exif.tobytes(), quality=90)
+    return path
+
+
+@pytest.mark.parametrize(("orientation", "undo"), [(1, None), (6, "ROTATE_90")])
+def test_heic_of_a_phone_is_turned_upright_once(tmp_path, orientation, undo):
+    """As a phone writes it: stored on its side, with a turn for decoders and the same in EXIF."""
+    upright = Image.fromarray(gaussian_filter(np.asarray(view(100)), (2, 2, 0)))
+    stored = upright.transpose(Image.Transpose[undo]) if undo else upright
+    exif = tags({0xA405: 26}, orientation=orientation, make="Apple", model="iPhone 14")
+    path = heic(tmp_path / "photos" / "IMG_1.HEIC", stored, exif)
+    photo = gather([path.parent], tmp_path / "work").photos[0]
+    assert (photo.name, photo.size) == ("IMG_1.HEIC.jpg", SIZE)
+    assert photo.focal == pytest.approx(26 / 43.2666 * math.hypot(*SIZE), rel=1e-4)
+    assert list_images(path.parent) == ["IMG_1.HEIC"] and find_file(path.parent / "IMG_1") == path
+    assert upright_size({1: path}) == SIZE
+    for pixels in (np.asarray(Image.open(photo.path)), read_image(path, True, SIZE), read_image(path, False, SIZE)):
+        assert np.abs(pixels.astype(int) - np.asarray(upright, int)).mean() < 3
+
+
+def test_heic_that_cannot_be_read_says_why(tmp_path, monkeypatch):
+    path = heic(tmp_path / "photos" / "IMG_1.HEIC", view(0), tags())
+    misnamed = path.with_name("sent.jpg")
+    misnamed.write_bytes(path.read_bytes())
+    assert names(gather([misnamed], tmp_path / "work")) == ["sent.jpg"]
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    reads_heic.cache_clear()
+    with pytest.raises(LumigraphError, match="pip install pi-heif"):
+        gather([path], tmp_path / "work")
+    with pytest.raises(LumigraphError, match="pip install pi-heif"):
+        read_image(path, True, SIZE)
+    monkeypatch.undo()
+    reads_heic.cache_clear()
+    for share in (0.02, 0.5, 0.98):
+        path.write_bytes(misnamed.read_bytes()[: round(share * misnamed.stat().st_size)])
+        with pytest.raises(LumigraphError, match=r"\(IMG_1.HEIC: it is cut short or damaged\); copy them again"):
+            gather([path], tmp_path / "work")
+
+
 def test_files_that_are_no_pictures_are_named_and_the_rest_is_used(tmp_path):
     walk_past(tmp_path / "photos", 2)
     (tmp_path / "photos" / "bad.jpg").write_bytes(b"nonsense")
@@ -253,6 +297,27 @@ def test_focal_length_from_the_sensor(tmp_path):
     for orientation in (1, 6):
         photo = only(tmp_path, tags(facts, orientation=orientation, **CAMERA))
         assert photo.focal == pytest.approx(40 / 23.2 * max(SIZE), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("facts", "focal"),
+    [
+        ({0xA210: 2, 0xA20E: 2540.0}, 500.0),  # pixels per inch
+        ({0xA20E: 2540.0}, 500.0),  # the same, unsaid
+        ({0xA210: 3, 0xA20E: 1000.0}, 500.0),  # per centimetre
+        ({0xA210: 2, 0xA20E: 2540.0, 0xA002: 480, 0xA003: 320}, 500.0),
+        ({0xA210: 2, 0xA20E: 2540.0, 0xA002: 960, 0xA003: 640}, 250.0),  # reduced to half since
+        ({0xA210: 2, 0xA20E: 2540.0, 0xA002: 640, 0xA003: 960}, 250.0),  # and turned
+        ({0xA210: 2, 0xA20E: 2540.0, 0xA002: 960}, 250.0),
+        ({0xA210: 2, 0xA20E: 2540.0, 0xA002: 480, 0xA003: 360}, 500.0),  # 40 rows cut off
+        ({0xA210: 2, 0xA20E: 2540.0, 0xA002: 640, 0xA003: 480}, None),  # cropped and reduced
+        ({0xA405: 36, 0xA002: 480, 0xA003: 360}, 36 / 43.2666 * 600),  # cropped, with the 35 mm equivalent
+    ],
+)
+def test_focal_length_in_pixels_from_the_sensor(tmp_path, facts, focal):
+    """5 mm on a sensor with 100 pixels per millimetre."""
+    found = only(tmp_path, tags({0x920A: 5.0} | facts)).focal
+    assert found == (None if focal is None else pytest.approx(focal, rel=1e-4))
 
 
 @pytest.mark.parametrize(

@@ -39,16 +39,30 @@ def arc(count: int, distance: float = 3.0) -> list[np.ndarray]:
     return [look_at(np.array([distance * np.cos(a), distance * np.sin(a), 1.2 + 0.25 * np.sin(5 * a)])) for a in angles]
 
 
-def draw(pose: np.ndarray, walls: list[np.ndarray]) -> Image.Image:
-    """What a pinhole camera sees of the three walls x = 0, y = 0 and z = 0."""
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    inward = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1)
+def pinhole(width: int = WIDTH, height: int = HEIGHT, focal: float = FOCAL) -> np.ndarray:
+    """Direction of each pixel in the camera's frame."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([(x - width / 2) / focal, (y - height / 2) / focal, np.ones_like(x)], -1)
+
+
+def panorama(width: int) -> np.ndarray:
+    """The same of an equirectangular panorama."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
+    longitude, latitude = (2 * x / width - 1) * np.pi, (2 * y / width - 0.5) * np.pi
+    level = np.cos(latitude)
+    return np.stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)], -1)
+
+
+def draw(pose: np.ndarray, walls: list[np.ndarray], inward: np.ndarray | None = None) -> Image.Image:
+    """What a camera sees of the walls x = 0, y = 0 and z = 0, and of those opposite if there are more."""
+    inward = pinhole() if inward is None else inward
     directions, eye = inward @ pose[:, :3].T, pose[:, 3]
-    picture, nearest = np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH), np.inf)
-    for axis, wall in enumerate(walls):
+    picture, nearest = np.zeros(inward.shape), np.full(inward.shape[:2], np.inf)
+    for i, wall in enumerate(walls):
+        axis = i % 3
         with np.errstate(divide="ignore", invalid="ignore"):
-            away = -eye[axis] / directions[..., axis]
-        hits = eye + away[..., None] * directions
+            away = (WALL * (i // 3) - eye[axis]) / directions[..., axis]
+            hits = eye + away[..., None] * directions
         u, v = (np.delete(hits, axis, -1) / WALL * (len(wall) - 1)).transpose(2, 0, 1)
         shown = (away > 0) & (away < nearest) & (u >= 0) & (v >= 0) & (u < len(wall) - 1) & (v < len(wall) - 1)
         nearest[shown] = away[shown]

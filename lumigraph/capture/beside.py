@@ -23,9 +23,9 @@ from ..geometry import evenly
 from .capture import Capture, PixelPlane, Shot
 from .numbers import kind_of, read_numbers
 from .photos.exif import exposure
-from .pictures import Chosen, read_image, readable, same_shape, stat
+from .pictures import HEIC_SUFFIXES, Chosen, read_image, readable, same_shape, stat
 
-EXPOSURE_SUFFIXES = (".jpg", ".jpeg")  # files with an exposure time
+EXPOSURE_SUFFIXES = (".jpg", ".jpeg", *HEIC_SUFFIXES)  # files with an exposure time
 DEPTH_KINDS = ("distance", "z-depth")
 DEPTH_VIEWS, POINTS_PER_VIEW = 64, 300  # depth maps that sparse points are drawn from at most, and points of each
 

@@ -25,6 +25,7 @@ JUMP_FACTOR = 10.0  # times the usual distance between neighbours
 MAX_VIEW_ANGLE = 45.0  # degrees between views; who walks far off seldom looks the same way there
 MAX_PAIRED_VIEWS = 200  # photographs, every two of which are compared
 CHECKED_JUMPS = 4  # widest jumps whose photographs are compared
+SAME_PLACE_SHARE = 1e-6  # of the whole way, below which two cameras are in one place
 SAME_VIEW_FACTOR = 1.25  # times the difference to adjacent photographs; up to it two photographs show the same
 THUMBNAIL_SIDE = 16  # pixels
 ORDER_SHARE = 0.5  # distance of neighbours, as a share of that of any two, up to which names give the order of exposure
@@ -113,6 +114,8 @@ def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = 
     steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
     same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(MAX_VIEW_ANGLE))
     usual = float(np.median(steps)) if len(steps) else 0.0
+    if usual < SAME_PLACE_SHARE * steps.sum():  # several views from each place, as of a panorama
+        return []
     return [
         (i, float(step / usual))
         for i, step in enumerate(steps)

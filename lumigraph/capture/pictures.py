@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,11 @@ from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, kind_of, read_
 
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
 MAX_KEPT = 1.2  # times as long a side stays as it is, rather than losing sharpness for few pixels
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
+HEIC_SUFFIXES = (".heic", ".heif", ".hif")
+IMAGE_SUFFIXES = (
+    ".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr", ".HEIC", *HEIC_SUFFIXES
+)  # fmt: skip
+NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
 EXIF_UPRIGHT = (None, 0, 1)
@@ -183,6 +187,18 @@ def stat(path: Path) -> str:
     return f"{found.st_mtime_ns} {found.st_size}"
 
 
+@cache
+def reads_heic() -> bool:
+    """Let Pillow read HEIC, turned upright by the decoder and without an orientation left in EXIF. False where the
+    package for it is missing."""
+    try:
+        import pi_heif
+    except ImportError:
+        return False
+    pi_heif.register_heif_opener()
+    return True
+
+
 def measure(path: Path) -> tuple[Size, int | None]:
     """Width and height as stored, and how EXIF says to turn it."""
     with readable(path):
@@ -293,6 +309,8 @@ def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
     """Context in which any fault that an image library raises for a file becomes one sentence."""
+    if path.suffix.lower() in HEIC_SUFFIXES and not reads_heic():
+        raise LumigraphError(f"{path} {NO_HEIC}")
     try:
         yield
     except LumigraphError:

@@ -37,8 +37,9 @@ class CaptureCommand:
     """Structure from motion: incremental, one photograph after the other, or global, quicker for hundreds."""
     matching: Literal["auto", "sequential", "exhaustive", "retrieval"] = "auto"
     """Pairs to match: neighbours in order, all, or those that look alike; auto decides by kind and number."""
-    camera: Literal["auto", "single", "per-device", "per-image"] = "auto"
-    """Photographs that share a lens model: all, those of one device, or none; auto decides by the metadata."""
+    camera: Literal["auto", "single", "per-device", "per-image", "spherical"] = "auto"
+    """Photographs that share a lens model: all, those of one device, or none; auto decides by the metadata. spherical:
+    a 360-degree film or panoramas, twice as wide as high; the scene gets flat views of them."""
     max_size: Annotated[int, between(200, 65_536), option("PIXELS")] = 1600
     """Longer side of photographs for feature detection; larger finds more features and is slower."""
 

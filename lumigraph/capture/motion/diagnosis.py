@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from ...files.names import counted, natural
+from ...geometry import evenly
 from ...system.library import pycolmap
 from ..colmap import poses_of
 from ..normalise import where_axes_meet
@@ -27,6 +28,11 @@ MAX_EXPOSURE_STOPS = 1.5  # of exposure that a photograph may differ from others
 EXPOSURE_WINDOW = 5  # neighbours on each side with which a frame's exposure is compared
 MIN_TRIANGULATION_ANGLE = 2.0  # degrees, median over points: below it depth is uncertain
 ROTATION_SHARE = 0.6  # share of the pairs that a pure rotation of the camera explains
+ALL_TURNED_SHARE = 0.9  # share from which on a model of these pairs has no depth, whatever it says
+TURN_SAMPLES = 300  # pairs whose motion is looked at
+FOCAL_RATIOS = 0.4, 4.0, 100  # shortest and longest focal length in terms of the longer side, and how many are tried
+MAX_TURN_DEVIATION = 0.15  # deviation from a rotation, of the motion between two pictures, which a turn may have
+MIN_MOTION = 0.02  # added to the motion, so that noise is small against it
 MIN_OVERLAP_MATCHES = 30  # shared features from which on two neighbours count as close
 MAX_GAP_ANGLE = 30.0  # degrees between neighbouring viewing directions
 MAX_REPROJECTION_ERROR = 2.0  # pixels
@@ -41,13 +47,16 @@ class Matches:
     features: dict[str, int]
     shared: dict[tuple[str, str], int]
     turned: int  # pairs that a turn of the camera alone explains
-    flat: int  # pairs that a turn or a plane explains
 
     def best(self, name: str) -> tuple[str, int]:
         """The photograph that shares most with this one, and how many details; 0 and no name if none does."""
         found = [(n, b if a == name else a) for (a, b), n in self.shared.items() if name in (a, b)]
         most = max(found, default=(0, ""))
         return most[1], most[0]
+
+    def are_turned(self, share: float = ROTATION_SHARE) -> bool:
+        """True if a turn of the camera alone explains more than a share of the pairs."""
+        return self.turned > share * max(len(self.shared), 1)
 
     def between(self, a: str, b: str) -> int:
         return self.shared.get((a, b)) or self.shared.get((b, a)) or 0
@@ -63,18 +72,48 @@ class Matches:
 
 
 def read_matches(database: Path) -> Matches:
-    shared, turned, flat = {}, 0, 0
+    shared, flat = {}, []
     kinds = pycolmap.TwoViewGeometryConfiguration
     with closing(pycolmap.Database.open(database)) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
+        images, cameras = opened.read_all_images(), {c.camera_id: c for c in opened.read_all_cameras()}
+        names = {image.image_id: image.name for image in images}
+        sizes = {i.image_id: (cameras[i.camera_id].width, cameras[i.camera_id].height) for i in images}
         features = {name: opened.num_keypoints_for_image(number) for number, name in names.items()}
         for number, pair in zip(*opened.read_two_view_geometries(), strict=True):
             if len(pair.inlier_matches) >= MIN_MATCHES:
                 a, b = pycolmap.pair_id_to_image_pair(number)
                 shared[names[a], names[b]] = len(pair.inlier_matches)
-                turned += pair.config == kinds.PANORAMIC
-                flat += pair.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
-    return Matches(features, shared, turned, flat)
+                if pair.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC):
+                    flat.append((np.array(pair.H), sizes[a], sizes[b]))
+    return Matches(features, shared, count_turns(flat))
+
+
+def count_turns(homographies: Sequence[tuple[Float[np.ndarray, "3 3"], tuple[int, int], tuple[int, int]]]) -> int:
+    """Number of homographies between two pictures that a turn explains, and no plane: K R K⁻¹ with one focal length.
+
+    Each with the widths and heights of its pictures. A plane before a camera that moves gives R + t nᵀ, which is no
+    rotation by as much as it moves; so the deviation from a rotation is measured in terms of the motion.
+    """
+    if not homographies:
+        return 0
+    some, ratios = evenly(homographies, TURN_SAMPLES), np.geomspace(*FOCAL_RATIOS)
+    worst = np.empty((len(some), len(ratios)))
+    for row, (homography, *sizes) in zip(worst, some, strict=True):
+        first, second = (calibration(size, ratios) for size in sizes)
+        motion = np.linalg.inv(second) @ homography @ first
+        motion /= np.cbrt(np.linalg.det(motion))[:, None, None]
+        off = np.abs(motion.transpose(0, 2, 1) @ motion - np.eye(3)).max((1, 2))
+        row[:] = off / (np.abs(motion - np.eye(3)).max((1, 2)) + MIN_MOTION)
+    best = worst[:, np.median(worst, axis=0).argmin()]
+    return round(float((best < MAX_TURN_DEVIATION).mean()) * len(homographies))
+
+
+def calibration(size: tuple[int, int], ratios: Float[np.ndarray, " ratio"]) -> Float[np.ndarray, "ratio 3 3"]:
+    """Calibration matrices for focal lengths in terms of the longer side."""
+    matrix = np.zeros((len(ratios), 3, 3))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = ratios * max(size)
+    matrix[:, :, 2] = size[0] / 2, size[1] / 2, 1
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -141,8 +180,12 @@ def diagnose(
     }
     angle = triangulation_angle(model)
     error = float(model.compute_mean_reprojection_error())
-    warnings = []
-    if len(left_out) > len(used) / 3:
+    warnings = [
+        f"{len(names)} photographs fit together, but not with the rest: {listed(names)}; if they show something else, "
+        f"capture them alone, otherwise take some that show parts of both"
+        for names in others
+    ]
+    if len(left_out) - sum(map(len, others)) > len(used) / 3:
         warnings.append(
             f"{len(left_out)} photographs have no place: take more between them and the rest, each overlapping the "
             f"next by two thirds"
@@ -173,7 +216,7 @@ def diagnose(
         track_length=float(model.compute_mean_track_length()),
         angle=angle,
         filled=filled(model),
-        coverage=coverage(registered, poses),
+        coverage=None if any(c.is_spherical() for c in model.cameras.values()) else coverage(registered, poses),
         warnings=warnings,
     )
 
@@ -270,8 +313,7 @@ def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
 
 
 def about_rotation(angle: float, matches: Matches) -> list[str]:
-    turned = matches.turned > ROTATION_SHARE * max(len(matches.shared), 1)
-    if angle >= MIN_TRIANGULATION_ANGLE and not turned:
+    if angle >= MIN_TRIANGULATION_ANGLE and not matches.are_turned():
         return []
     return [
         f"the photographs were taken from nearly one place (the outermost views of a point are {angle:.1f} degrees "

@@ -70,7 +70,8 @@ def sketch_of(model: pycolmap.Reconstruction, names: list[str], keep_axes: bool)
     for name in names:
         image = by_name[name]
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().inverse().matrix()
-        half = np.array([camera.width, camera.height]) / (2 * camera.mean_focal_length())
+        focal = camera.width / 2 if camera.is_spherical() else camera.mean_focal_length()
+        half = np.array([camera.width, camera.height]) / (2 * focal)
         directions = np.array([[x * half[0], y * half[1], 1.0] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
         eyes.append(pose[:, 3])
         corners.append(directions @ pose[:, :3].T)

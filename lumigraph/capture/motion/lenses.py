@@ -12,10 +12,11 @@ from ...errors import LumigraphError
 from ...system.library import pycolmap
 from ..photos import Photo
 
-Sharing = Literal["auto", "single", "per-device", "per-image"]
+Sharing = Literal["auto", "single", "per-device", "per-image", "spherical"]
 
 DEFAULT_FOCAL = 1.2  # longer sides of the picture: 43 mm on full frame
 MODEL = "SIMPLE_RADIAL"  # COLMAP's name of the lens that mapping begins with: a focal length and a coefficient
+SPHERE = "EQUIRECTANGULAR"  # COLMAP's name of the lens of a panorama of 360 by 180 degrees, which has no parameters
 MIN_FULL_MODEL_VIEWS = 30  # photographs of one lens that determine two focal lengths and four distortion coefficients
 MIN_SAME_SIZE_SHARE = 0.5  # of the photographs of unknown device; from it on one size means one lens
 
@@ -25,11 +26,17 @@ def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "a
 
     auto: those of one device and size do. Where files name no device, a video's frames do, and photographs if most have
     one size; pictures out of many hands seldom do.
-    Raises LumigraphError where one lens is asked for and sizes differ.
+    Raises LumigraphError where one lens is asked for and sizes differ, and for a panorama that is not 2:1.
     """
-    if sharing == "single" and len({p.size for p in photos}) > 1:
+    if sharing in ("single", "spherical") and len({p.size for p in photos}) > 1:
         raise LumigraphError(
-            "--camera single needs photographs of one size, and these have several; use --camera per-device"
+            f"--camera {sharing} needs photographs of one size, and these have several; use --camera per-device"
+        )
+    width, height = photos[0].size
+    if sharing == "spherical" and width != 2 * height:
+        raise LumigraphError(
+            f"{photos[0].name} is {width}x{height} pixels, and a panorama of 360 by 180 degrees is twice as wide as "
+            f"high; export it as equirectangular, or leave out --camera spherical"
         )
     unknown = Counter(p.size for p in photos if p.device is None)
     shared = {
@@ -39,7 +46,7 @@ def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "a
     }
 
     def lens(photo: Photo) -> tuple:
-        if sharing == "single":
+        if sharing in ("single", "spherical"):
             return ()
         if sharing == "per-image" or (photo.device is None and photo.size not in shared):
             return (photo.name,)
@@ -57,13 +64,13 @@ def prior(group: Sequence[Photo]) -> tuple[float, bool]:
     return (known[len(known) // 2], True) if known else (DEFAULT_FOCAL * max(group[0].size), False)
 
 
-def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
-    """A new database with a camera for each group and an image for each photograph."""
+def write_database(path: Path, groups: Sequence[Sequence[Photo]], model: str) -> None:
+    """A new database with a camera for each group and an image for each photograph. model: COLMAP's name of the lens"""
     with closing(pycolmap.Database.open(path)) as database:
         for group in groups:
             focal, known = prior(group)
-            camera = pycolmap.Camera.create_from_model_name(1, MODEL, focal, *group[0].size)
-            camera.has_prior_focal_length = known
+            camera = pycolmap.Camera.create_from_model_name(1, model, focal, *group[0].size)
+            camera.has_prior_focal_length = known or camera.is_spherical()
             camera_id = database.write_camera(camera)
             rig = pycolmap.Rig()
             rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id))

@@ -26,7 +26,7 @@ from ..photos import Intake, Photo, gather
 from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
-from .diagnosis import MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
+from .diagnosis import ALL_TURNED_SHARE, MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
 from .folder import (
     DRAWING_FILES,
@@ -40,11 +40,13 @@ from .folder import (
     write_model,
 )
 from .georeference import Georeference, georeference, gps_positions, upright
-from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, Sharing, group_by_lens, prior, write_database
+from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens, prior, write_database
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
+from .sphere import flat_views
 from .stages import Stages, key_of
 
 MIN_VIEWS = 3  # photographs of a model
+BLACK = -10.5  # mean log2 of the luminance, below which a photograph is black: 2 of 255
 MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
 FEATURE_BUDGETS = ((80, MAX_FEATURES), (200, 4096))  # most photographs, and features of each; matching is quadratic
@@ -65,7 +67,7 @@ class MotionOptions:
     frames:   how many to take of a video; None: by its length
     mapper:   one photograph after the other, or all at once
     matching: which photographs are compared; auto: neighbours for a video, all up to 80 photographs, else those alike
-    camera:   which photographs share a lens
+    camera:   which photographs share a lens; spherical: they are panoramas of 360 by 180 degrees
     max_size: longer side in pixels to which photographs are reduced when details are looked for
     """
 
@@ -109,10 +111,15 @@ def taken_in(sources: Sequence[Path], work: Path, options: MotionOptions, track:
     """Gather photographs, and list those that are no duplicates. Raises LumigraphError if there are too few."""
     intake = with_safe_names(gather(sources, work, options.frames, track))
     photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
+    if all(photo.brightness < BLACK for photo in photos):
+        raise LumigraphError(
+            f"{intake.source}: {counted(len(intake.photos), 'photograph')}, and every one is black; open one to see "
+            f"whether its file is at fault, and take them again with more light"
+        )
     if len(photos) < MIN_VIEWS:
         raise LumigraphError(
             f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {MIN_VIEWS} are the "
-            f"least{also_unreadable(intake)}; take some from other places"
+            f"least{also_unreadable(intake)}{also_repeated(intake)}; take some from other places"
         )
     return intake, photos
 
@@ -171,13 +178,18 @@ class Reconstruction:
 
     def __post_init__(self) -> None:
         self.stages = Stages(self.work)
-        self.images, self.database = self.folder / "images", self.work / "database.db"
+        self.spherical = self.options.camera == "spherical"
+        self.lens = SPHERE if self.spherical else MODEL
+        place = self.work / "panoramas" if self.spherical else self.folder  # a scene has flat views of panoramas
+        self.images, self.mask_folder, self.database = place / "images", place / MASKS, self.work / "database.db"
         self.models, self.unfolded = self.work / "models", self.work / "unfolded"
         self.completed, self.refined = self.work / "completed", self.work / "refined"
         self.near, self.second = self.work / "near.db", self.work / "second.db"
         self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
+        # A panorama shows four times the angle of a photograph on its longer side.
+        self.max_size = self.options.max_size * (2 if self.spherical else 1)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
         self.matching: Matching = chosen if self.options.matching == "auto" else self.options.matching
 
@@ -188,8 +200,8 @@ class Reconstruction:
         features = key_of(
             pycolmap.__version__,
             [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
-            [[prior(group), MODEL, [p.name for p in group]] for group in self.groups],
-            self.options.max_size,
+            [[prior(group), self.lens, [p.name for p in group]] for group in self.groups],
+            self.max_size,
             self.count_features(),
         )
         places = [p.gps for p in self.photos] if self.matching == "retrieval" else None
@@ -201,7 +213,7 @@ class Reconstruction:
     def run(self) -> dict[str, Any]:
         claim_results(self.folder)
         copy_photographs(self.photos, self.images, self.track)
-        self.masks = copy_masks(self.photos, self.folder / MASKS, self.track)
+        self.masks = copy_masks(self.photos, self.mask_folder, self.track)
         self.find_features(self.keys["features"])
         self.compare(self.keys["matching"])
         self.place(self.keys["mapping"])
@@ -220,7 +232,7 @@ class Reconstruction:
         if not self.stages.was_begun("features", key) or not self.database.is_file():
             remove_database(self.database)
             with replacing(self.database, ours=True) as partial:
-                write_database(partial, self.groups)
+                write_database(partial, self.groups, self.lens)
         with self.stages.working("features", key):
             self.colmap(
                 "Finding details",
@@ -230,7 +242,7 @@ class Reconstruction:
                 names=self.names,
                 images=str(self.images),
                 masks=self.masks and str(self.masks),
-                max_size=self.options.max_size,
+                max_size=self.max_size,
                 features=self.count_features(),
                 contrast=1.0,
             )
@@ -322,7 +334,7 @@ class Reconstruction:
         self.colmap(
             "Finding more details", len(self.names), self.second, stage="features",
             names=sorted(left), images=str(self.images), masks=self.masks and str(self.masks),
-            max_size=max(MAX_SECOND_SIDE, self.options.max_size), features=MAX_FEATURES, contrast=SECOND_CONTRAST,
+            max_size=max(MAX_SECOND_SIDE, self.max_size), features=MAX_FEATURES, contrast=SECOND_CONTRAST,
         )  # fmt: skip
         self.match(self.second, left)
 
@@ -361,7 +373,7 @@ class Reconstruction:
             images=str(self.images),
             models=str(models),
             model=model and str(model),
-            calibrate=not all(prior(group)[1] for group in self.groups),
+            calibrate=not (self.spherical or all(prior(group)[1] for group in self.groups)),
         )
 
     def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str], Path]:
@@ -391,7 +403,7 @@ class Reconstruction:
         found, told, _ = self.choose(matches)
         if self.refined.is_dir():
             found = [pycolmap.Reconstruction(self.refined), *found]
-        if not found or found[0].num_reg_images() < MIN_VIEWS:
+        if not found or found[0].num_reg_images() < MIN_VIEWS or matches.are_turned(ALL_TURNED_SHARE):
             raise LumigraphError(nothing_fits(self.intake, self.photos, matches))
         for name in (RESULT_FILE, "transforms.json"):
             claim_file(self.folder / name, "capture")
@@ -404,7 +416,10 @@ class Reconstruction:
         if place is not None and not known:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
-        write_model(self.folder, model, self.photos, z_up=known)
+        written, photos = model, self.photos
+        if self.spherical:
+            written, photos = flat_views(model, photos, self.folder, self.masks, self.track)
+        write_model(self.folder, written, photos, z_up=known)
         if self.intake.raw:
             write_json(self.folder / RAW_FILE, asdict(Remembered(self.intake.raw)), "capture")
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
@@ -517,6 +532,12 @@ def also_unreadable(intake: Intake) -> str:
     return f" ({name} could not be used: {why}{f'; nor {more} more' if more else ''})"
 
 
+def also_repeated(intake: Intake) -> str:
+    """Addition to the error for too few photographs: how many others repeat one of them."""
+    count, first = len(intake.duplicates), next(iter(intake.duplicates.values()), "")
+    return f" ({count} more {'shows' if count == 1 else 'show'} what {first} shows)" if count else ""
+
+
 def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches) -> str:
     """Why no model came about, in a sentence."""
     poor = sum(matches.features.get(photo.name, 0) < MIN_FEATURES for photo in photos)
@@ -524,8 +545,8 @@ def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches) -> s
         why = f"{poor} of {len(photos)} show too few details, being blank, dark or out of focus"
     elif not matches.shared:
         why = f"no two of {len(photos)} show the same things"
-    elif matches.turned > len(matches.shared) / 2:
-        why = "they were taken from one place, which tells nothing of depth"
+    elif matches.are_turned():
+        why = "they were taken from one place, so that nothing shows parallax, which depth is found by"
     else:
         largest = len(matches.groups()[0])
         why = f"at most {largest} of {len(photos)} show the same things, and not from places that tell depth"

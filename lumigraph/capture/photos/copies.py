@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import importlib
 import os
 import statistics
 from collections.abc import Mapping
@@ -16,7 +14,7 @@ from PIL import Image, ImageOps
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry import evenly
-from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, eight_bits
+from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, eight_bits
 from ..raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .photo import Track
 
@@ -102,15 +100,9 @@ def write(photo: RawPhoto, brightness: float, target: Path) -> None:
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-def learn_formats() -> None:
-    """Let Pillow read HEIC, where the package for it happens to be installed."""
-    with contextlib.suppress(ImportError):
-        importlib.import_module("pillow_heif").register_heif_opener()
-
-
 def is_plain(image: Image.Image, path: Path) -> bool:
     """True if OpenCV and COLMAP read this file correctly: JPEG or PNG, upright, 8 bits of grey or colour."""
-    if image.getexif().get(EXIF_ORIENTATION) not in EXIF_UPRIGHT:
+    if image.getexif().get(EXIF_ORIENTATION) not in EXIF_UPRIGHT or path.suffix.lower() in HEIC_SUFFIXES:
         return False
     if image.format in ("JPEG", "MPO"):
         return image.mode in ("L", "RGB")

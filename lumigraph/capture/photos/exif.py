@@ -57,25 +57,28 @@ def device(tags: dict[int, Any], size: tuple[int, int]) -> str | None:
 
 
 def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
-    """The focal length in pixels of a picture of `size`, supposing that it was reduced since exposure but not cropped.
+    """The focal length in pixels of a picture of `size`, which was reduced or cropped since exposure, but not both.
 
     From the 35 mm equivalent f35, which compares diagonals: f35 / 43.27 mm = f / diagonal. Otherwise from the focal
-    length in mm and the sensor's pixels per length.
+    length in mm and the sensor's pixels per length. None where the size at exposure has another shape and neither
+    side: nobody knows then how much the picture was reduced.
     """
-    width, height = number(tags.get(Tag.ExifImageWidth)), number(tags.get(Tag.ExifImageHeight))
-    if width and height:
-        if abs(math.log(max(width, height) / min(width, height) * min(size) / max(size))) > ASPECT_TOLERANCE:
-            return None
+    # Software that turns a picture may leave the size at exposure as it was, hence the longer and the shorter side.
+    long, short = max(size), min(size)
+    said = [x for x in map(number, (tags.get(Tag.ExifImageWidth), tags.get(Tag.ExifImageHeight))) if x]
+    exposed = (max(said), min(said)) if len(said) == 2 else (said[0], said[0] * short / long) if said else (long, short)
+    cropped = abs(math.log(exposed[0] / exposed[1] * short / long)) > ASPECT_TOLERANCE
+    if cropped and exposed[0] != long and exposed[1] != short:
+        return None
+    scale = 1.0 if cropped else long / exposed[0]
     if equivalent := number(tags.get(Tag.FocalLengthIn35mmFilm)):
-        return equivalent / FULL_FRAME_DIAGONAL * math.hypot(*size)
+        return scale * equivalent / FULL_FRAME_DIAGONAL * math.hypot(*exposed)
     length, density = number(tags.get(Tag.FocalLength)), number(tags.get(Tag.FocalPlaneXResolution))
     if not (length and density):
         return None
-    unit = FOCAL_PLANE_UNITS.get(int(number(tags.get(Tag.FocalPlaneResolutionUnit)) or 2), 25.4)
-    # Its width at exposure. Software that turns a picture may leave these tags as they were, hence the longer side.
-    exposed = max(width or 0, height or 0) or max(size)
-    sensor = exposed / density * unit
-    return length / sensor * max(size) if SENSOR_WIDTHS[0] < sensor < SENSOR_WIDTHS[1] else None
+    per_mm = density / FOCAL_PLANE_UNITS.get(int(number(tags.get(Tag.FocalPlaneResolutionUnit)) or 2), 25.4)
+    plausible = SENSOR_WIDTHS[0] < exposed[0] / per_mm < SENSOR_WIDTHS[1]
+    return scale * length * per_mm if plausible else None
 
 
 def exposure(exif: Image.Exif) -> float | None:

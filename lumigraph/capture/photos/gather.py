@@ -11,22 +11,21 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import explained
 from ...files.names import counted, natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
-from ..pictures import describe, reductions
+from ..pictures import HEIC_SUFFIXES, NO_HEIC, describe, reads_heic, reductions
 from ..raw import Developed, is_raw
-from .copies import copy_upright, develop, is_current, is_plain, learn_formats, name_of_copy
+from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
 from .exif import read_facts
 from .judge import blurred, duplicates, judge
 from .photo import Intake, Photo, Track, untracked
 from .video import extract, is_video
 
-HEIC_SUFFIXES = (".heic", ".heif")
-PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif"}
+PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", *HEIC_SUFFIXES}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
 PROGRAM_FILES = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # in folders of programs
 
@@ -46,7 +45,6 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
     if films:
         return of_video(films[0], source, work, frames, track)
-    learn_formats()
     files = named_files(list_photographs(sources, work))
     raw: dict[str, Developed] = {}
     unreadable: dict[str, str] = {}
@@ -184,6 +182,9 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
     refuses the copy."""
     if path.suffix.lower() not in PHOTOGRAPHS:
         return "its format is not read here; convert it to JPEG"
+    heic = path.suffix.lower() in HEIC_SUFFIXES
+    if not reads_heic() and heic:  # a file of another name may be HEIC too
+        return f"it {NO_HEIC}"
     try:
         with Image.open(path) as image:
             facts = read_facts(image.getexif(), image.size)
@@ -198,9 +199,7 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
     except LumigraphError:
         raise
     except Exception as fault:  # image libraries raise anything for a damaged file
-        if path.suffix.lower() in HEIC_SUFFIXES and isinstance(fault, UnidentifiedImageError):
-            return "HEIC can be read once pillow-heif is installed (pip install pillow-heif)"
-        return describe(fault)
+        return "it is cut short or damaged" if heic and not getattr(fault, "strerror", None) else describe(fault)
     known = facts.device, facts.focal, facts.gps, facts.time
     photo = Photo(name, upright_file, size, *known, found.sharpness, found.brightness, mask_beside(path))
     return Candidate(photo, found.signature, path.stat().st_size)
