@@ -251,10 +251,10 @@ def test_large_photographs_are_reduced_by_themselves(tmp_path):
     poses = Tiny(count=4).poses
     shots = [
         Shot(str(i), p[:3], Pinhole(torch.tensor([[2000.0, 2000.0]]), torch.tensor([[w / 2, 8.0]])), (w, 16), image)
-        for i, (p, w) in enumerate(zip(poses, (2201, 2200, 1101, 1100), strict=True))
+        for i, (p, w) in enumerate(zip(poses, (2201, 1650, 1321, 1320), strict=True))
         for image in [np.zeros((16, w, 3), np.uint8)]
     ]
-    assert assemble(Capture("x", shots)).cameras.size.tolist() == [[734, 5], [1100, 8], [550, 8], [1100, 16]]
+    assert assemble(Capture("x", shots)).cameras.size.tolist() == [[1100, 8], [1100, 11], [1100, 13], [1320, 16]]
 
 
 def test_reduced_folders_are_used_where_they_fit(tiny, tmp_path):
