@@ -60,6 +60,14 @@ def angle_for(camera: Camera, aspect: float) -> float:
     return min(MAX_FIELD_OF_VIEW, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
 
 
+def angle_across(angle: float, aspect: float) -> float:
+    """Vertical angle of view, in radians, of a window that shows an angle across its smaller side, as pages do.
+
+    aspect: width / height
+    """
+    return min(MAX_FIELD_OF_VIEW, 2 * math.atan(math.tan(angle / 2) / min(aspect, 1.0)))
+
+
 @dataclass(frozen=True)
 class ViewRequest:
     """A camera in the browser, and the settings of its client.
@@ -120,17 +128,19 @@ class Flight:
 
     def __init__(self, client: Any):
         self._client, self._number = client, 0
+        self.placed: tuple[np.ndarray, np.ndarray] | None = None  # position and target of the last `place`
 
     def stop(self) -> None:
         self._number += 1
 
     def place(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
         """Set the camera: its pose, the distance to the point it turns about, its vertical angle of view in radians."""
-        camera = self._client.camera
+        camera, target = self._client.camera, pose[:, 3] + distance * pose[:, 2]
+        self.placed = pose[:, 3], target
         with self._client.atomic():
             camera.up_direction = upwards(pose)
             camera.position = pose[:, 3]
-            camera.look_at = pose[:, 3] + distance * pose[:, 2]
+            camera.look_at = target
             camera.fov = angle
 
     def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
