@@ -111,6 +111,7 @@ def run_export(command: list[str], report: Callable[[str], None]) -> str:
     report("Exporting ...")
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with start([sys.executable, "-m", *command], text=True, **pipes) as process:
+        assert process.stdout is not None and process.stderr is not None
         last = ""
         for line in process.stderr:
             if line.strip():
