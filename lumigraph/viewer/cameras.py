@@ -127,11 +127,11 @@ class Flight:
     """A mover of one client's camera. A new flight ends the one before."""
 
     def __init__(self, client: Any):
-        self._client, self._number = client, 0
+        self._client, self._number, self.flying = client, 0, False
         self.placed: tuple[np.ndarray, np.ndarray] | None = None  # position and target of the last `place`
 
     def stop(self) -> None:
-        self._number += 1
+        self._number, self.flying = self._number + 1, False
 
     def place(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
         """Set the camera: its pose, the distance to the point it turns about, its vertical angle of view in radians."""
@@ -145,7 +145,7 @@ class Flight:
 
     def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
         """Move the camera smoothly to what `place` would set. Returns on arrival, or when another flight begins."""
-        self._number += 1
+        self._number, self.flying = self._number + 1, True
         number, camera = self._number, self._client.camera
         begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
         goal = pose[:, 3], pose[:, 3] + distance * pose[:, 2], upwards(pose), angle
@@ -163,6 +163,7 @@ class Flight:
                 camera.fov = fov
             time.sleep(STEP_SECONDS)
         self.place(pose, distance, angle)
+        self.flying = False
 
     def play(
         self,
@@ -176,7 +177,7 @@ class Flight:
 
         shown: called with the number of each frame that is not skipped
         """
-        self._number += 1
+        self._number, self.flying = self._number + 1, True
         number, begin = self._number, time.perf_counter()
         while (now := time.perf_counter() - begin) < seconds:
             if number != self._number:
@@ -186,6 +187,7 @@ class Flight:
             shown(i)
             time.sleep(STEP_SECONDS)
         self.place(poses[-1], distance, angles[-1])
+        self.flying = False
         shown(len(poses) - 1)
         return True
 

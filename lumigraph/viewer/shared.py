@@ -163,11 +163,15 @@ class Shared:
         return self.method.given(**dict(request.settings)) if request.settings else self.method
 
     def subject_crops(self) -> tuple[Sphere, tuple[Vector, Vector]]:
-        """Sphere around the subject and corners of the box, by the sparse points if the photographs have been opened.
+        """Sphere around the subject and corners of the box, by the sparse points if the photographs have been opened,
+        else by the centres of Gaussians.
 
         The box of an object alone is the box of interest; any other holds the sphere.
         """
-        sphere, frame = subject_of(self.subject.around, self.scenery.points), self.subject.frame
+        points = self.scenery.points
+        if points is None and self.is_cloud and not self.turns.training:
+            points = needs(self.method, HasGaussians).gaussians().means.detach().cpu()
+        sphere, frame = subject_of(self.subject.around, points), self.subject.frame
         return sphere, sphere.bounds if frame.is_open else frame.bounds
 
     def connected(self, client: Any) -> bool:

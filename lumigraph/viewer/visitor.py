@@ -114,7 +114,7 @@ class Visitor:
         A camera that was placed beyond them, as at a photograph, may stay as far beyond.
         """
         opening, camera = self._shared.subject.opening, self._client.camera
-        if not (self.controls.stays and self._here):
+        if self.flight.flying or not (self.controls.stays and self._here):
             return
         position, target = opening.limited(camera.position, camera.look_at)
         placed = self.flight.placed or (position, target)
