@@ -126,7 +126,7 @@ def test_a_page_and_the_viewer_begin_and_end_alike(learnt, tmp_path):
         first = viewer._server.initial_camera
         assert np.allclose(first.position, opening.position) and np.allclose(first.look_at, opening.target)
         assert first.fov == pytest.approx(math.radians(opening.angle))
-        client = Client(viewer.address.url)
+        client = Client(viewer.address.url, opening.position)
         client.picture()
         (visitor,) = viewer._everyone()
 
@@ -168,7 +168,7 @@ def test_a_slow_browser_has_a_picture_from_the_beginning(tmp_path):
     about = subject(tiny.scene(), tmp_path)
     with Viewer(method.eval(), about, choose_address(port=0)) as viewer:
         client = Client(viewer.address.url, about.opening.position)
-        still = client.picture(width=120)
+        still = client.picture(90, width=120)  # the renderer may have to be compiled
         (visitor,) = viewer._everyone()
         camera = visitor.request().camera((120, 90))
         assert np.abs(still / 255 - method.render(camera).rgb.clamp(0, 1).numpy()).mean() < 0.02

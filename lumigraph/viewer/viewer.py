@@ -167,6 +167,8 @@ class Viewer:
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         prepare_window(server.gui, subject.title)
+        # No environment map: nothing here is lit, and viser fades the canvas in over frames once it has loaded
+        server.scene.configure_environment_map(None)
         opening = subject.opening
         server.initial_camera.position = np.array(opening.position)
         server.initial_camera.look_at = np.array(opening.target)

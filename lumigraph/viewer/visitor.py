@@ -114,7 +114,7 @@ class Visitor:
         A camera that was placed beyond them, as at a photograph, may stay as far beyond.
         """
         opening, camera = self._shared.subject.opening, self._client.camera
-        if self.flight.flying or not (self.controls.stays and self._here):
+        if self.flight.flying or not (self._arrived and self.controls.stays and self._here):
             return
         position, target = opening.limited(camera.position, camera.look_at)
         placed = self.flight.placed or (position, target)
@@ -146,6 +146,7 @@ class Visitor:
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
+            self._arrived = self._arrived or self._at_opening(pose_of(camera.wxyz, camera.position))
             self.controls.show_angle(camera.fov)
             self.painter.request()
             if self._at_rest is not None:
@@ -197,11 +198,15 @@ class Visitor:
 
         A slow browser draws its first splats after many seconds. Until then it shows our rendering behind them.
         """
-        here = np.abs(np.array(request.pose) - self._shared.subject.opening.pose).max() < PLACE_TOLERANCE
+        here = self._at_opening(request.pose)
         changed = request.part or bool(request.settings) or self._shared.turns.training
         self._left = self._left or changed or (self._arrived and not here)
-        self._arrived = self._arrived or bool(here)
-        return bool(here) and not self._left
+        self._arrived = self._arrived or here
+        return here and not self._left
+
+    def _at_opening(self, pose: tuple[tuple[float, ...], ...]) -> bool:
+        """True for the pose that every client begins with. A browser may report another one before it has that."""
+        return bool(np.abs(np.array(pose) - self._shared.subject.opening.pose).max() < PLACE_TOLERANCE)
 
     def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
         """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon."""
