@@ -74,7 +74,8 @@ class Visitor:
             self.export = ExportPanel(client, shared.tabs["Export"], *about)
         self._seen: tuple[Any, ...] = ()
         self._at_rest: asyncio.TimerHandle | None = None  # until the camera counts as resting
-        self._arrived = self._left = self._noted = False  # at the opening; away from it; what limits do
+        self._arrived = self._at_opening(pose_of(client.camera.wxyz, client.camera.position))  # at the opening, once
+        self._left = self._noted = False  # the opening; and what limits do
         client.camera.on_update(self._moved)
         if client.camera.aspect < 1:
             client.camera.fov = self._first_angle
