@@ -72,7 +72,7 @@ def dragged(viewer: Viewer, chromium: Any, size: tuple[int, int], output: Path) 
     page.goto(viewer.address.url)
     visitor = wait(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
     things = around_focus(viewer.method, viewer.subject)
-    result: dict[str, Any] = {"distance": round(viewer.subject.distance(viewer.subject.first), 3)}
+    result: dict[str, Any] = {"distance": round(viewer.subject.opening.distance, 3)}
 
     def note(moment: str) -> None:
         wait(visitor.painter.settled.is_set)

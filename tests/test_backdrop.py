@@ -9,7 +9,8 @@ from solids import Seen, around, ball
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.scene import Frame
-from lumigraph.export.page import backdrop, opening_of_scene
+from lumigraph.export.page import backdrop
+from lumigraph.paths.opening import opening_of_scene
 
 SKY, GROUND, FLOOR = (0.5, 0.7, 0.9), (0.3, 0.5, 0.1), -0.5
 

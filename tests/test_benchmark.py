@@ -198,7 +198,7 @@ def test_published_figures_are_of_methods_and_scenes():
 def test_a_process_says_why_it_failed(tmp_path):
     log = tmp_path / "a.log"
     assert launch(["eval", str(tmp_path / "nowhere")], log) == 2
-    assert reason(log, 2).startswith(str(tmp_path / "nowhere")) and "is not a run" in reason(log, 2)
+    assert reason(log, 2).startswith(str(tmp_path / "nowhere")) and "does not exist" in reason(log, 2)
     assert "memory" in reason(log, 137)
 
 

@@ -377,7 +377,7 @@ def test_a_run_that_nobody_is_like(runs, dense, tmp_path, capsys):
     [
         ({"bounds": [[0, 0, 0], [0, 1, 1]]}, "nothing between"),
         ({"agreement": 2}, "should be from 0 to 1"),
-        ({"source": "gone"}, "gone is not a run"),
+        ({"source": "gone"}, "gone does not exist"),
         ({"sauce": 1}, "nothing is known of 'sauce'"),
     ],
 )

@@ -39,7 +39,7 @@ from lumigraph.explain.ray import along_ray
 from lumigraph.export import points as export_points
 from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
-from lumigraph.export.page import opening_of_scene, splats_page, views_page
+from lumigraph.export.page import splats_page, views_page
 from lumigraph.method import Method, RayMethod
 from lumigraph.method.capabilities import (
     CanCompress,
@@ -53,6 +53,7 @@ from lumigraph.method.capabilities import (
 )
 from lumigraph.metrics import psnr
 from lumigraph.paths import camera_path
+from lumigraph.paths.opening import opening_of_scene
 from lumigraph.run import Run, build
 from lumigraph.run.checkpoint import Checkpoints
 from lumigraph.training import fit

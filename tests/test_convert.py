@@ -301,7 +301,7 @@ REFUSED = {
     "a learner of shapes": (["RAYS", "distance-grid", "--output", "OUT"], "distance-grid learns from shapes"),
     "no method": (["RAYS", "plenoxel", "--output", "OUT"], "did you mean plenoxels?"),
     "no output": (["RAYS", "plenoxels"], "Name a run, a method and a new folder"),
-    "no run": (["/nowhere", "plenoxels", "--output", "OUT"], "is not a run"),
+    "no run": (["/nowhere", "plenoxels", "--output", "OUT"], "/nowhere does not exist"),
     "its own source": (["RAYS", "plenoxels", "--output", "RAYS"], "already holds a run"),
     "a composition": (["TWO", "plenoxels", "--output", "OUT"], "convert its parts"),
     "a moving scene": (["MOVING", "plenoxels", "--output", "OUT"], "of a scene that moves"),

@@ -74,7 +74,7 @@ def test_what_does_not_open_is_named(folder):
     (folder / "letter.txt").write_text("Madam")
     with pytest.raises(LumigraphError, match=r"letter\.txt is none of the files that open"):
         open_any(folder / "letter.txt")
-    with pytest.raises(LumigraphError, match="is not a run"):
+    with pytest.raises(LumigraphError, match="nowhere does not exist"):
         open_any(folder / "nowhere")
     with pytest.raises(LumigraphError, match=r"gone\.json does not exist"):
         open_any(folder / "gone.json")

@@ -154,7 +154,7 @@ def test_a_damaged_optimizer_stops_a_resume(run):
 def test_a_folder_that_is_no_run(tmp_path):
     with pytest.raises(LumigraphError, match="is not a run"):
         Run(tmp_path)
-    with pytest.raises(LumigraphError, match="is not a run"):
+    with pytest.raises(LumigraphError, match="nowhere does not exist"):
         Run(tmp_path / "nowhere")
 
 

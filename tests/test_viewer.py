@@ -22,6 +22,7 @@ from budgets import budget
 from torch import nn
 from viewer_client import Client
 
+import lumigraph.methods
 from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
@@ -30,6 +31,7 @@ from lumigraph.figures import EMPTY_COLOUR, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.gaussians.cloud import cleaned
 from lumigraph.method import Method, RayMethod
+from lumigraph.paths.opening import opening_of_scene
 from lumigraph.run import Run
 from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
@@ -54,6 +56,13 @@ def learnt(ball_run):
 def subject(scene, folder, **changes) -> Subject:
     cameras = {name: scene.cameras[index] for name, index in scene.splits.items()}
     return replace(Subject("ball", scene.frame, cameras, folder / "paths", "lumigraph render RUN"), **changes)
+
+
+def until(happens, seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def request_of(camera, canvas) -> ViewRequest:
@@ -102,6 +111,76 @@ def test_up_keeps_the_roll():
         up = upwards(np.concatenate([rotation, np.zeros((3, 1))], 1))
         right = np.cross(rotation[:, 2], up)
         assert np.allclose(right / np.linalg.norm(right), rotation[:, 0], atol=1e-6)
+
+
+# The opening and its limits
+
+
+def test_a_page_and_the_viewer_begin_and_end_alike(learnt, tmp_path):
+    """A client that goes too far comes back, is not held where it does not want to be, and finds home."""
+    scene, method = learnt
+    about = subject(scene, tmp_path)
+    opening = about.opening
+    assert opening == opening_of_scene("ball", about.cameras["train"], scene.frame)
+    with Viewer(method, about, choose_address(port=0)) as viewer:
+        first = viewer._server.initial_camera
+        assert np.allclose(first.position, opening.position) and np.allclose(first.look_at, opening.target)
+        assert first.fov == pytest.approx(math.radians(opening.angle))
+        client = Client(viewer.address.url, opening.position)
+        client.picture()
+        (visitor,) = viewer._everyone()
+
+        def away() -> float:
+            return float(np.linalg.norm(np.array(visitor.request().pose)[:, 3]))
+
+        client.look_from((20.0, 0.0, 0.5))
+        until(lambda: away() == pytest.approx(opening.farthest, rel=1e-3))
+        client.turn(visitor.controls._stays, False)
+        client.look_from((21.0, 0.0, 0.5))
+        time.sleep(0.5)
+        assert away() > 20
+        visitor._go_home()
+        assert np.allclose(np.array(visitor.request().pose), opening.pose, atol=1e-5)
+        client.close()
+
+
+def test_limits_of_an_opening(learnt, tmp_path):
+    opening = replace(subject(learnt[0], tmp_path).opening, floor=-0.5)
+    target = np.array(opening.target)
+    for position in (opening.position, 0.5 * np.array(opening.position)):  # as it is within them
+        assert np.allclose(opening.limited(np.array(position), target), (position, target))
+    for sideways in (0.0, 30.0):
+        goal = target + np.array([0.0, sideways, 0.0])
+        position, ahead = opening.limited(goal + np.array([0.1, 0.2, -9.0]), goal)
+        offset = position - ahead
+        assert ahead[1] <= max(1.0, target[1]) + 1e-9 and position[2] >= -0.5 - 1e-9
+        assert np.linalg.norm(offset) == pytest.approx(min(opening.farthest, math.hypot(0.1, 0.2, 9.0)))
+        assert math.degrees(math.acos(offset[2] / np.linalg.norm(offset))) <= opening.lowest + 1e-6
+    outward = replace(opening, inward=False)
+    assert np.array_equal(outward.limited(9 * target + 9, target)[0], 9 * target + 9)
+
+
+def test_a_slow_browser_has_a_picture_from_the_beginning(tmp_path):
+    """Behind splats there is our own rendering until the client moves, and a colour from then on."""
+    kind = lumigraph.methods.find("gaussian-splatting")
+    method = kind(tiny.scene().frame, kind.Config(sh_degree=0))
+    method.cloud.replace(some_cloud(200, degree=0))
+    about = subject(tiny.scene(), tmp_path)
+    with Viewer(method.eval(), about, choose_address(port=0)) as viewer:
+        client = Client(viewer.address.url, about.opening.position)
+        still = client.picture(90, width=120)  # the renderer may have to be compiled
+        (visitor,) = viewer._everyone()
+        camera = visitor.request().camera((120, 90))
+        assert np.abs(still / 255 - method.render(camera).rgb.clamp(0, 1).numpy()).mean() < 0.02
+        until(visitor.painter.settled.is_set)
+        assert visitor.controls.status.content == "200 Gaussians, drawn by the browser"
+        client.look_from((0.5, 3.0, 0.5))
+        assert client.picture(width=2).min() == 255
+        client.look_from(about.opening.position)
+        until(lambda: np.allclose(visitor.request().pose, about.opening.pose, atol=1e-3))
+        until(visitor.painter.settled.is_set)
+        assert visitor._flat == WHITE
+        client.close()
 
 
 # Modes
@@ -675,7 +754,7 @@ def test_view_and_train_view(ball_folder, tmp_path, capsys):
 
 def test_view_says_what_is_wrong(tmp_path, capsys):
     assert main(["view", str(tmp_path / "nothing")]) == 2
-    assert "is not a run" in capsys.readouterr().err
+    assert "nothing does not exist" in capsys.readouterr().err
     folder = tmp_path / "run"
     run = tiny.new_run(folder)
     fit(tiny.method(), tiny.scene(), run, steps=1, show=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 import tiny
 import torch
 from budgets import budget
+from test_viewer import until
 from viewer_client import Client
 
 from lumigraph import methods
@@ -50,13 +50,6 @@ class Swollen(Method):
 
     def render(self, camera):
         return splatting.render(self.gaussians(), camera, self.frame.background)
-
-
-def until(happens, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not happens():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_a_client_sees_what_it_turns_and_nobody_else_does(tmp_path):

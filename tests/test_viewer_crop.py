@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,25 +9,20 @@ import pytest
 import tiny
 import torch
 from budgets import budget
-from test_viewer import some_cloud, subject
+from test_viewer import some_cloud, subject, until
 from viewer_client import Client
 
 import lumigraph.methods
 from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians.cloud import ISOLATION, MAX_SCALE, cleaned
+from lumigraph.paths import Surroundings
+from lumigraph.paths.opening import subject_of
 from lumigraph.viewer import Viewer, choose_address
-from lumigraph.viewer.crop_panel import BOX, SPHERE, circles, edges
+from lumigraph.viewer.crop_panel import ALL, BOX, CROPPED_MAX_SCALE, SPHERE, circles, edges
 
 # A client may leave at any moment; viser warns of what was still on its way.
 pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
-
-
-def until(happens, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not happens():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -63,13 +57,14 @@ def test_a_cloud_is_cropped_cleaned_and_saved(cloud_viewer):
     client.turn(panel._radius, 0.5)
     client.turn(panel._shape, SPHERE)
     until(lambda: visitor.request().crop == Sphere((0.0, 0.0, 0.0), 0.5))
-    inside = cleaned(cloud, visitor.request().crop)
+    assert visitor.request().floaters == (("max_scale", CROPPED_MAX_SCALE),)  # what sticks out of a crop is gone
+    inside = cleaned(cloud, visitor.request().crop, max_scale=CROPPED_MAX_SCALE)
     assert 10 < len(inside) < 190
     until(lambda: len(visitor._splats.buffer) == len(inside))
 
     client.turn(panel._floaters["min_opacity"], 0.5)
     client.turn(panel._clean, True)
-    floaters = {"min_opacity": 0.5, "max_scale": MAX_SCALE, "isolation": ISOLATION}
+    floaters = {"min_opacity": 0.5, "max_scale": CROPPED_MAX_SCALE, "isolation": ISOLATION}
     until(lambda: dict(visitor.request().floaters) == floaters)
     solid = cleaned(cloud, visitor.request().crop, **floaters)
     assert 0 < len(solid) < len(inside)
@@ -86,6 +81,8 @@ def test_a_cloud_is_cropped_cleaned_and_saved(cloud_viewer):
     panel._name.value = "taken"
     panel._save()  # says so, and goes on
     assert len(saved) == 1
+    client.turn(panel._shape, ALL)
+    until(lambda: dict(visitor.request().floaters) == floaters | {"max_scale": MAX_SCALE})
 
 
 def test_a_box_is_dragged_by_its_corners(cloud_viewer):
@@ -99,7 +96,8 @@ def test_a_box_is_dragged_by_its_corners(cloud_viewer):
     until(lambda: visitor.request().crop == CropBox(lower, (0.25, 0.0, 0.5)))
     assert panel._upper.value == (0.25, 0.0, 0.5)
     assert np.allclose(panel._nodes["outline"].points.reshape(-1, 3).max(0), (0.25, 0.0, 0.5))
-    until(lambda: len(visitor._splats.buffer) == len(cleaned(cloud, visitor.request().crop)))
+    shown = dict(visitor.request().floaters)
+    until(lambda: len(visitor._splats.buffer) == len(cleaned(cloud, visitor.request().crop, **shown)))
     client.turn(panel._upper, (0.3, 0.3, 0.3))  # by its number: the handle follows
     until(lambda: np.allclose(panel._nodes["upper"].position, 0.3))
     client.turn(panel._shape, SPHERE)
@@ -113,6 +111,30 @@ def test_outlines_lie_on_what_they_outline():
     box = CropBox((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     lengths = np.linalg.norm(np.diff(edges(box), axis=1)[:, 0], axis=-1)
     assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
+
+
+def test_a_crop_begins_at_the_subject(tmp_path):
+    """Sparse points on a small ball beside the middle of the scene, and more of them far behind it."""
+    scene = tiny.scene()
+    frame = replace(scene.frame, reach=4.0, has_alpha=False)
+    spread = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    ball = torch.tensor([0.1, 0.0, 0.05]) + 0.2 * torch.nn.functional.normalize(spread, dim=-1)
+    points = torch.cat([ball, 3 + spread[:200]])
+    sphere = subject_of(Surroundings(scene.cameras, frame), points)
+    assert sphere.middle == pytest.approx((0.1, 0.0, 0.05), abs=0.03) and 0.19 < sphere.radius < 0.26
+    assert sphere.radius < subject_of(Surroundings(scene.cameras, frame)).radius < tiny.DISTANCE * 12 / tiny.FOCAL
+
+    opened = replace(scene, frame=frame, points=points)
+    about = subject(opened, tmp_path, open_scene=lambda: opened)
+    with Viewer(tiny.method(frame).eval(), about, choose_address(port=0)) as viewer:
+        client = Client(viewer.address.url)
+        client.picture(width=120)
+        (visitor,) = viewer._everyone()
+        until(lambda: visitor.crop._radius.value == sphere.radius)  # once the photographs have been opened
+        client.turn(visitor.crop._radius, 0.5)
+        client.turn(visitor.crop._fit, True)
+        until(lambda: visitor.request().crop == sphere)
+        client.close()
 
 
 def test_other_methods_crop_and_save_nothing(tmp_path):

@@ -19,10 +19,11 @@ from windows import SIZE, psnr, some_camera
 from lumigraph.camera import Camera
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
-from lumigraph.export.page import WEB, Opening, mesh_page, opening_of_scene, splats_page, views, views_page
+from lumigraph.export.page import WEB, mesh_page, splats_page, views, views_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.splatting import render
 from lumigraph.paths import Surroundings
+from lumigraph.paths.opening import Opening, opening_of_scene
 from lumigraph.run import State
 
 pytestmark = budget("exports", 15)

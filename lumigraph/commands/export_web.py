@@ -61,7 +61,8 @@ class ExportWeb:
     device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ..export.page import backdrop, opening_of_scene
+        from ..export.page import backdrop
+        from ..paths.opening import opening_of_scene
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,9 +37,14 @@ class ViewCommand:
 
     def run(self) -> int:
         from ..viewer import Viewer, choose_address
+        from .export_menu import export_menu
 
         opened, method, cameras = open_method(self.source, self.device, self.settings)
-        subject = subject_of(opened, cameras, page=page_of(opened, method, cameras))
+        subject = replace(
+            subject_of(opened, cameras, page=page_of(opened, method, cameras)),
+            behind=behind_of(opened, method, cameras),
+            exporter=export_menu(opened, method, self.settings, self.device),
+        )
         address = choose_address(self.host, self.port)
         with until_interrupted(), Viewer(method, subject, address) as viewer:
             show_address(viewer)
@@ -59,11 +64,21 @@ def page_of(opened: Any, method: Any, cameras: Any) -> Any:
         return None
 
     def page() -> bytes:
-        from ..export.page import opening_of_scene, volume_bytes
+        from ..export.page import volume_bytes
+        from ..paths.opening import opening_of_scene
 
         return volume_bytes(volume, opening_of_scene(opened.title, cameras["train"], opened.frame))
 
     return page
+
+
+def behind_of(opened: Any, method: Any, cameras: Any) -> Any:
+    """Backdrop of a cloud, as on its exported page; `None` without photographs, and for methods that are slow to render
+    on a plain machine."""
+    from ..export.page import backdrop
+    from ..method.capabilities import HasGaussians, can
+
+    return backdrop(method, cameras["train"]) if opened.photographed and can(method, HasGaussians) else None
 
 
 def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: Any = None) -> Any:
@@ -115,13 +130,11 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
     if not wanted:
         yield None
         return
-    import dataclasses
-
     from ..viewer import Viewer, choose_address
 
     subject = subject_of(run, finished=False)
     if run.photographed:
-        subject = dataclasses.replace(subject, open_scene=lambda: data)
+        subject = replace(subject, open_scene=lambda: data)
     with Viewer(method, subject, choose_address(host, port), training=True) as viewer:
         show_address(viewer)
         yield viewer

@@ -13,7 +13,7 @@ import gzip
 import io
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from torch import Tensor
 from .. import __version__
 from ..camera import Camera
 from ..datasets.mesh import Mesh
-from ..datasets.scene import Frame, Vector
+from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..exchange import spz
 from ..exchange.baked import Browsable
@@ -36,7 +36,8 @@ from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..geometry import evenly
 from ..method import Method
-from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
+from ..paths import Surroundings, camera_path, film_size
+from ..paths.opening import Backdrop, Opening
 from ..system.progress import counting, track
 
 BACKDROP_VIEWS, BACKDROP_SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
@@ -45,16 +46,6 @@ HORIZON_BAND = math.sin(math.radians(10))  # of the horizon, above and below
 MIN_SEEN_SHARE = 0.02  # share of pixels from which on something counts as seen
 HAZE_SHARE, SKY_SHARE = 0.5, 0.5  # of the way to white, where no photograph shows a horizon or a sky
 MAX_SHARE_BELOW_FLOOR = 0.02  # share of the surfaces in the box of interest that may lie below the floor
-
-
-@dataclass(frozen=True)
-class Backdrop:
-    """sRGB-encoded colours overhead, at the horizon and underfoot; and the height of the floor, in scene units."""
-
-    overhead: Vector
-    horizon: Vector
-    underfoot: Vector
-    floor: float
 
 
 @torch.no_grad()
@@ -108,9 +99,6 @@ def floor(places: Float[Tensor, "point 3"], bounds: Float[Tensor, "2 3"]) -> flo
 
 
 WEB = Path(__file__).parent / "web"
-MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # limits of zooming, times the first distance to the target
-MAX_OPEN_DISTANCE = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
-DEGREES_BELOW, DEGREES_BELOW_OPEN = 20.0, 5.0  # limit of the camera below the lowest photograph; for open scenes
 ARC_SHARE = 0.8  # of the arc that photographs cover is shown
 HARMONICS_STEPS = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 MAX_CROP_SCALE = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
@@ -119,74 +107,6 @@ MAX_PAGE_BYTES = 100e6  # bytes of a page with a volume
 # How to move, with a mouse and with fingers.
 ORBIT_HELP = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
 LOOK_HELP = "Drag to look around", "Drag to look around"
-
-
-@dataclass(frozen=True)
-class Opening:
-    """Camera, limits and colours with which a page begins: lengths in scene units, angles in degrees.
-
-    background: colour behind everything, sRGB in [0, 1]
-    position, target: of the camera, and the point that it looks at and turns about
-    angle:      of view, across the window's smaller side
-    near, far:  distances along the optical axis between which the scene is drawn
-    nearest, farthest: distances from the target that zooming keeps to
-    lowest:     largest angle between up and the direction from the target to the camera
-    inward:     whether the camera goes around the target; otherwise it turns on the spot
-    within:     two corners of the box that the target stays in, where it is moved sideways
-    floor:      height that the camera stays above; None for any
-    sky:        colours overhead and underfoot, with the background at the horizon; None for the background everywhere
-    """
-
-    title: str
-    background: Vector
-    position: tuple[float, ...]
-    target: tuple[float, ...]
-    angle: float
-    near: float
-    far: float
-    nearest: float
-    farthest: float
-    lowest: float
-    inward: bool
-    within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    floor: float | None = None
-    sky: tuple[Vector, Vector] | None = None
-
-
-def opening_of_scene(
-    title: str, cameras: Camera, frame: Frame, background: Vector | None = None, behind: Backdrop | None = None
-) -> Opening:
-    """An opening from a typical position of the photographs, in their viewing direction.
-
-    cameras:    of the photographs
-    background: instead of the frame's
-    behind:     of a scene under the open sky; its colours count where no background is given
-    """
-    around = Surroundings(cameras, frame)
-    pose = camera_path("orbit", cameras, frame, 1, (2, 2)).pose[0].double()
-    position, forward = pose[:, 3], pose[:, 2]
-    target = pivot(around, position, forward)
-    distance = float((position - target).norm())
-    elevation = math.degrees(float(around.polar[:, 1].min()))
-    alone = not frame.is_open
-    low, high = (torch.tensor(corner, dtype=torch.double) for corner in frame.bounds)
-    coloured = behind if background is None else None
-    return Opening(
-        title,
-        background or (coloured.horizon if coloured else frame.background),
-        tuple(position.tolist()),
-        tuple(target.tolist()),
-        math.degrees(angle_of_view(cameras)),
-        frame.near,
-        100 * frame.reach,
-        MIN_DISTANCE * distance,
-        (MAX_DISTANCE if alone else MAX_OPEN_DISTANCE) * distance,
-        min(90 - elevation + (DEGREES_BELOW if alone else DEGREES_BELOW_OPEN), 175.0) if around.inward else 175.0,
-        around.inward,
-        (tuple(torch.minimum(low, target).tolist()), tuple(torch.maximum(high, target).tolist())),
-        behind.floor if behind else None,
-        (coloured.overhead, coloured.underfoot) if coloured else None,
-    )
 
 
 def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:

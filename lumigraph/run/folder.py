@@ -59,6 +59,10 @@ class Run(Trained):
                     f"{self.folder} is a run in blocks, and this is for one of them at a time: name "
                     f"{self.folder / 'blocks' / '0'}, or another block"
                 )
+            if not files.exists(self.folder):
+                raise LumigraphError(
+                    f"{self.folder} does not exist; check the path, or make a run by `lumigraph train`"
+                )
             raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
         self.settings = Settings.read(self._config)
         self.frame = self.settings.frame

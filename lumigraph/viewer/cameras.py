@@ -60,6 +60,14 @@ def angle_for(camera: Camera, aspect: float) -> float:
     return min(MAX_FIELD_OF_VIEW, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
 
 
+def angle_across(angle: float, aspect: float) -> float:
+    """Vertical angle of view, in radians, of a window that shows an angle across its smaller side, as pages do.
+
+    aspect: width / height
+    """
+    return min(MAX_FIELD_OF_VIEW, 2 * math.atan(math.tan(angle / 2) / min(aspect, 1.0)))
+
+
 @dataclass(frozen=True)
 class ViewRequest:
     """A camera in the browser, and the settings of its client.
@@ -119,23 +127,25 @@ class Flight:
     """A mover of one client's camera. A new flight ends the one before."""
 
     def __init__(self, client: Any):
-        self._client, self._number = client, 0
+        self._client, self._number, self.flying = client, 0, False
+        self.placed: tuple[np.ndarray, np.ndarray] | None = None  # position and target of the last `place`
 
     def stop(self) -> None:
-        self._number += 1
+        self._number, self.flying = self._number + 1, False
 
     def place(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
         """Set the camera: its pose, the distance to the point it turns about, its vertical angle of view in radians."""
-        camera = self._client.camera
+        camera, target = self._client.camera, pose[:, 3] + distance * pose[:, 2]
+        self.placed = pose[:, 3], target
         with self._client.atomic():
             camera.up_direction = upwards(pose)
             camera.position = pose[:, 3]
-            camera.look_at = pose[:, 3] + distance * pose[:, 2]
+            camera.look_at = target
             camera.fov = angle
 
     def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
         """Move the camera smoothly to what `place` would set. Returns on arrival, or when another flight begins."""
-        self._number += 1
+        self._number, self.flying = self._number + 1, True
         number, camera = self._number, self._client.camera
         begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
         goal = pose[:, 3], pose[:, 3] + distance * pose[:, 2], upwards(pose), angle
@@ -153,6 +163,7 @@ class Flight:
                 camera.fov = fov
             time.sleep(STEP_SECONDS)
         self.place(pose, distance, angle)
+        self.flying = False
 
     def play(
         self,
@@ -166,7 +177,7 @@ class Flight:
 
         shown: called with the number of each frame that is not skipped
         """
-        self._number += 1
+        self._number, self.flying = self._number + 1, True
         number, begin = self._number, time.perf_counter()
         while (now := time.perf_counter() - begin) < seconds:
             if number != self._number:
@@ -176,6 +187,7 @@ class Flight:
             shown(i)
             time.sleep(STEP_SECONDS)
         self.place(poses[-1], distance, angles[-1])
+        self.flying = False
         shown(len(poses) - 1)
         return True
 

@@ -21,13 +21,18 @@ MIN_DEGREES, MAX_DEGREES = 10.0, 120.0  # degrees
 
 
 class Controls:
-    """The contents of the tab `View` of a client of viser. changed: called when anything that is drawn changes."""
+    """The contents of the tab `View` of a client of viser.
 
-    def __init__(self, client: Any, shared: Shared, changed: Callable[[], None]):
-        self._client, self._frame, self._changed = client, shared.subject.frame, changed
+    changed: called when anything that is drawn changes
+    home:    called to fly to where the view began
+    """
+
+    def __init__(self, client: Any, shared: Shared, changed: Callable[[], None], home: Callable[[], None]):
+        self._client, self._own, self._changed = client, shared.subject.opening.background, changed
         self._modes = {mode.capitalize(): mode for mode in MODES}  # by how the dropdown names them
         gui = client.gui
-        with shared.tabs[0]:
+        with shared.tabs["View"]:
+            gui.add_button("Home", hint="Fly to where the view began").on_click(lambda _: home())
             self._mode = gui.add_dropdown("Show", list(self._modes))
             hint = "Drawn by our own renderer and sent, not by the browser"
             self._exact = gui.add_checkbox("Draw exactly", False, visible=shared.is_cloud, hint=hint)
@@ -35,9 +40,11 @@ class Controls:
             self._angle = gui.add_slider("Angle of view", MIN_DEGREES, MAX_DEGREES, 1.0, 50.0, hint=hint)
             hint = "Pixels along the longer side, once the camera rests"
             self._sharpest = gui.add_slider("Resolution", 240, 2048, 16, DEFAULT_RESOLUTION, hint=hint)
-            self._background = gui.add_rgb("Background", to_bytes(self._frame.background))
+            self._background = gui.add_rgb("Background", to_bytes(self._own))
             self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
             self._points = gui.add_checkbox("Sparse points", False, visible=False)
+            hint = "Fly back where the camera rests beyond the limits of the exported page"
+            self._stays = gui.add_checkbox("Stay near the scene", True, hint=hint)
             if shared.subject.page is not None:
                 gui.add_html(CLIENT_SIDE_LINK)
             self.status = gui.add_markdown("")
@@ -65,8 +72,13 @@ class Controls:
     def background(self) -> Vector:
         """The background colour: the scene's own, to the last bit, until another is chosen."""
         chosen = tuple(self._background.value)
-        own = self._frame.background
+        own = self._own
         return own if chosen == to_bytes(own) else (chosen[0] / 255, chosen[1] / 255, chosen[2] / 255)
+
+    @property
+    def stays(self) -> bool:
+        """True if the camera returns from beyond its limits."""
+        return bool(self._stays.value)
 
     @property
     def surrounded(self) -> bool:
@@ -120,7 +132,7 @@ class MethodControls:
         self._handles: dict[str, Any] = {}
         if not controls:
             return
-        with shared.tabs[0], client.gui.add_folder("Controls"):
+        with shared.tabs["View"], client.gui.add_folder("Controls"):
             for control in controls:
                 handle = self._handles[control.name] = add(client.gui, control, self._begun[control.name])
                 handle.on_update(lambda _: changed())

@@ -19,12 +19,13 @@ from .shared import NAME, NAME_RULE, Keep, Shared
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
-HANDLE = 0.25  # length of a handle's arrows, in longest sides of the bounds
+HANDLE = 0.25  # length of a handle's arrows, in radii of the subject
 CIRCLE_SEGMENTS = 64  # pieces of a drawn circle
+CROPPED_MAX_SCALE = 0.25  # extents of the crop; larger Gaussians stick out of it
 NUMBER_STEP = 0.001  # scene units: step of the numbers
 FLOATERS = {  # arguments of `cleaned`: label, range with step and default, hint
     "min_opacity": ("Least opacity", (0.0, 0.5, 0.005, MIN_OPACITY), "Fainter Gaussians are left out"),
-    "max_scale": ("Largest size", (0.01, 1.0, 0.01, MAX_SCALE), "In extents of the cloud"),
+    "max_scale": ("Largest size", (0.01, 1.0, 0.01, MAX_SCALE), "In extents of what is shown; also in a box or sphere"),
     "isolation": (
         "Isolation",
         (0.0, 8.0, 0.1, ISOLATION),
@@ -49,18 +50,19 @@ class CropPanel:
         keep: Keep | None,
         notify: Callable[[str, str], None],
     ):
-        self._client, self._changed, self._keep, self._notify = client, changed, keep, notify
+        self._client, self._shared, self._changed, self._keep, self._notify = client, shared, changed, keep, notify
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
-        (lower, upper), gui = shared.subject.frame.bounds, client.gui
-        middle = cast(Vector, tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True)))
-        self._size = longest = max(b - a for a, b in zip(lower, upper, strict=True))
-        with shared.tabs[1]:
+        gui, (sphere, (lower, upper)) = client.gui, shared.subject_crops()
+        self._size, self._cropped = sphere.radius, False
+        with shared.tabs["Crop"]:
             self._shape = gui.add_dropdown("Show", (ALL, BOX, SPHERE))
             self._lower = gui.add_vector3("Lower", lower, step=NUMBER_STEP, visible=False)
             self._upper = gui.add_vector3("Upper", upper, step=NUMBER_STEP, visible=False)
-            self._middle = gui.add_vector3("Middle", middle, step=NUMBER_STEP, visible=False)
-            self._radius = gui.add_number("Radius", longest / 2, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
+            self._middle = gui.add_vector3("Middle", sphere.middle, step=NUMBER_STEP, visible=False)
+            self._radius = gui.add_number("Radius", sphere.radius, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
+            self._fit = gui.add_button("Fit to subject", hint="The sphere, or its box, around what the cameras look at")
+            self._fit.on_click(lambda _: self.fit(SPHERE if self._shape.value == ALL else None))
             self._clean = gui.add_checkbox("Leave out floaters", False, visible=shared.is_cloud)
             self._floaters = {
                 name: gui.add_slider(label, *limits, hint=hint, visible=False)
@@ -88,8 +90,25 @@ class CropPanel:
 
     @property
     def floaters(self) -> tuple[tuple[str, float], ...]:
-        """Arguments of `cleaned` for floaters; none while they stay."""
-        return tuple((name, float(x.value)) for name, x in self._floaters.items()) if self._clean.value else ()
+        """Arguments of `cleaned` for floaters; the largest size alone in a crop whose floaters stay."""
+        return tuple((name, float(x.value)) for name, x in self._floaters.items() if self._applies(name))
+
+    def _applies(self, name: str) -> bool:
+        """True if a limit of floaters is in force."""
+        return bool(self._clean.value) or (name == "max_scale" and self._cropped and self._shared.is_cloud)
+
+    def fit(self, shape: str | None = None) -> None:
+        """Set sphere and box to the subject of the capture. shape: shown from now on; None leaves it"""
+        sphere, (lower, upper) = self._shared.subject_crops()
+        self._following = True
+        try:
+            if shape is not None:
+                self._shape.value = shape
+            self._middle.value, self._radius.value = sphere.middle, sphere.radius
+            self._lower.value, self._upper.value = lower, upper
+        finally:
+            self._following = False
+        self._update()
 
     @property
     def drawn(self) -> bool:
@@ -100,10 +119,13 @@ class CropPanel:
         if self._following:
             return
         shape = self._shape.value
+        if self._cropped != (shape != ALL):
+            self._cropped = not self._cropped
+            self._floaters["max_scale"].value = CROPPED_MAX_SCALE if self._cropped else MAX_SCALE
         for handle, shown in (
             *((x, shape == BOX) for x in (self._lower, self._upper)),
             *((x, shape == SPHERE) for x in (self._middle, self._radius)),
-            *((x, self._clean.value) for x in self._floaters.values()),
+            *((x, self._applies(name)) for name, x in self._floaters.items()),
         ):
             if handle.visible != shown:
                 handle.visible = shown

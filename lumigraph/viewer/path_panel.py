@@ -50,7 +50,7 @@ class PathPanel:
         self._nodes: list[Any] = []
         self._filling = False  # while what the panel shows is set from here
         gui = client.gui
-        with shared.tabs[2]:
+        with shared.tabs["Path"]:
             gui.add_button("Add keyframe here").on_click(lambda _: self._add())
             self._chosen = gui.add_dropdown("Keyframe", [NONE])
             self._actions = gui.add_button_group("This one", ("Go", "Set", "◀", "▶", "✕"))

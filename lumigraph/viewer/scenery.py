@@ -37,7 +37,8 @@ class Scenery:
     def __init__(self, server: Any, cameras: dict[str, Camera], clicked: Callable[[Any, Camera], None]):
         self._server = server
         self._frusta: dict[int, Any] = {}  # by image number
-        self.has_points, self._stopped = False, False
+        self.points: Float[Tensor, "point 3"] | None = None
+        self._stopped = False
         server.scene.add_frame(CAMERAS, show_axes=False)
         server.scene.add_frame(POINTS, show_axes=False)
         everyone = Camera.cat(list(cameras.values()))
@@ -106,7 +107,7 @@ class Scenery:
                 point_shading="flat",
                 precision="float32",
             )
-            self.has_points = True
+            self.points = scene.points.cpu()
         for number, frustum in self._frusta.items():
             frustum.image = thumbnail(scene.photograph(number).before(WHITE)).numpy()
 

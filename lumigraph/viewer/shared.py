@@ -14,14 +14,15 @@ from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from ..camera import Camera
-from ..camera.crop import Crop
+from ..camera.crop import Crop, Sphere
 from ..camera.rays import Rays, Rendering
-from ..datasets.scene import Frame, Scene
+from ..datasets.scene import Frame, Scene, Vector
 from ..gaussians import Gaussians, splatting
 from ..gaussians.cloud import cleaned
 from ..method import Method, RayMethod
 from ..method.capabilities import HasGaussians, needs
-from ..paths import Surroundings, best_centred, pivot
+from ..paths import Surroundings
+from ..paths.opening import Backdrop, Opening, opening_of_scene, pivot, subject_of
 from .cameras import ViewRequest
 from .scenery import Scenery
 from .turns import Turns
@@ -29,6 +30,45 @@ from .turns import Turns
 NAME = re.compile(r"\w[\w .-]{0,80}")  # of a saved file or folder
 NAME_RULE = "A name is made of letters, digits, spaces, dots and dashes"
 Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
+
+
+@dataclass(frozen=True)
+class ExportOption:
+    """An option of an export.
+
+    default: its default as text, "" for one that is computed; or False for a switch
+    choices: all values, where they are few
+    hint:    the default in words
+    """
+
+    name: str
+    default: str | bool
+    choices: tuple[str, ...] = ()
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format: the usual ending of its files, its description, its options."""
+
+    ending: str
+    about: str
+    options: tuple[ExportOption, ...] = ()
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """Exports of a scene.
+
+    formats: by name
+    command: command line of an export, from the format's name, the file's name, options and a client's view
+    run:     runs it, calls a function with each line of progress, and returns the result in words; it raises
+             LumigraphError if the export fails
+    """
+
+    formats: Mapping[str, ExportFormat]
+    command: Callable[[str, str, Mapping[str, str | bool], ViewRequest], list[str]]
+    run: Callable[[list[str], Callable[[str], None]], str]
 
 
 @dataclass(frozen=True)
@@ -44,6 +84,8 @@ class Subject:
     keep:           saves the cropped and cleaned cloud under a name, and returns its path; None where nothing
                     can be saved
     page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
+    behind:         colours and floor of a scene under the open sky
+    exporter:       exports the scene; None where nothing can be exported
     """
 
     title: str
@@ -55,6 +97,8 @@ class Subject:
     rows: list[dict[str, Any]] = field(default_factory=list)
     keep: Keep | None = None
     page: Callable[[], bytes] | None = None
+    behind: Backdrop | None = None
+    exporter: Exporter | None = None
 
     @cached_property
     def around(self) -> Surroundings:
@@ -62,9 +106,9 @@ class Subject:
         return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
 
     @cached_property
-    def first(self) -> Camera:
-        """The photograph's camera that every client begins with."""
-        return self.around.cameras[best_centred(self.around)]
+    def opening(self) -> Opening:
+        """Camera that every client begins with, and the limits of its movement: those of `lumigraph export web`."""
+        return opening_of_scene(self.title, self.cameras["train"].to("cpu"), self.frame, behind=self.behind)
 
     def distance(self, camera: Camera) -> float:
         """Distance from a camera to the point that it turns about, in scene units."""
@@ -78,7 +122,7 @@ class Shared:
 
     is_cloud:           whether the method has Gaussians
     server:             viser's
-    tabs:               View, Crop and Path, where each client's own controls go
+    tabs:               by name, where each client's own controls go
     step:               to which the method has been trained
     stopped:            whether the viewer has ended
     """
@@ -88,7 +132,7 @@ class Shared:
     subject: Subject
     turns: Turns
     server: Any
-    tabs: tuple[Any, Any, Any]
+    tabs: dict[str, Any]
     scenery: Scenery
     step: int = 0
     stopped: bool = False
@@ -117,6 +161,18 @@ class Shared:
 
     def _given(self, request: ViewRequest) -> Method:
         return self.method.given(**dict(request.settings)) if request.settings else self.method
+
+    def subject_crops(self) -> tuple[Sphere, tuple[Vector, Vector]]:
+        """Sphere around the subject and corners of the box, by the sparse points if the photographs have been opened,
+        else by the centres of Gaussians.
+
+        The box of an object alone is the box of interest; any other holds the sphere.
+        """
+        points = self.scenery.points
+        if points is None and self.is_cloud and not self.turns.training:
+            points = needs(self.method, HasGaussians).gaussians().means.detach().cpu()
+        sphere, frame = subject_of(self.subject.around, points), self.subject.frame
+        return sphere, sphere.bounds if frame.is_open else frame.bounds
 
     def connected(self, client: Any) -> bool:
         """True if a client is still connected."""

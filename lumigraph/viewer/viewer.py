@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +18,6 @@ from ..method import Method
 from ..method.capabilities import HasGaussians, can
 from ..system.progress import clock, short
 from .address import Address
-from .cameras import angles
 from .scenery import Scenery
 from .serving import quiet, start_server
 from .shared import Shared, Subject
@@ -147,7 +147,8 @@ class Viewer:
         self._server = start_server(address, subject.title, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
-        own_tabs = tabs.add_tab("View"), tabs.add_tab("Crop"), tabs.add_tab("Path")
+        names = ["View", "Crop", "Path", *(["Export"] if subject.exporter else [])]
+        own_tabs = {name: tabs.add_tab(name) for name in names}
         self._panel: TrainingPanel | None = None
         if subject.rows or training:
             with tabs.add_tab("Training"):
@@ -166,10 +167,12 @@ class Viewer:
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         prepare_window(server.gui, subject.title)
-        pose, distance = subject.first.pose[0].double().numpy(), subject.distance(subject.first)
-        server.initial_camera.position = pose[:, 3]
-        server.initial_camera.look_at = pose[:, 3] + distance * pose[:, 2]
-        server.initial_camera.fov = angles(subject.first)[1]
+        # No environment map: nothing here is lit, and viser fades the canvas in over frames once it has loaded
+        server.scene.configure_environment_map(None)
+        opening = subject.opening
+        server.initial_camera.position = np.array(opening.position)
+        server.initial_camera.look_at = np.array(opening.target)
+        server.initial_camera.fov = math.radians(opening.angle)
 
     # What fit() calls
 
@@ -246,5 +249,5 @@ class Viewer:
         for visitor in self._everyone():
             if fault is not None:
                 visitor.notify("Without photographs", fault)
-            elif self._scenery.has_points:
-                visitor.controls.offer_points()
+            else:
+                visitor.offer_points()

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
 import os
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +27,11 @@ from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..gaussians import Gaussians
 from ..geometry import to_matrix, unit
-from .cameras import Flight, ViewRequest, angle_for, angles, pose_of, rows
+from ..paths.opening import upright
+from .cameras import Flight, ViewRequest, angle_across, angle_for, pose_of, rows
 from .controls import Controls, MethodControls
 from .crop_panel import CropPanel
+from .export_panel import ExportPanel
 from .modes import along_axis, extra_modes, picture
 from .painter import MOVING_SECONDS, Pace, Painter
 from .path_panel import PathPanel
@@ -38,7 +43,10 @@ DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it pa
 MIN_BAND_ROWS = 16  # of a band
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
 MAX_RECOLOURED_GAUSSIANS = 500_000  # Gaussians; more are too many to send again whenever the camera rests
-FIELD_OF_VIEW_TOLERANCE = 0.01  # radians: a difference of angles of view that is worth setting
+REST_SECONDS = 0.25  # seconds without movement from which on a camera beyond its limits returns
+LIMIT_TOLERANCE = 0.02  # of the first distance to the target, that a camera may rest beyond its limits
+PLACE_TOLERANCE = 1e-3  # scene units and cosines, within which a camera is where it began
+LIMIT_NOTE = "Untick `Stay near the scene` in the tab View to go farther"
 RECOLOUR_EYE_SHIFT = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
 Wanted = Callable[[], bool]
 
@@ -56,20 +64,23 @@ class Visitor:
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
         self.painter = Painter(self._draw, shared.turns, self._report_fault, lambda: shared.step)
         self.flight = Flight(client)
-        self.controls = Controls(client, shared, self.painter.request)
+        self.controls = Controls(client, shared, self.painter.request, self._go_home)
         self.method_controls = MethodControls(client, shared, self.painter.request)
         keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
         self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify)
         self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
+        if shared.subject.exporter is not None:
+            about = shared.subject.exporter, shared.subject.title.partition(".")[0], self.request, self.notify
+            self.export = ExportPanel(client, shared.tabs["Export"], *about)
         self._seen: tuple[Any, ...] = ()
+        self._at_rest: asyncio.TimerHandle | None = None  # until the camera counts as resting
+        self._arrived = self._at_opening(pose_of(client.camera.wxyz, client.camera.position))  # at the opening, once
+        self._left = self._noted = False  # the opening; and what limits do
         client.camera.on_update(self._moved)
-        first = shared.subject.first
-        angle, wide = angles(first)[1], angle_for(first, client.camera.aspect)
-        if wide > angle + FIELD_OF_VIEW_TOLERANCE:  # a narrow window shows the whole photograph too
-            client.camera.fov = angle = wide
-        self.controls.show_angle(angle)  # the client's camera may still have the angle from before this
-        if shared.scenery.has_points:
-            self.controls.offer_points()
+        if client.camera.aspect < 1:
+            client.camera.fov = self._first_angle
+        self.controls.show_angle(self._first_angle)  # the client's camera may still have the angle from before this
+        self.offer_points()
         self.painter.request()
         self.painter.start()
 
@@ -81,6 +92,40 @@ class Visitor:
         """Show the client a notification."""
         if self._here:
             self._client.add_notification(title, text, auto_close_seconds=8.0)
+
+    def offer_points(self) -> None:
+        """Offer the sparse points, once there are any, and let crops begin by them."""
+        if self._shared.scenery.points is not None:
+            self.controls.offer_points()
+            if self.crop.crop is None:
+                self.crop.fit()
+
+    @property
+    def _first_angle(self) -> float:
+        """Vertical angle of view of the opening in the client's window, in radians."""
+        return angle_across(math.radians(self._shared.subject.opening.angle), self._client.camera.aspect)
+
+    def _go_home(self) -> None:
+        opening = self._shared.subject.opening
+        self.flight.fly(opening.pose, opening.distance, self._first_angle)
+
+    def _return(self) -> None:
+        """Fly back to within the opening's limits from where a client has moved beyond them.
+
+        A camera that was placed beyond them, as at a photograph, may stay as far beyond.
+        """
+        opening, camera = self._shared.subject.opening, self._client.camera
+        if self.flight.flying or not (self._arrived and self.controls.stays and self._here):
+            return
+        position, target = opening.limited(camera.position, camera.look_at)
+        placed = self.flight.placed or (position, target)
+        allowed = LIMIT_TOLERANCE * opening.distance + np.linalg.norm(opening.limited(*placed)[0] - placed[0])
+        if np.linalg.norm(position - camera.position) > allowed:
+            goal = upright(position, target), float(np.linalg.norm(target - position)), camera.fov
+            threading.Thread(target=self.flight.fly, args=goal, name="return", daemon=True).start()
+            if not self._noted:
+                self._noted = True
+                self.notify("Nothing was photographed from there", LIMIT_NOTE)
 
     def fly_to(self, camera: Camera, distance: float) -> None:
         """Fly to where a photograph was taken, with an angle of view that shows all of it."""
@@ -102,8 +147,12 @@ class Visitor:
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
+            self._arrived = self._arrived or self._at_opening(pose_of(camera.wxyz, camera.position))
             self.controls.show_angle(camera.fov)
             self.painter.request()
+            if self._at_rest is not None:
+                self._at_rest.cancel()
+            self._at_rest = asyncio.get_running_loop().call_later(REST_SECONDS, self._return)
 
     def request(self) -> ViewRequest:
         """The current view of the client."""
@@ -126,9 +175,14 @@ class Visitor:
         """Show the best picture that can be drawn in a time; returns whether no better one is possible."""
         request = self.request()
         self._step_out(tuple(row[3] for row in request.pose))
-        if self._shared.is_cloud and request.mode == "colour" and not request.exact:
-            return self._draw_splats(request, seconds, wanted)
-        if self._splats is not None:
+        by_browser = self._shared.is_cloud and request.mode == "colour" and not request.exact
+        if by_browser:
+            still = self._begins(request)
+            done = self._draw_splats(request, seconds, wanted, still)
+            if not still:
+                return done
+            request = replace(request, depth=False)  # before the rendering, however deep
+        elif self._splats is not None:
             self._splats.visible = False
         size = request.full if seconds == float("inf") else self._pace.size(request.full, seconds)
         begin = time.perf_counter()
@@ -136,8 +190,24 @@ class Visitor:
         took = time.perf_counter() - begin
         self._pace.note(size[0] * size[1], took)
         self._show(rendering, camera, request, QUALITY_MOVING if seconds == MOVING_SECONDS else QUALITY)
-        self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
+        if not by_browser:
+            self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
         return size == request.full
+
+    def _begins(self, request: ViewRequest) -> bool:
+        """True until the client first moves or changes the scene, unless it is in training.
+
+        A slow browser draws its first splats after many seconds. Until then it shows our rendering behind them.
+        """
+        here = self._at_opening(request.pose)
+        changed = request.part or bool(request.settings) or self._shared.turns.training
+        self._left = self._left or changed or (self._arrived and not here)
+        self._arrived = self._arrived or here
+        return here and not self._left
+
+    def _at_opening(self, pose: tuple[tuple[float, ...], ...]) -> bool:
+        """True for the pose that every client begins with. A browser may report another one before it has that."""
+        return bool(np.abs(np.array(pose) - self._shared.subject.opening.pose).max() < PLACE_TOLERANCE)
 
     def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
         """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon."""
@@ -171,9 +241,12 @@ class Visitor:
             raise NotWantedError
         self._client.scene.set_background_image(pixels, "jpeg", jpeg_quality=quality, depth=depth)
 
-    def _draw_splats(self, request: ViewRequest, seconds: float, wanted: Wanted) -> bool:
-        """Send the browser what it needs to draw the cloud itself; returns whether that is up to date."""
-        if self._flat != request.background:
+    def _draw_splats(self, request: ViewRequest, seconds: float, wanted: Wanted, still: bool) -> bool:
+        """Send the browser what it needs to draw the cloud itself; returns whether that is up to date.
+
+        still: whether a rendering is the background, instead of a colour
+        """
+        if not still and self._flat != request.background:
             self._stream(np.full((2, 2, 3), np.round(255 * np.array(request.background)), np.uint8), 95, None)
             self._flat = request.background
         if self._splats is not None:

@@ -1,0 +1,123 @@
+"""Every export with its options, as the viewer's tab Export offers them."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any, Literal, get_args, get_origin
+
+from ..errors import LumigraphError
+from ..files.ranges import hints
+from ..system.signals import start
+from .export import What
+
+ENDINGS = {"mesh": ".glb", "octree": ".npz", "panorama": ".jpg", "points": ".ply", "snerg": "", "splats": ".spz"}
+ENDINGS |= {"stereo": ".jpg", "web": ".html"}
+ELSEWHERE = ("source", "output", "overwrite", "part", "settings", "device")  # fields that the viewer sets otherwise
+
+
+def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) -> Any:
+    """The viewer's Exporter of an opened run or file.
+
+    settings: of --set; device: of --device
+    """
+    from ..camera.crop import CropBox
+    from ..method.capabilities import HasAtlas, HasGaussians, HasOctree, can
+    from ..viewer.shared import Exporter, ExportFormat
+
+    needs: dict[str, Any] = {"splats": HasGaussians, "octree": HasOctree, "snerg": HasAtlas}
+    kinds = {marks.name: kind for kind, marks in map(get_args, get_args(What))}
+    kinds = {name: kind for name, kind in kinds.items() if name not in needs or can(method, needs[name])}
+    kinds = {"web": kinds.pop("web"), **kinds}  # the usual one first
+    formats = {
+        name: ExportFormat(ENDINGS[name], " ".join(inspect.cleandoc(kind.__doc__).split()), tuple(options_of(kind)))
+        for name, kind in kinds.items()
+    }
+
+    def command(name: str, file: str, values: Mapping[str, str | bool], request: Any) -> list[str]:
+        words = ["lumigraph", "export", name, str(opened.path), os.path.join(opened.path.parent, file)]
+        for option in formats[name].options:
+            words += typed_option(option.name, values[option.name], option.default)
+        if "part" in hints(kinds[name]):
+            crop = request.crop
+            if isinstance(crop, CropBox):
+                words += ["--box", *(f"{x:.6f}" for x in (*crop.lower, *crop.upper))]
+            elif crop is not None:
+                words += ["--sphere", *(f"{x:.6f}" for x in (*crop.middle, crop.radius))]
+            words += [f"--{key.replace('_', '-')}={value:g}" for key, value in request.floaters]
+        if "settings" in hints(kinds[name]):
+            chosen = [*settings, *(f"{key}={value}" for key, value in request.settings)]
+            words += [word for text in chosen for word in ("--set", text)]
+        if "device" in hints(kinds[name]) and device != "auto":
+            words += ["--device", device]
+        return words
+
+    return Exporter(formats, command, run_export)
+
+
+def options_of(kind: type) -> Iterator[Any]:
+    """The options of an export's command that the viewer offers, those of dataclasses that it holds among them."""
+    from ..viewer.shared import ExportOption
+
+    said = hints(kind)
+    for field in fields(kind):
+        if field.name in ELSEWHERE:
+            continue
+        if is_dataclass(field.default):
+            yield from options_of(type(field.default))
+            continue
+        marks = [mark for mark in get_args(said[field.name])[1:] if hasattr(mark, "help_behavior_hint")]
+        name = next((mark.name for mark in marks if mark.name), field.name).replace("_", "-")
+        hint = next((str(mark.help_behavior_hint) for mark in marks if mark.help_behavior_hint), "")
+        if isinstance(field.default, bool):
+            yield ExportOption(name, field.default, hint=hint)
+            continue
+        choices = list(choices_of(said[field.name]))
+        default = str(field.default) if field.default is not None else "default" if choices else ""
+        yield ExportOption(name, default, tuple(dict.fromkeys([default, *choices])) if choices else (), hint)
+
+
+def choices_of(hint: Any) -> Iterator[str]:
+    """The values of each Literal in an annotation."""
+    if get_origin(hint) is Literal:
+        yield from get_args(hint)
+    else:
+        for inner in get_args(hint):
+            yield from choices_of(inner)
+
+
+def typed_option(name: str, value: str | bool, default: str | bool) -> list[str]:
+    """Words of an option on the command line; none for its default. A browser's text stays the value of that option."""
+    if value == default or value == "":
+        return []
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    numbers = value.split()
+    if len(numbers) > 1 and all(number.removeprefix("-").replace(".", "", 1).isdigit() for number in numbers):
+        return [f"--{name}", *numbers]
+    return [f"--{name}={value}"]
+
+
+def run_export(command: list[str], report: Callable[[str], None]) -> str:
+    """Run a command line in a process of its own, so that the viewer goes on; returns what it prints.
+
+    report: called with each line of progress
+    Raises LumigraphError with its last line if it fails.
+    """
+    report("Exporting ...")
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with start([sys.executable, "-m", *command], text=True, **pipes) as process:
+        assert process.stdout is not None and process.stderr is not None
+        last = ""
+        for line in process.stderr:
+            if line.strip():
+                last = line.strip()
+                report(last)
+        said = process.stdout.read()
+    if process.returncode:
+        raise LumigraphError(last.removeprefix("lumigraph: ") or "The export was ended; try it again")
+    return said
