@@ -1,5 +1,4 @@
-"""Findings on photographs that were spoiled on purpose: one blurred, one mirrored, one of another scene, one pose turned
-by 5 degrees.
+"""Findings on spoiled photographs: one blurred, one mirrored, one of another scene, one pose turned by 5 degrees.
 
     python benchmarks/doctor.py FOLDER [FOLDER ...] [--method gaussian-splatting] [--steps 600] [--downscale 2]
 

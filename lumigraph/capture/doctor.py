@@ -27,6 +27,7 @@ from .transforms import Made
 MIN_JUDGED = 4  # photographs; fewer have no usual value to compare with
 MAX_OBSERVATIONS = 500  # of sparse points, measured in each photograph
 MIN_OBSERVATIONS = 20  # of a photograph that is judged by them
+MIN_COUNT_SHARE = 0.1  # of the others' points that a photograph has at least
 MIN_TRACK_LENGTH = 3  # photographs that show a point; two could agree on a wrong place
 MISPLACED_ERROR = 4.0  # pixels of a picture 1000 wide, and
 MISPLACED_FACTOR = 5.0  # times the median error of all, from which on a pose is wrong
@@ -38,7 +39,7 @@ PSNR_SPREAD, FLOATING_SPREAD = 1.0, 0.06  # smallest standard deviations: dB, an
 MIRRORED_PSNR = 1.5  # dB by which a mirrored photograph must fit its rendering better
 
 BLURRED = "blurred"  # fault of a photograph
-LACKING = "lacking"  # fault of a capture with directions that lack photographs
+LACKING = "lacking directions"  # fault of a capture with directions that lack photographs
 
 Array = Float[np.ndarray, " photo"]
 
@@ -80,19 +81,21 @@ class Residual:
 
 
 @dataclass(frozen=True)
-class Tracks:
+class TrackAgreement:
     """Agreement of a photograph with the sparse points that it shows.
 
+    count:    features of reliable points; the rest is measured from 20 on, and NaN below
     error:    median distance between a feature and its projected point, pixels of a picture 1000 wide
     share:    of its features beyond the allowed distance of 4 of these pixels
     likeness: correlation of its pixels with the colours of the points;  mirrored: the same of the mirrored photograph;
               NaN where no file holds it
     """
 
-    error: float
-    share: float
-    likeness: float
-    mirrored: float
+    count: int
+    error: float = np.nan
+    share: float = np.nan
+    likeness: float = np.nan
+    mirrored: float = np.nan
 
 
 def findings(
@@ -181,7 +184,7 @@ def judged_file(shot: Shot) -> Judgement | None:
         return None
 
 
-def tracks_of(capture: Capture) -> dict[str, Tracks]:
+def tracks_of(capture: Capture) -> dict[str, TrackAgreement]:
     """Agreement of photographs, by name, with the tracks of the COLMAP model beside them; empty without a model.
 
     Points are moved into the capture's frame by the similarity of both sets of camera positions, so poses that were
@@ -198,9 +201,11 @@ def tracks_of(capture: Capture) -> dict[str, Tracks]:
     if matrix is None:
         return {}
     reliable = {k: p for k, p in model.points3D.items() if p.track.length() >= MIN_TRACK_LENGTH}
+    found: dict[str, TrackAgreement] = {}
     measured: list[tuple[Shot, np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]] = []
     for stem, image in images.items():
         seen = [(p.xy, reliable[p.point3D_id]) for p in image.get_observation_points2D() if p.point3D_id in reliable]
+        found[shots[stem].name] = TrackAgreement(len(seen))
         if len(seen) < MIN_OBSERVATIONS:
             continue
         features, points = zip(*evenly(seen, MAX_OBSERVATIONS), strict=True)
@@ -209,14 +214,14 @@ def tracks_of(capture: Capture) -> dict[str, Tracks]:
         colours = np.array([p.color for p in points], np.float64)
         measured.append((shots[stem], np.array(features), there, colours, (camera.width, camera.height)))
 
-    def agreement(i: int) -> Tracks:
+    def agreement(i: int) -> TrackAgreement:
         shot, features, points, colours, size = measured[i]
         away = reprojection(shot, features, points, size)
         error, share = float(np.median(away)), float((away > MISPLACED_ERROR).mean())
-        return Tracks(error, share, *likeness(shot, features, colours, size))
+        return TrackAgreement(found[shot.name].count, error, share, *likeness(shot, features, colours, size))
 
-    found = in_parallel(agreement, range(len(measured)))
-    return {shot.name: tracks for (shot, *_), tracks in zip(measured, found, strict=True)}
+    agreements = in_parallel(agreement, range(len(measured)))
+    return found | {shot.name: tracks for (shot, *_), tracks in zip(measured, agreements, strict=True)}
 
 
 def reprojection(
@@ -255,20 +260,26 @@ def likeness(
 
 
 def of_tracks(
-    shots: Sequence[Shot], tracks: Mapping[str, Tracks], folder: Path, blurred: Collection[str] = ()
+    shots: Sequence[Shot], tracks: Mapping[str, TrackAgreement], folder: Path, blurred: Collection[str] = ()
 ) -> list[Finding]:
     """Photographs whose pose or pixels contradict the sparse points that they show.
 
     blurred: names of photographs whose pixels are no evidence
     """
-    if len(tracks) < MIN_JUDGED:
+    if sum(t.error == t.error for t in tracks.values()) < MIN_JUDGED:
         return []
-    usual = float(np.median([t.error for t in tracks.values()]))
-    alike = float(np.nanmedian([t.likeness for t in tracks.values()]))
+    many = float(np.median([t.count for t in tracks.values()]))
+    usual = float(np.nanmedian([t.error for t in tracks.values()]))
+    likenesses = [t.likeness for t in tracks.values() if t.likeness == t.likeness]
+    alike = float(np.median(likenesses)) if likenesses else 0.0
     found = []
     for shot in shots:
         if (t := tracks.get(shot.name)) is None:
             continue
+        if t.count < min(MIN_OBSERVATIONS, MIN_COUNT_SHARE * many):
+            evidence = f"{t.count} of its details are points that other photographs show, of others {many:.0f}"
+            advice = "look at it in capture.png, and take photographs between it and the others"
+            found.append(Finding(shot.name, "placed by few points", evidence, advice))
         if t.error > max(MISPLACED_ERROR, MISPLACED_FACTOR * usual):
             evidence = (
                 f"its details are {t.error:.0f} pixels from their points (per 1000), those of others {usual:.1f}; "
@@ -278,11 +289,10 @@ def of_tracks(
             again = shlex.join(["lumigraph", "capture", source, "--output", f"{folder}-again"])
             found.append(Finding(shot.name, "placed badly", evidence, f"find the poses again: {again}"))
         if shot.name not in blurred and t.likeness < min(MAX_LIKENESS, alike - MIN_LIKENESS_DROP):
+            evidence = f"correlation with the colours of its points {t.likeness:.2f}, others {alike:.2f}"
+            fault = "shows something else"
             if t.mirrored > t.likeness + MIRRORED_LIKENESS:
-                fault, evidence = "mirrored", f"mirrored it fits the colours of its points ({t.mirrored:.2f}), as it is"
-            else:
-                fault, evidence = "shows something else", "its pixels do not have the colours of its points"
-            evidence += f" (correlation {t.likeness:.2f}, others {alike:.2f})"
+                fault, evidence = "mirrored", f"{evidence}, mirrored {t.mirrored:.2f}"
             found.append(Finding(shot.name, fault, evidence, leave_out(shot)))
     return found
 

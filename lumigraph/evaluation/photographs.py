@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from ..camera import Camera
 from ..camera.rays import Rendering
 from ..capture import read_capture
 from ..capture.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
@@ -27,6 +29,7 @@ from ..run import Run
 from ..system.progress import track
 
 PIXEL_BUDGET = 800_000  # rendered pixels of all photographs together, so that the check takes seconds
+MAX_SECONDS = 10.0  # of rendering; slow methods render smaller, and fewer photographs
 MIN_SIDE, MAX_SIDE = 48, 256  # pixels of the longer side of a rendering
 NEIGHBOURS = 12  # nearest cameras that free space is asked of
 SURFACE_SAMPLES = 500  # points of each rendered surface
@@ -87,13 +90,12 @@ def compare_all(method: Method, scene: Scene) -> list[Compared]:
         return []
     own = [control.name for control in method.controls if control.of_photographs]
     method.eval()
+    chosen, side = affordable(method, scene.cameras[chosen[0]], chosen)
     found: list[Compared] = []
     maps: list[DepthMap] = []
     for index in track(chosen, "Examining photographs", len(chosen)):
         shot = scene.photograph(index)
-        width, height = shot.camera.size[0].tolist()
-        side = (PIXEL_BUDGET / len(chosen) * max(width, height) / min(width, height)) ** 0.5
-        shot = shot.reduced(max(1, round(max(width, height) / min(max(side, MIN_SIDE), MAX_SIDE))))
+        shot = shot.reduced(max(1, round(int(shot.camera.size.max()) / side)))
         camera = method.refined(shot.camera)
         told = method.given(**{name: str(index) for name in own}) if own else method
         seen = told.render(camera).cpu()
@@ -110,6 +112,21 @@ def compare_all(method: Method, scene: Scene) -> list[Compared]:
     return [
         one._replace(residual=replace(one.residual, floating=share)) for one, share in zip(found, shares, strict=True)
     ]
+
+
+def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[int], float]:
+    """The photographs that can be rendered in about 10 s, evenly spread, and the longer side in pixels of each.
+
+    camera: of one of them, with which the speed is measured
+    """
+    small = camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
+    method.render(small)  # compiles
+    begin = time.perf_counter()
+    method.render(small)
+    pixels, least = int(small.size.prod()), int(small.size.max())
+    budget = min(PIXEL_BUDGET, MAX_SECONDS * pixels / (time.perf_counter() - begin))
+    chosen = evenly(chosen, max(MIN_JUDGED, int(budget / pixels)))
+    return chosen, min(max(least * (budget / len(chosen) / pixels) ** 0.5, least), MAX_SIDE)
 
 
 def fit(rgb: Float[Tensor, "pixel 3"], truth: Float[Tensor, "pixel 3"]) -> float:

@@ -415,7 +415,7 @@ class Reconstruction:
         found = findings(read_transforms(self.folder), diagnosis.left_out)
         result = self.summary(key, model, place, diagnosis) | {"findings": [asdict(finding) for finding in found]}
         write_json(self.folder / RESULT_FILE, result, "capture")
-        return result
+        return read_json(self.folder / RESULT_FILE)
 
     def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
         """Turn a model so that +z is up; by GPS, which also gives metres and the origin, where that can tell."""
