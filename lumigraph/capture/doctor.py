@@ -32,10 +32,10 @@ MIN_TRACK_LENGTH = 3  # photographs that show a point; two could agree on a wron
 MISPLACED_ERROR = 4.0  # pixels of a picture 1000 wide, and
 MISPLACED_FACTOR = 5.0  # times the median error of all, from which on a pose is wrong
 MAX_LIKENESS = 0.5  # correlation with the colours of its points below which a photograph shows something else, if
-MIN_LIKENESS_DROP = 0.3  # below that of the others
-MIRRORED_LIKENESS = 0.2  # by which a mirrored photograph must correlate better
+MIN_LIKENESS_DROP = 0.3  # below that of the others; a mirrored photograph correlates as they do
 MIN_DEVIATIONS = 4.0  # robust standard deviations below the median that count as a fault
 PSNR_SPREAD, FLOATING_SPREAD = 1.0, 0.06  # smallest standard deviations: dB, and share of the pixels
+FLOATING_DEVIATIONS = 3.0  # of PSNR that floating surfaces come with; alone they are a fault of the run
 MIRRORED_PSNR = 1.5  # dB by which a mirrored photograph must fit its rendering better
 
 BLURRED = "blurred"  # fault of a photograph
@@ -291,7 +291,7 @@ def of_tracks(
         if shot.name not in blurred and t.likeness < min(MAX_LIKENESS, alike - MIN_LIKENESS_DROP):
             evidence = f"correlation with the colours of its points {t.likeness:.2f}, others {alike:.2f}"
             fault = "shows something else"
-            if t.mirrored > t.likeness + MIRRORED_LIKENESS:
+            if t.mirrored > alike - MIN_LIKENESS_DROP:
                 fault, evidence = "mirrored", f"{evidence}, mirrored {t.mirrored:.2f}"
             found.append(Finding(shot.name, fault, evidence, leave_out(shot)))
     return found
@@ -319,7 +319,7 @@ def of_residuals(residuals: Sequence[Residual], shots: Sequence[Shot], named: se
                 elif r.photograph not in named:
                     evidence += ": its pose is wrong, or it shows something else"
                 found.append(Finding(r.photograph, fault, evidence, advice))
-            if adrift[i] > MIN_DEVIATIONS:
+            if adrift[i] > MIN_DEVIATIONS and low[i] > FLOATING_DEVIATIONS:
                 evidence = (
                     f"other cameras see past {100 * r.floating:.0f} % of its surface, of others past "
                     f"{100 * np.median(floating):.0f} %"
