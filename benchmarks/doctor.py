@@ -9,6 +9,7 @@ or true faults of the data. Spoiled copies are in memory and a temporary folder.
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import warnings
 from collections import defaultdict
@@ -29,6 +30,7 @@ from lumigraph.capture.pictures import list_images
 from lumigraph.evaluation.photographs import compare_all
 from lumigraph.geometry import evenly
 from lumigraph.run import build
+from lumigraph.system.signals import exit_code
 from lumigraph.training import fit
 
 TURN = np.radians(5)
@@ -79,7 +81,9 @@ def with_run(capture: Capture, options: Options) -> list[Finding]:
     kind = methods.find(options.method)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     method = build(kind, scene.frame, kind.preset(device), device, options.seed, learning=True)
-    fit(method, scene, budget=Budget(options.steps), seed=options.seed, show=False)
+    outcome = fit(method, scene, budget=Budget(options.steps), seed=options.seed, show=False)
+    if outcome.signal is not None:
+        sys.exit(exit_code(outcome.signal))
     residuals = [one.residual for one in compare_all(method, scene)]
     for one in sorted(residuals, key=lambda one: one.psnr)[:6]:
         print(f"    {one.photograph} {one.split} {one.psnr:.1f} dB, mirrored {one.mirrored:.1f}, "
