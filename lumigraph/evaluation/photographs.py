@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..camera.rays import Rendering
 from ..capture import read_capture
 from ..capture.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
-from ..datasets.scene import Scene
+from ..datasets.scene import Photograph, Scene
 from ..depth_maps import DepthMap, free
 from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range, save_picture
 from ..files import read_json, write_json
@@ -33,16 +33,17 @@ MAX_SECONDS = 10.0  # of rendering; slow methods render smaller, and fewer photo
 MIN_SIDE, MAX_SIDE = 48, 256  # pixels of the longer side of a rendering
 NEIGHBOURS = 12  # nearest cameras that free space is asked of
 SURFACE_SAMPLES = 500  # points of each rendered surface
+SHEET_SIDE = 400.0  # pixels of the longer side in the report
 SHOWN = 5  # worst photographs in the report
 RESULT_FILE, SHEET_FILE = "photographs.json", "photographs.png"
 
 
 class Compared(NamedTuple):
-    """A photograph, reduced, and its rendering after a gain and an offset per colour."""
+    """Residual of a photograph of the scene, by its number, and the longer side in pixels of its rendering."""
 
     residual: Residual
-    photograph: Tensor
-    rendering: Rendering
+    index: int
+    side: float
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,9 @@ def examine(run: Run, method: Method, scene: Scene) -> list[Finding]:
         found = of_residuals(residuals, (), set())
     write_json(run.folder / RESULT_FILE, asdict(Examined(found, residuals)), ours=True)
     if compared:
-        save_picture(run.folder / SHEET_FILE, sheet(worst(compared, found), found), ours=True)
+        save_picture(
+            run.folder / SHEET_FILE, sheet(method, scene, worst(compared, found), found, len(compared)), ours=True
+        )
     return found
 
 
@@ -88,17 +91,12 @@ def compare_all(method: Method, scene: Scene) -> list[Compared]:
     chosen = sorted(splits)
     if len(chosen) < MIN_JUDGED:
         return []
-    own = [control.name for control in method.controls if control.of_photographs]
     method.eval()
     chosen, side = affordable(method, scene.cameras[chosen[0]], chosen)
     found: list[Compared] = []
     maps: list[DepthMap] = []
     for index in track(chosen, "Examining photographs", len(chosen)):
-        shot = scene.photograph(index)
-        shot = shot.reduced(max(1, round(int(shot.camera.size.max()) / side)))
-        camera = method.refined(shot.camera)
-        told = method.given(**{name: str(index) for name in own}) if own else method
-        seen = told.render(camera).cpu()
+        shot, camera, seen = rendered(method, scene, index, side)
         truth = shot.before(scene.frame.background)
         mask = torch.ones(truth.shape[:2], dtype=torch.bool) if shot.mask is None else shot.mask
         if not mask.any():
@@ -107,11 +105,21 @@ def compare_all(method: Method, scene: Scene) -> list[Compared]:
         rgb = seen.rgb.clamp(0, 1)
         straight, mirrored = (fit(rgb[m], image[m]) for image, m in ((truth, mask), (truth.flip(1), mask.flip(1))))
         residual = Residual(label(scene.names[index]), splits[index], straight, mirrored, 0.0)
-        found.append(Compared(residual, truth, replace(seen, rgb=rgb)))
+        found.append(Compared(residual, index, side))
     shares = floating(maps)
     return [
         one._replace(residual=replace(one.residual, floating=share)) for one, share in zip(found, shares, strict=True)
     ]
+
+
+def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Photograph, Camera, Rendering]:
+    """A photograph reduced to a longer side, its refined camera, and the rendering with its own exposure or appearance
+    where the method has learnt one."""
+    shot = scene.photograph(index)
+    shot = shot.reduced(max(1, round(int(shot.camera.size.max()) / side)))
+    own = {control.name: str(index) for control in method.controls if control.of_photographs}
+    camera = method.refined(shot.camera)
+    return shot, camera, (method.given(**own) if own else method).render(camera).cpu()
 
 
 def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[int], float]:
@@ -122,7 +130,7 @@ def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[
     small = camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
     method.render(small)  # compiles
     begin = time.perf_counter()
-    method.render(small)
+    method.render(small).cpu()  # waits for a GPU
     pixels, least = int(small.size.prod()), int(small.size.max())
     budget = min(PIXEL_BUDGET, MAX_SECONDS * pixels / (time.perf_counter() - begin))
     chosen = evenly(chosen, max(MIN_JUDGED, int(budget / pixels)))
@@ -157,13 +165,19 @@ def worst(compared: Sequence[Compared], found: Sequence[Finding]) -> list[Compar
     return sorted(compared, key=lambda one: (one.residual.photograph not in named, one.residual.psnr))[:SHOWN]
 
 
-def sheet(compared: Sequence[Compared], found: Sequence[Finding]) -> Image.Image:
-    """Contact sheet of photographs, renderings, errors and depths, each with its faults."""
+@torch.no_grad()
+def sheet(
+    method: Method, scene: Scene, compared: Sequence[Compared], found: Sequence[Finding], count: int
+) -> Image.Image:
+    """Contact sheet of photographs, renderings, errors and depths, each with its faults, rendered anew at a larger
+    size. count: photographs that were rendered before, in about the same time"""
     rows = []
-    for residual, photograph, seen in compared:
+    for residual, index, side in compared:
+        shot, _, seen = rendered(method, scene, index, min(SHEET_SIDE, side * (count / len(compared)) ** 0.5))
         faults = dict.fromkeys(f.fault for f in found if f.photograph == residual.photograph)
         text = f"{residual.photograph} · {residual.psnr:.2f} dB · {', '.join(faults) or 'no fault found'}"
         depth = colour_depth(seen.depth, seen.opacity, depth_range(seen.depth, seen.opacity))
-        rows.append(Row(text, [photograph, seen.rgb, colour_error(photograph, seen.rgb), depth]))
+        truth, rgb = shot.before(scene.frame.background), seen.rgb.clamp(0, 1)
+        rows.append(Row(text, [truth, rgb, colour_error(truth, rgb), depth]))
     title = f"The {len(rows)} worst photographs"
     return contact_sheet(title, ["photograph", "rendering", f"{ERROR_GAIN}x error", "depth"], rows)
