@@ -42,7 +42,7 @@ class Compared(NamedTuple):
     """Residual of a photograph of the scene, by its number, and the longer side in pixels of its rendering."""
 
     residual: Residual
-    index: int
+    number: int
     side: float
 
 
@@ -172,8 +172,8 @@ def sheet(
     """Contact sheet of photographs, renderings, errors and depths, each with its faults, rendered anew at a larger
     size. count: photographs that were rendered before, in about the same time"""
     rows = []
-    for residual, index, side in compared:
-        shot, _, seen = rendered(method, scene, index, min(SHEET_SIDE, side * (count / len(compared)) ** 0.5))
+    for residual, number, side in compared:
+        shot, _, seen = rendered(method, scene, number, min(SHEET_SIDE, side * (count / len(compared)) ** 0.5))
         faults = dict.fromkeys(f.fault for f in found if f.photograph == residual.photograph)
         text = f"{residual.photograph} · {residual.psnr:.2f} dB · {', '.join(faults) or 'no fault found'}"
         depth = colour_depth(seen.depth, seen.opacity, depth_range(seen.depth, seen.opacity))
