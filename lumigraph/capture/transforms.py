@@ -61,11 +61,13 @@ class Whole:
 
 @dataclass(frozen=True)
 class Made:
-    """Fields of capture.json: the source of a scene, the name of its making, and the messages about it."""
+    """Fields of capture.json: the source of a scene, the name of its making, the messages about it, and photographs
+    without a pose with the reason."""
 
     sources: list[str] = field(default_factory=list)
     key: str = ""
     warnings: list[str] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,10 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, between
-from .common import say, scene_name, show, typed
+from .common import finding_rows, lines, say, scene_name, show, typed
 from .options import needed, option
 
 GENERIC_FOLDERS = "images", "photos", "photographs", "pictures", "input", "frames"  # named after their contents
-MAX_NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
-INDENT = " " * 13
 
 
 @dataclass(frozen=True)
@@ -125,22 +123,23 @@ def show_result(folder: Path, result: dict[str, Any], onward: str | None = None)
 
 
 def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
+    from ..capture.doctor import Finding
+
     placed, others = len(result["registered"]), result["other_models"]
     found = {"photographs": f"{placed} of {result['given']} placed"}
     if others:
         found["photographs"] += f", and apart from them {' and '.join(str(len(names)) for names in others)}"
-    blurred = {name: why for name, why in result["blurred"].items() if name not in result["left_out"]}
-    for title, what in (("left out", result["left_out"]), ("blurred", blurred)):
-        if what:
-            found[title] = lines([f"{name}: {why}" for name, why in what.items()])
+    found |= finding_rows([Finding(**finding) for finding in result["findings"]], str(folder / "capture.json"))
     if result["duplicates"]:
-        found["duplicates"] = lines([f"{name} of {other}" for name, other in result["duplicates"].items()])
+        repeated = [f"{name} of {other}" for name, other in result["duplicates"].items()]
+        found["duplicates"] = lines(repeated, str(folder / "capture.json"))
     found["error"] = f"{result['error']:.2f} pixels"
     found["points"] = f"{result['points']:,}, each in {result['track_length']:.1f} photographs on average"
     found["coverage"] = f"points span {100 * result['filled']:.0f} % of a photograph, on average"
     found["parallax"] = f"{result['angle']:.0f} degrees between the outermost views of a point (median)"
     if coverage := result["coverage"]:
         found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
+        found["around"] += ", from {:.0f} to {:.0f} degrees above the subject".format(*coverage["elevations"])
         gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]
         found["around"] += f"; no photograph from {', '.join(gaps)}" if gaps else ""
     if result["gps"] and result["gps"]["used"]:
@@ -148,9 +147,3 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
     found["time"] = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result["seconds"].items())
     found["pictures"] = f"{folder / 'capture.png'}, {folder / 'photographs.png'}"
     return found | {"scene": str(folder)}
-
-
-def lines(items: list[str]) -> str:
-    """One below the other, beside the names of the rows."""
-    more = [f"and {len(items) - MAX_NAMED} more, in photographs.png and capture.json"] if len(items) > MAX_NAMED else []
-    return f"\n{INDENT}".join(items[:MAX_NAMED] + more)

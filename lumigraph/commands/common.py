@@ -16,6 +16,8 @@ from ..files import scene_name as scene_name
 from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
 
+MAX_LINES = 12  # lines of one kind that are printed
+
 
 def choose_device(name: str) -> Any:
     """A torch.device by name; `auto` takes a GPU where there is one. Raises LumigraphError if it is not there."""
@@ -97,10 +99,25 @@ def say(text: str) -> None:
 
 
 def show(rows: Mapping[str, Any]) -> None:
-    """Results, text or rich Text, one to a line, names aligned."""
+    """Results, text or rich Text, names aligned; further lines of a text stand below its first."""
     out, width = console(soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
+        if isinstance(value, str):
+            value = value.replace("\n", "\n" + " " * (width + 2))
         out.print(dim(f"{name:<{width}}") + "  " + value)
+
+
+def lines(items: Sequence[str], more: str) -> str:
+    """At most 12 items, one below the other. more: where all of them are"""
+    rest = [f"and {len(items) - MAX_LINES} more, in {more}"] if len(items) > MAX_LINES else []
+    return "\n".join([*items[:MAX_LINES], *rest])
+
+
+def finding_rows(found: Sequence[Any], more: str) -> dict[str, str]:
+    """Rows of findings by fault, for `show`. more: the file that holds all of them"""
+    from ..capture.doctor import grouped
+
+    return {fault: lines(sentences, more) for fault, sentences in grouped(found).items()}
 
 
 def typed(*words: object) -> str:

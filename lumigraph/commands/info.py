@@ -26,7 +26,9 @@ class Info:
     reader: ReaderOption = None
 
     def run(self) -> int:
-        from ..capture import open_dataset
+        from ..capture import open_dataset, read_capture
+        from ..capture.doctor import findings
+        from ..datasets.scene import Scene
         from ..exchange import is_splat_file, read_gaussians, snerg
         from ..large import BlockRun
         from ..run import is_block_run
@@ -53,6 +55,10 @@ class Info:
             tree = info_tree.atlas_tree(SnergFolder(self.what))
         else:
             options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
-            tree = info_tree.dataset_tree(open_dataset(self.what, **options))
+            data = open_dataset(self.what, **options)
+            tree = info_tree.dataset_tree(data)
+            if isinstance(data, Scene) and Path(data.source).expanduser().is_dir():
+                upright = data.frame.to_source.rotation.T.double().numpy()
+                info_tree.add_findings(tree, findings(read_capture(data.source, self.reader), None, upright))
         console(width=TREE_WIDTH, soft_wrap=True).print(tree)
         return 0

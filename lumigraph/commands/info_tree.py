@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from rich.text import Text
 from rich.tree import Tree
 
 from ..budget import Budget
+from ..capture.doctor import Finding, grouped
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..datasets.shapes import Shapes
 from ..errors import LumigraphError
+from ..evaluation.photographs import examined
 from ..exchange import size_of
 from ..files.names import natural
 from ..gaussians import Gaussians
@@ -67,6 +71,8 @@ def run_tree(run: Run) -> Tree:
         figures["seconds per view"] = evaluation.get("seconds_per_view")
         protocol = ("split", "views", "shapes", "members", "resolution")
         branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
+    if checked := examined(run):
+        add_findings(tree, checked.findings)
     places = [path for folder in (run.folder, run.folder / "renders") if folder.is_dir() for path in folder.iterdir()]
     pages = [path for path in places if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
     pages.sort(key=lambda path: natural(path.as_posix()))
@@ -204,6 +210,15 @@ def frame_rows(frame: Frame) -> dict[str, Any]:
         "moments": frame.times and f"from {frame.times[0]:g} to {frame.times[1]:g}",
         "one scene unit": f"{frame.to_source.scale:.4g} of the source's",
     }
+
+
+def add_findings(tree: Tree, found: Sequence[Finding]) -> None:
+    """A branch of findings, by fault; a line that says so without any."""
+    node = tree.add(bold("findings") + ("" if found else "  none"))
+    for fault, sentences in grouped(found).items():
+        kind = node.add(dim(fault))
+        for sentence in sentences:
+            kind.add(Text(sentence))
 
 
 def branch(tree: Tree, title: str, rows: dict[str, Any]) -> None:

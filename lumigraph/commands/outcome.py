@@ -7,8 +7,9 @@ from typing import Any
 
 from ..budget import QUALITIES, Budget
 from ..datasets.scene import Scene
+from ..errors import LumigraphError
 from ..method import Method, RayMethod
-from .common import say, show, typed
+from .common import finding_rows, say, show, typed
 
 SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
 FULL_SIZE_SHARE = 0.45  # share of training below which a trend spans less than its second half
@@ -43,7 +44,20 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     enough = state.step >= method.steps_for("draft", data)
     more = more_time(run.folder, budget) if enough else typed("resume", run.folder, "--quality", "draft")
     rows["advice"] = advice(trend, enough, more, photographed(run, data))
-    show(rows | next_commands(run))
+    show(rows | photograph_rows(run, method, data) | next_commands(run))
+
+
+def photograph_rows(run: Any, method: Method, data: Any) -> dict[str, str]:
+    """Findings on the photographs of a run, which are written into it; a fault of their files is a warning."""
+    from ..evaluation.photographs import RESULT_FILE, examine
+
+    if not isinstance(data, Scene):
+        return {}
+    try:
+        return finding_rows(examine(run, method, data), str(run.folder / RESULT_FILE))
+    except LumigraphError as fault:
+        say(f"warning: the photographs could not be examined: {fault}")
+        return {}
 
 
 def seen(passes: float, what: str) -> str:

@@ -15,6 +15,7 @@ from PIL import Image
 
 from .. import __version__, methods
 from ..budget import Budget
+from ..capture.doctor import grouped
 from ..capture.pictures import readable
 from ..figures.charts import STYLE as CHARTS
 from ..figures.charts import Series, bar_chart, line_chart
@@ -23,6 +24,7 @@ from ..metrics import scores_of
 from ..run import Run
 from ..system.progress import clock, short
 from ..training.verdict import cameras_moved, of_final_size
+from .photographs import SHEET_FILE, examined
 
 MAX_FILM_BYTES = 12 << 20  # bytes; larger ones are named instead of embedded
 STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
@@ -33,6 +35,7 @@ def write_report(run: Run) -> Path:
     path = claim_report(run)
     evaluation = run.evaluation()
     body = header(run, evaluation) + films(run) + previews(run) + curves(run) + views(run, evaluation) + cameras(run)
+    body += photographs(run)
     if (sheet := run.folder / "eval.png").exists():
         body += section("Contact sheet", f"<img class='sheet' src='{jpeg(sheet)}' alt=''>")
     body += settings(run, evaluation)
@@ -182,6 +185,20 @@ def cameras(run: Run) -> str:
     )
     note = f"Against all of them together: {moved}. The lines are means."
     return section("How far cameras moved", side_by_side(charts), note)
+
+
+def photographs(run: Run) -> str:
+    """The five worst photographs with rendering and difference, and all findings, where the run was examined."""
+    if (checked := examined(run)) is None or not (shown := run.folder / SHEET_FILE).exists():
+        return ""
+    lines = "".join(
+        f"<li><b>{escape(fault)}</b>: {escape(sentence)}</li>"
+        for fault, sentences in grouped(checked.findings).items()
+        for sentence in sentences
+    )
+    body = f"<img class='sheet' src='{jpeg(shown)}' alt=''>" + (f"<ul>{lines}</ul>" if lines else "")
+    note = "" if lines else "No photograph differs from the others by more than chance."
+    return section("Photographs to look at", body, note)
 
 
 def settings(run: Run, evaluation: dict[str, Any] | None) -> str:

@@ -5,6 +5,7 @@
     checkpoints/    the latest complete state, in a folder named after its step: see `checkpoint`
     metrics.jsonl   one line every few steps
     previews/       one view as it came to be
+    photographs.json, photographs.png: findings on its photographs, and the five worst
     eval.json, eval.png, renders/, report.html: what the commands made of it
 
 Nothing in it runs code when opened.

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +17,13 @@ from ...files.names import counted, natural
 from ...geometry import evenly
 from ...system.library import pycolmap
 from ..colmap import poses_of
-from ..normalise import where_axes_meet
+from ..coverage import Coverage, coverage
 from ..oddities import in_steps, jumps
 from ..photos import Intake, Photo
+from ..photos.judge import MAX_EXPOSURE_STOPS, exposure_jumps
 
 MIN_FEATURES = 100
 MIN_MATCHES = 15  # shared features of two photographs that COLMAP accepts
-MAX_EXPOSURE_STOPS = 1.5  # of exposure that a photograph may differ from others
-EXPOSURE_WINDOW = 5  # neighbours on each side with which a frame's exposure is compared
 MIN_TRIANGULATION_ANGLE = 2.0  # degrees, median over points: below it depth is uncertain
 ROTATION_SHARE = 0.6  # share of the pairs that a pure rotation of the camera explains
 ALL_TURNED_SHARE = 0.9  # share from which on a model of these pairs has no depth, whatever it says
@@ -34,7 +32,6 @@ FOCAL_RATIOS = 0.4, 4.0, 100  # shortest and longest focal length in terms of th
 MAX_TURN_DEVIATION = 0.15  # deviation from a rotation, of the motion between two pictures, which a turn may have
 MIN_MOTION = 0.02  # added to the motion, so that noise is small against it
 MIN_OVERLAP_MATCHES = 30  # shared features from which on two neighbours count as close
-MAX_GAP_ANGLE = 30.0  # degrees between neighbouring viewing directions
 MAX_REPROJECTION_ERROR = 2.0  # pixels
 ANGLE_SAMPLES = 2000  # points whose angles are measured
 MAX_NAMES = 8  # photographs that a warning lists
@@ -114,22 +111,6 @@ def calibration(size: tuple[int, int], ratios: Float[np.ndarray, " ratio"]) -> F
     matrix[:, 0, 0] = matrix[:, 1, 1] = ratios * max(size)
     matrix[:, :, 2] = size[0] / 2, size[1] / 2, 1
     return matrix
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Directions without a photograph: so many degrees, between two photographs."""
-
-    degrees: float
-    between: tuple[str, str]
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """Angle of the subject that photographs cover; gaps only if they cover more than half of the circle."""
-
-    degrees: float
-    gaps: list[Gap] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -270,22 +251,6 @@ def filled(model: pycolmap.Reconstruction) -> float:
     return float(np.mean(shares))
 
 
-def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Coverage | None:
-    """The coverage around the vertical through what the cameras look at; None where they look at no one thing.
-    Directions nearer to each other than 30 degrees cover what lies between them."""
-    subject, converging = where_axes_meet(poses[:, :, 3], poses[:, :, 2])
-    if not converging:
-        return None
-    away = poses[:, :2, 3] - subject[:2]
-    azimuth = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
-    order = np.argsort(azimuth)
-    steps = np.diff(azimuth[order], append=azimuth[order[0]] + 360)
-    wide = [i for i in range(len(order)) if steps[i] > MAX_GAP_ANGLE]
-    degrees = float(360 - steps[wide].sum())
-    gaps = [Gap(float(steps[i]), (names[order[i]], names[order[(i + 1) % len(order)]])) for i in wide]
-    return Coverage(degrees, sorted(gaps, key=lambda gap: -gap.degrees) if degrees > 180 else [])
-
-
 def folds(
     names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"], matches: Matches, in_order: bool
 ) -> list[tuple[int, float]]:
@@ -299,11 +264,7 @@ def folds(
 
 def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
     """Photographs more than 1.5 stops from their neighbours, or where there is no order, from the median of all."""
-    found = []
-    for i, photo in enumerate(photos):
-        others = photos[max(0, i - EXPOSURE_WINDOW) : i + EXPOSURE_WINDOW + 1] if in_order else photos
-        if abs(photo.brightness - statistics.median(p.brightness for p in others)) > MAX_EXPOSURE_STOPS:
-            found.append(photo.name)
+    found = [photos[i].name for i in exposure_jumps([photo.brightness for photo in photos], in_order)]
     if not found:
         return []
     return [

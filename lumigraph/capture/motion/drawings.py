@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from .diagnosis import Diagnosis
 
 INK_COLOUR, FAINT_COLOUR, PAPER_COLOUR = "#1b1d22", "#6d717a", "#fbfaf8"
 LEFT_OUT_COLOUR, BLURRED_COLOUR, DUPLICATE_COLOUR = "#c0392b", "#d98200", "#3f6fb0"
+LACKING_COLOUR = "#c0392b"  # of circles where photographs are lacking
 PANEL_SIDE, MARGIN, LINE_HEIGHT = 720, 28, 20
 SUPERSAMPLING = 2  # for smooth lines and dots
 POINT_SHADE = 0.85  # factor on points' colours, so that white ones show on paper
@@ -31,17 +33,21 @@ FRUSTUM_DEPTH = 0.05  # as a share of the drawing's extent
 
 @dataclass(frozen=True)
 class Sketch:
-    """Geometry to draw, in a frame with +z up: corners are each camera's eye and the four corners of its picture."""
+    """Geometry to draw, in a frame with +z up: corners are each camera's eye and the four corners of its picture.
+
+    lacking: positions for photographs that would fill gaps
+    """
 
     eyes: Float[np.ndarray, "photo 3"]
     corners: Float[np.ndarray, "photo 4 3"]
     points: Float[np.ndarray, "point 3"]
     colours: UInt8[np.ndarray, "point 3"]
+    lacking: Float[np.ndarray, "place 3"]
 
 
 def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosis, keep_axes: bool = False) -> None:
     """Write a picture of an upright model. keep_axes: whether x goes right in it, as where x is east."""
-    sketch = sketch_of(model, diagnosis.registered, keep_axes)
+    sketch = sketch_of(model, diagnosis.registered, keep_axes, diagnosis.coverage.places if diagnosis.coverage else [])
     low, high = interesting(sketch)
     extent = high - low
     height = [round(PANEL_SIDE * min(max(extent[k] / extent[0], 0.35), 1.25)) for k in (1, 2)]
@@ -53,6 +59,8 @@ def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosi
         draw.text((corner[0], corner[1] - LINE_HEIGHT), name, FAINT_COLOUR, ImageFont.load_default(14))
         sheet.paste(draw_view(sketch, axis, low, high, (PANEL_SIDE, height[i])), corner)
     foot = "cameras from first (dark) to last (bright); points in their own colours"
+    if diagnosis.coverage and (advice := diagnosis.coverage.advice):
+        foot += f"; circles: add {advice[0]}" + (f", and {len(advice) - 1} more" if len(advice) > 1 else "")
     draw.text((MARGIN, sheet.height - MARGIN), foot, FAINT_COLOUR, ImageFont.load_default(14))
     save_picture(path, sheet, "capture")
 
@@ -64,7 +72,9 @@ def heading(diagnosis: Diagnosis) -> str:
     )
 
 
-def sketch_of(model: pycolmap.Reconstruction, names: list[str], keep_axes: bool) -> Sketch:
+def sketch_of(
+    model: pycolmap.Reconstruction, names: list[str], keep_axes: bool, lacking: Sequence[tuple[float, float, float]]
+) -> Sketch:
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     eyes, corners = [], []
     for name in names:
@@ -83,6 +93,7 @@ def sketch_of(model: pycolmap.Reconstruction, names: list[str], keep_axes: bool)
         np.array(corners) @ turn.T,
         np.array([point.xyz for point in found]).reshape(-1, 3) @ turn.T,
         np.array([point.color for point in found], np.uint8).reshape(-1, 3),
+        np.array(lacking).reshape(-1, 3) @ turn.T,
     )
 
 
@@ -96,7 +107,8 @@ def longest_first(eyes: Float[np.ndarray, "photo 3"]) -> Float[np.ndarray, "3 3"
 
 def interesting(sketch: Sketch) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
     """The box to show: all cameras, and most points, unless those are far off."""
-    low, high = sketch.eyes.min(0), sketch.eyes.max(0)
+    shown = np.concatenate([sketch.eyes, sketch.lacking])
+    low, high = shown.min(0), shown.max(0)
     if len(sketch.points):
         middle = np.median(sketch.points, axis=0)
         away = MAX_DISTANCE_FACTOR * np.median(np.linalg.norm(sketch.eyes - middle, axis=-1))
@@ -138,6 +150,8 @@ def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size
             draw.line([tuple(eye), tuple(tips[j])], colour, SUPERSAMPLING)
             draw.line([tuple(tips[j]), tuple(tips[(j + 1) % 4])], colour, SUPERSAMPLING)
         draw.ellipse([*(eye - 2.5 * SUPERSAMPLING), *(eye + 2.5 * SUPERSAMPLING)], colour)
+    for at in place(sketch.lacking):
+        draw.ellipse([*(at - 5 * SUPERSAMPLING), *(at + 5 * SUPERSAMPLING)], None, LACKING_COLOUR, 2 * SUPERSAMPLING)
     return image.resize(size, Image.Resampling.BOX)
 
 

@@ -22,10 +22,12 @@ from ...files.ranges import typed
 from ...system.library import pycolmap
 from ...system.progress import counting
 from ..colmap import poses_of
+from ..doctor import findings
 from ..photos import Intake, Photo, gather
 from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
+from ..transforms import read as read_transforms
 from .diagnosis import ALL_TURNED_SHARE, MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
 from .folder import (
@@ -57,7 +59,7 @@ MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must
 FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
-OUTPUT_VERSION = 2  # another number makes all outputs be written again
+OUTPUT_VERSION = 3  # another number makes all outputs be written again
 
 
 @dataclass(frozen=True)
@@ -425,9 +427,10 @@ class Reconstruction:
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)
-        result = self.summary(key, model, place, diagnosis)
+        found = findings(read_transforms(self.folder), diagnosis.left_out)
+        result = self.summary(key, model, place, diagnosis) | {"findings": [asdict(finding) for finding in found]}
         write_json(self.folder / RESULT_FILE, result, "capture")
-        return result
+        return read_json(self.folder / RESULT_FILE)
 
     def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
         """Turn a model so that +z is up; by GPS, which also gives metres and the origin, where that can tell."""

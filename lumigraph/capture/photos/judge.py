@@ -16,7 +16,8 @@ Effect", which compares slopes before and after blurring.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,9 @@ SOFT_SHARPNESS = 1.8  # below this a picture is blurred if others of the subject
 CRISP_SHARPNESS = 3.5  # above this a picture counts as sharp
 MIN_BLUR_RATIO = 1.6  # times less sharp than the others' median is noticeable, and
 MIN_DEVIATIONS = 4.0  # standard deviations of the logarithm below it is unusual
+
+MAX_EXPOSURE_STOPS = 1.5  # of exposure that a photograph may differ from others
+EXPOSURE_WINDOW = 5  # neighbours on each side with which a frame's exposure is compared
 
 SIGNATURE_SIDE = 96  # pixels to a side of a signature
 DETAIL_SIGMA = 3.0  # pixels of the grid; larger structures are shared by all pictures of one subject
@@ -124,6 +128,20 @@ def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
             found[name] = f"far less sharp than the others: {value:.1f} where they have {usual:.1f}"
         elif value < MIN_SHARPNESS:
             found[name] = f"no fine detail: sharpness {value:.1f} where clean edges have 4"
+    return found
+
+
+def exposure_jumps(brightness: Sequence[float], in_order: bool) -> dict[int, float]:
+    """Stops, by number, of photographs that differ by more than 1.5 from the median of their neighbours in order.
+
+    brightness: mean log2 of the linear luminance
+    in_order:   whether photographs follow each other in space; otherwise the median is that of all
+    """
+    found = {}
+    for i, own in enumerate(brightness):
+        others = brightness[max(0, i - EXPOSURE_WINDOW) : i + EXPOSURE_WINDOW + 1] if in_order else brightness
+        if abs(stops := own - statistics.median(others)) > MAX_EXPOSURE_STOPS:
+            found[i] = stops
     return found
 
 

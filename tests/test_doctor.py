@@ -1,0 +1,200 @@
+"""Faulty photographs are named with their fault, and no others: by pixels, by tracks, by what a run renders."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import tiny
+import torch
+from budgets import budget
+from PIL import Image, ImageFilter, ImageOps
+from views import FOCAL, HEIGHT, WALL, WIDTH, between, look_at, pattern, write_views
+
+from lumigraph.capture import read_capture
+from lumigraph.capture.coverage import coverage
+from lumigraph.capture.doctor import LACKING, Finding, Residual, deviations, findings, of_residuals
+from lumigraph.commands.cli import main
+from lumigraph.datasets.images import ImageStore
+from lumigraph.evaluation.photographs import RESULT_FILE, compare_all, examine, examined
+from lumigraph.evaluation.report import write_report
+from lumigraph.training import fit
+
+pytestmark = budget("capture", 8)
+
+TURN = np.radians(5)
+TURNED = np.array([[np.cos(TURN), 0, np.sin(TURN)], [0, 1, 0], [-np.sin(TURN), 0, np.cos(TURN)]])
+
+
+def drawn_capture(folder: Path) -> Path:
+    """Twelve photographs of a corner with transforms.json and a COLMAP model, all of which agree."""
+    poses = write_views(folder / "images")
+    random = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, WIDTH / 2, HEIGHT / 2])
+    camera.camera_id = 1
+    model.add_camera_with_trivial_rig(camera)
+    points, colours = [], []
+    for axis in range(3):
+        uv = random.uniform(0.02 * WALL, 0.7 * WALL, (150, 2))
+        points.append(np.insert(uv, axis, 0.0, axis=1))
+        colours.append(between(pattern(axis), *(uv / WALL * (len(pattern(axis)) - 1)).T))
+    tracks = defaultdict(list)
+    for number, (name, pose) in enumerate(poses.items(), 1):
+        inward = (np.concatenate(points) - pose[:, 3]) @ pose[:, :3]
+        xy = FOCAL * inward[:, :2] / inward[:, 2:] + (WIDTH / 2, HEIGHT / 2)
+        shown = np.flatnonzero((inward[:, 2] > 0) & (xy >= 0).all(-1) & (xy < (WIDTH, HEIGHT)).all(-1))
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy[k]) for k in shown])
+        whole = np.concatenate([pose, [[0, 0, 0, 1]]])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.linalg.inv(whole)[:3]))
+        for i, k in enumerate(shown.tolist()):
+            tracks[k].append((number, i))
+    for k, elements in tracks.items():
+        track = pycolmap.Track()
+        for element in elements:
+            track.add_element(*element)
+        model.add_point3D(np.concatenate(points)[k], track, np.concatenate(colours)[k].round().astype(np.uint8))
+    (folder / "sparse/0").mkdir(parents=True)
+    model.write_binary(folder / "sparse/0")
+    write_transforms(folder, poses)
+    return folder
+
+
+def write_transforms(folder: Path, poses: dict[str, np.ndarray]) -> None:
+    frames = []
+    for name, pose in poses.items():
+        matrix = np.concatenate([pose * [1, -1, -1, 1], [[0, 0, 0, 1]]])
+        frames.append({"file_path": f"images/{name}", "transform_matrix": matrix.tolist()})
+    lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2, "w": WIDTH, "h": HEIGHT}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory) -> Path:
+    """A capture without faults, until the first test spoils it."""
+    return drawn_capture(tmp_path_factory.mktemp("doctor") / "corner")
+
+
+def spoiled(folder: Path) -> dict[str, str]:
+    """Spoil four photographs of a drawn capture; gives name and fault of each."""
+    images = folder / "images"
+    for name, change in (
+        ("view02.jpg", lambda image: image.filter(ImageFilter.GaussianBlur(6))),
+        ("view05.jpg", ImageOps.mirror),
+        ("view07.jpg", lambda image: Image.fromarray(pattern(20, 512).astype(np.uint8)).resize(image.size)),
+    ):
+        with Image.open(images / name) as image:
+            changed = change(image.convert("RGB"))
+        changed.save(images / name, quality=95)
+    poses = {Path(shot.name).name: shot.pose.copy() for shot in read_capture(folder).shots}
+    poses["view09.jpg"][:, :3] @= TURNED
+    write_transforms(folder, poses)
+    return {
+        "view02.jpg": "blurred",
+        "view05.jpg": "mirrored",
+        "view07.jpg": "shows something else",
+        "view09.jpg": "placed badly",
+    }
+
+
+def test_spoiled_photographs_are_named_and_no_others(clean, capsys):
+    assert findings(read_capture(clean)) == []
+    expected = spoiled(clean)
+    found = findings(read_capture(clean))
+    assert {finding.photograph: finding.fault for finding in found} == expected and len(found) == 4
+    turned = next(finding for finding in found if finding.photograph == "view09.jpg")
+    assert "100 % of its tracks disagree" in turned.evidence and "lumigraph capture" in turned.advice
+    assert f"mv {clean / 'images/view05.jpg'}" in str(found)
+    assert main(["info", str(clean)]) == 0
+    out = capsys.readouterr().out
+    assert all(f"{name}: " in out for name in expected) and "shows something else" in out
+
+
+def test_photographs_without_a_pose_come_from_the_report_of_the_capture(clean):
+    path = clean / "capture.json"
+    path.write_text(json.dumps({"left_out": {"a.jpg": "shares too few details"}}))
+    first = findings(read_capture(clean))[0]
+    path.unlink()
+    assert (first.photograph, first.fault, first.evidence) == ("a.jpg", "left out", "shares too few details")
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory):
+    """A run that has learnt the ball, and its scene with three training photographs spoiled afterwards."""
+    scene = tiny.scene()
+    run = tiny.new_run(tmp_path_factory.mktemp("doctor") / "ball")
+    fit(run.new_method(), scene, run, steps=60, show=False, rehearsal=False)
+    pictures = [scene.images[i].byte().numpy() for i in range(len(scene))]
+    pictures[1] = pictures[1][:, ::-1].copy()
+    pictures[6] = np.full_like(pictures[6], 255)
+    pictures[6][::2, :, :3] = 0
+    pose = scene.cameras.pose.clone()
+    pose[10, :, :3] = pose[10, :, :3] @ torch.from_numpy(TURNED).float()
+    cameras = replace(scene.cameras, pose=pose)
+    return run, scene, replace(scene, images=ImageStore.from_arrays(pictures), cameras=cameras)
+
+
+def test_a_run_names_photographs_that_it_cannot_render(learnt):
+    run, scene, wrong = learnt
+    method = run.method()
+    assert of_residuals([one.residual for one in compare_all(method, scene)], (), set()) == []
+    faults = defaultdict(set)
+    for finding in of_residuals([one.residual for one in compare_all(method, wrong)], (), set()):
+        faults[finding.photograph].add(finding.fault)
+    assert faults == {"ball_1": {"mirrored"}, "ball_6": {"rendered badly"}, "ball_10": {"rendered badly"}}
+
+
+def test_the_worst_photographs_stand_in_the_report(learnt):
+    run, _, wrong = learnt
+    found = examine(run, run.method(), wrong)
+    checked = examined(run)
+    assert checked is not None and checked.findings == found and len(checked.residuals) == len(wrong)
+    page = write_report(run).read_text()
+    assert "Photographs to look at" in page and "ball_10" in page and "mirrored" in page
+    assert (run.folder / RESULT_FILE).exists()
+
+
+def test_depth_that_floats_is_a_fault():
+    """Of a photograph that is rendered worse than the others; otherwise it is a fault of the run."""
+    psnr = {"b": 21.5} | dict.fromkeys("acdefgh", 25.0)
+    rows = [Residual(name, "train", x, 10.0, 0.6 if name in "ab" else 0.0) for name, x in psnr.items()]
+    [finding] = of_residuals(rows, (), set())
+    assert (finding.photograph, finding.fault) == ("b", "contradicts depth") and "60 %" in finding.evidence
+
+
+def test_deviations_are_robust():
+    values = np.array([20.0, 20.1, 19.9, 20.2, 19.8, 5.0])
+    assert deviations(values, 1.0)[-1] == pytest.approx(14.95) and deviations(values, 1.0)[:-1].max() < 0.2
+
+
+def ring(degrees: np.ndarray, height: float | np.ndarray) -> np.ndarray:
+    turns = np.radians(degrees)
+    eyes = np.stack([3 * np.cos(turns), 3 * np.sin(turns), np.broadcast_to(height, turns.shape)], -1)
+    return np.stack([look_at(eye, np.zeros(3)) for eye in eyes])
+
+
+def test_lacking_directions_are_advised():
+    degrees = np.arange(-130, 135, 20.0)  # the first photograph is the middle of what lies opposite the gap
+    names = [f"{i}.jpg" for i in range(len(degrees))]
+    around = coverage(["front.jpg", *names], ring(np.array([0.0, *degrees]), np.array([1.5] + [0.0, 1.5] * 7)))
+    assert around.degrees == pytest.approx(260) and around.elevations == pytest.approx((0.0, 26.6), abs=0.1)
+    assert around.advice == ["4 more from behind, a step lower: between 13.jpg and 0.jpg"] and len(around.places) == 4
+    assert all(x < 0 and np.hypot(x, y) > 2 for x, y, _ in around.places)
+    flat = coverage(names, ring(np.arange(0, 360, 360 / len(names)), 0.5))
+    assert len(flat.advice) == 1 and "a second round of 12 photographs, a step higher" in flat.advice[0]
+    assert all(z > 1 for _, _, z in flat.places)
+
+
+def test_lacking_directions_are_findings(clean):
+    capture = read_capture(clean)
+    poses = ring(np.linspace(0, 260, len(capture.shots)), 0.5)
+    shots = [replace(shot, pose=pose) for shot, pose in zip(capture.shots, poses, strict=True)]
+    found = [f for f in findings(replace(capture, shots=shots), {}) if f.fault == LACKING]
+    assert len(found) == 2 and all(f.photograph == "" and isinstance(f, Finding) for f in found)
+    assert "260 of 360 degrees" in found[0].evidence and "between view11.jpg and view00.jpg" in found[0].advice
