@@ -113,8 +113,8 @@ def compare(photographs: Path, work: Path) -> tuple[Placed, Placed]:
 
 
 def main(options: Options) -> None:
-    table = Table("capture", "photographs", *(f"{who}: {what}" for who in ("ours", "COLMAP") for what in
-                  ("placed", "apart", "error, px", "points", "seconds")))  # fmt: skip
+    names = "placed", "apart", "error, px", "points", "seconds"
+    table = Table("capture", "photographs", *names, caption="Lumigraph / COLMAP's defaults")
     rows = []
     for source in options.folders:
         for count in (None, *options.count):
@@ -134,12 +134,12 @@ def main(options: Options) -> None:
             name = source.stem if source.name[:6] not in ("images", "video.") else f"{source.parent.name}/{source.name}"
             rows.append([name, len(chosen), *map(asdict, results)])
             cells = [
-                cell
+                (r.photographs, " ".join(map(str, r.apart)) or "-", f"{r.error:.2f}", r.points, f"{r.seconds:.0f}")
                 for r in results
-                for cell in (r.photographs, " ".join(map(str, r.apart)), f"{r.error:.2f}", r.points, f"{r.seconds:.0f}")
             ]
-            table.add_row(name, str(len(chosen)), *map(str, cells))
-            print(name, len(chosen), *cells, flush=True)
+            pairs = [f"{ours} / {theirs}" for ours, theirs in zip(*cells, strict=True)]
+            table.add_row(name, str(len(chosen)), *pairs)
+            print(name, len(chosen), *pairs, sep="  ", flush=True)
             if options.output:
                 files.write_json(options.output, rows)
     console().print(table)
