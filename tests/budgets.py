@@ -21,7 +21,7 @@ from numba.core import event
 # Seconds on two cores like those of a plain cloud machine, by group.
 BUDGETS: dict[str, float] = {
     "kernels": 150,
-    "capture": 120,
+    "capture": 150,
     "exports": 95,
     "runs": 180,
     "methods": 120,

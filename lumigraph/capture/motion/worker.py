@@ -28,6 +28,7 @@ BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the databas
 MIN_MODEL_VIEWS = 3  # photographs of a model
 MAX_THREADS = 16  # more threads need more memory than they save time
 MIN_ADDED_INLIERS = 18  # inliers that place a photograph in a finished model; COLMAP's 30 hold while it grows
+MIN_VIEW_POINTS = 15  # points that a placed photograph shows in the end, as two photographs must share to be compared
 MAX_ADJUSTMENT_STEPS = 30
 MIN_HELD_POINTS = 30  # points whose error decides on a lens
 MIN_GAIN = 0.99  # error of held-out tracks with the full lens, of that with the simple one, below which it is kept
@@ -128,6 +129,8 @@ def refine_lenses(job: dict[str, Any]) -> None:
         if sane and after < MIN_GAIN * before:
             set_full(model, lenses)
             adjust(model)
+    for image in [image for image in model.images.values() if image.has_pose and image.num_points3D < MIN_VIEW_POINTS]:
+        model.deregister_frame(image.frame_id)  # so few do not determine a pose
     os.makedirs(job["models"])
     model.write(job["models"])
 
