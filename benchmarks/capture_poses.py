@@ -1,4 +1,4 @@
-"""How well a capture agrees with a reference: camera positions after the best similarity between the two.
+"""Compare a capture with a reference: camera positions after the best similarity between the two.
 
     python benchmarks/capture_poses.py SCENE REFERENCE
 

@@ -55,7 +55,7 @@ def main(options: Options) -> None:
 
 
 class PlainLayer(nn.Linear):
-    """What `components.fields.layers.Dense` does, without anything that makes it quick."""
+    """The layer `components.fields.layers.Dense`, without its optimisations."""
 
     def forward(self, x: Tensor) -> Tensor:
         y = super().forward(x.float())

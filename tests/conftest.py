@@ -31,7 +31,7 @@ from numba.core import event  # isort: skip
 
 LIMIT = 300  # seconds of waiting, in whatever state the machine is, that a test's setup, body or end may take
 PACKAGE = Path(lumigraph.__file__).parent
-FIRST = ["test_contract", "test_bounds", "test_seeded_faults"]  # the last two run kernels as plain Python
+FIRST_FILES = ["test_contract", "test_bounds", "test_seeded_faults"]  # the last two run kernels as plain Python
 JIT = re.compile(r"^\s*(import|from) (numba|triton)\b", re.MULTILINE)
 
 
@@ -73,7 +73,7 @@ event.register("numba:compile", LEDGER.compiling)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def order(item: pytest.Item) -> tuple[bool, int, float]:
         file, share = item.path.stem, share_of(item.get_closest_marker("budget"))[1]
-        place = FIRST.index(file) if file in FIRST else len(FIRST)
+        place = FIRST_FILES.index(file) if file in FIRST_FILES else len(FIRST_FILES)
         return "chromium" in getattr(item, "fixturenames", ()), place, -share
 
     items.sort(key=order)

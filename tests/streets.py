@@ -32,7 +32,7 @@ def write_street(folder: Path, photographs: int = 36, phase: float = 0.0, length
 
 
 def picture(eye: np.ndarray, right: np.ndarray, down: np.ndarray, forward: np.ndarray, phase: float) -> np.ndarray:
-    """What a camera sees of the walls, bytes (height, width, 3)."""
+    """Picture of the walls, bytes (height, width, 3)."""
     v, u = np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / SIZE] * 2, indexing="ij")
     ways = u[..., None] * right + v[..., None] * down + forward
     x, y, z = np.moveaxis(eye + (HALF_WIDTH / np.abs(ways[..., 1:2])) * ways, -1, 0)

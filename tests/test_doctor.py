@@ -161,7 +161,7 @@ def test_the_worst_photographs_stand_in_the_report(learnt):
 
 
 def test_depth_that_floats_is_a_fault():
-    """Of a photograph that is rendered worse than the others; otherwise it is a fault of the run."""
+    """Depth is a photograph's fault only if its rendering is worse than the others; otherwise it is the run's."""
     psnr = {"b": 21.5} | dict.fromkeys("acdefgh", 25.0)
     rows = [Residual(name, "train", x, 10.0, 0.6 if name in "ab" else 0.0) for name, x in psnr.items()]
     [finding] = of_residuals(rows, (), set())

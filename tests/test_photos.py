@@ -157,7 +157,7 @@ def heic(path: Path, image: Image.Image, exif: Image.Exif) -> Path:
 
 @pytest.mark.parametrize(("orientation", "undo"), [(1, None), (6, "ROTATE_90")])
 def test_heic_of_a_phone_is_turned_upright_once(tmp_path, orientation, undo):
-    """As a phone writes it: stored on its side, with a turn for decoders and the same in EXIF."""
+    """A phone's file: stored on its side, with a turn for decoders and the same in EXIF."""
     upright = Image.fromarray(gaussian_filter(np.asarray(view(100)), (2, 2, 0)))
     stored = upright.transpose(Image.Transpose[undo]) if undo else upright
     exif = tags({0xA405: 26}, orientation=orientation, make="Apple", model="iPhone 14")

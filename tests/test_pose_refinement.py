@@ -19,7 +19,7 @@ from lumigraph.capture.capture import Shot
 from lumigraph.capture.oddities import about_fold
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
-from lumigraph.components.training.schedules import BEGINS, ENDS, FIRST, band_weights
+from lumigraph.components.training.schedules import BEGINS, ENDS, INITIAL_BANDS, band_weights
 from lumigraph.datasets.alignment import aligning, moves
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
@@ -140,7 +140,7 @@ def test_a_step_moves_the_picture_equally_far_whichever_way():
 
 def test_bands_join_one_after_another():
     first, middle, last = (band_weights(8, progress) for progress in (0.0, (BEGINS + ENDS) / 2, 1.0))
-    assert first.tolist() == [1.0] * int(8 * FIRST) + [0.0] * int(8 - 8 * FIRST)
+    assert first.tolist() == [1.0] * int(8 * INITIAL_BANDS) + [0.0] * int(8 - 8 * INITIAL_BANDS)
     assert (middle.diff() <= 0).all() and middle[4] == 1 and middle[5:].tolist() == [0.0] * 3
     assert last.tolist() == [1.0] * 8
     alpha = 2.5  # from 1 to 4 of 4 bands

@@ -54,7 +54,7 @@ def panorama(width: int) -> np.ndarray:
 
 
 def draw(pose: np.ndarray, walls: list[np.ndarray], inward: np.ndarray | None = None) -> Image.Image:
-    """What a camera sees of the walls x = 0, y = 0 and z = 0, and of those opposite if there are more."""
+    """Picture of the walls x = 0, y = 0 and z = 0, and of those opposite if there are more."""
     inward = pinhole() if inward is None else inward
     directions, eye = inward @ pose[:, :3].T, pose[:, 3]
     picture, nearest = np.zeros(inward.shape), np.full(inward.shape[:2], np.inf)

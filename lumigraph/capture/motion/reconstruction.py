@@ -236,18 +236,24 @@ class Reconstruction:
             with replacing(self.database, ours=True) as partial:
                 write_database(partial, self.groups, self.lens)
         with self.stages.working("features", key):
-            self.colmap(
-                "Finding details",
-                len(self.names),
-                self.database,
-                stage="features",
-                names=self.names,
-                images=str(self.images),
-                masks=self.masks and str(self.masks),
-                max_size=self.max_size,
-                features=self.count_features(),
-                contrast=1.0,
-            )
+            self.detect("Finding details", self.database, self.names, self.max_size, self.count_features(), 1.0)
+
+    def detect(
+        self, description: str, database: Path, names: list[str], max_size: int, features: int, contrast: float
+    ) -> None:
+        """Detect features of photographs that have none in a database; contrast: of COLMAP's threshold."""
+        self.colmap(
+            description,
+            len(self.names),
+            database,
+            stage="features",
+            names=names,
+            images=str(self.images),
+            masks=self.masks and str(self.masks),
+            max_size=max_size,
+            features=features,
+            contrast=contrast,
+        )
 
     def compare(self, key: str) -> None:
         if self.stages.is_done("matching", key):
@@ -302,7 +308,7 @@ class Reconstruction:
                     self.map(self.near, partial, "incremental")
 
     def complete(self, key: str) -> None:
-        """Join models that stand apart, then look again at photographs without a place.
+        """Join models that stand apart, then place the photographs that were left out in a second pass.
 
         Their features are detected at the size and the contrast that the first pass has left out, they are compared
         once more, and mapping continues from the largest model.
@@ -310,6 +316,7 @@ class Reconstruction:
         if self.stages.is_done("completing", key) and self.completed.is_dir():
             return
         with self.stages.working("completing", key), replacing_folder(self.completed, ours=True) as partial:
+            remove_database(self.second)  # of other photographs
             found, _, database = self.choose(read_matches(self.database))
             apart = [partial / f"apart{i}" for i in range(len(found))]
             for place, model in zip(apart, found, strict=True):
@@ -324,20 +331,17 @@ class Reconstruction:
                 )  # fmt: skip
             left = set(self.names) - (registered(pycolmap.Reconstruction(best)) if best else set())
             if left:
-                self.look_again(left, database)
+                self.match_again(left, database)
                 again = partial / "again"
                 again.mkdir()
                 self.map(self.second, again, "incremental", best)
 
-    def look_again(self, left: set[str], database: Path) -> None:
-        """The database of the second pass: other features of the photographs without a place, and their matches."""
+    def match_again(self, left: set[str], database: Path) -> None:
+        """Make the database of the second pass: other features of the photographs without a place, and matches."""
         copy_database(database, self.second)
-        forget(self.second, left)
-        self.colmap(
-            "Finding more details", len(self.names), self.second, stage="features",
-            names=sorted(left), images=str(self.images), masks=self.masks and str(self.masks),
-            max_size=max(MAX_SECOND_SIDE, self.max_size), features=MAX_FEATURES, contrast=SECOND_CONTRAST,
-        )  # fmt: skip
+        delete_features(self.second, left)
+        side = max(MAX_SECOND_SIDE, self.max_size)
+        self.detect("Finding more details", self.second, sorted(left), side, MAX_FEATURES, SECOND_CONTRAST)
         self.match(self.second, left)
 
     def refine(self, key: str) -> None:
@@ -499,7 +503,7 @@ def copy_database(source: Path, target: Path) -> None:
         old.backup(new)
 
 
-def forget(path: Path, names: Container[str]) -> None:
+def delete_features(path: Path, names: Container[str]) -> None:
     """Delete the features of photographs and their matches from a database."""
     with closing(pycolmap.Database.open(path)) as database:
         gone = {image.image_id for image in database.read_all_images() if image.name in names}

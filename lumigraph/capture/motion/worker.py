@@ -129,8 +129,10 @@ def refine_lenses(job: dict[str, Any]) -> None:
         if sane and after < MIN_GAIN * before:
             set_full(model, lenses)
             adjust(model)
-    for image in [image for image in model.images.values() if image.has_pose and image.num_points3D < MIN_VIEW_POINTS]:
-        model.deregister_frame(image.frame_id)  # so few do not determine a pose
+    weak = [image for image in model.images.values() if image.has_pose and image.num_points3D < MIN_VIEW_POINTS]
+    if model.num_reg_images() - len(weak) >= MIN_MODEL_VIEWS:
+        for image in weak:  # so few do not determine a pose
+            model.deregister_frame(image.frame_id)
     os.makedirs(job["models"])
     model.write(job["models"])
 

@@ -47,7 +47,7 @@ def held_decay(method: Any, step: int, progress: float) -> float:
     return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
 
-FIRST = 1 / 4  # share of the bands that are there from the beginning
+INITIAL_BANDS = 1 / 4  # share of the bands that are there from the beginning
 BEGINS, ENDS = 0.05, 0.4  # shares of the budget between which the others join
 
 
@@ -57,11 +57,11 @@ def band_weights(count: int, progress: float, begins: float = BEGINS, ends: floa
         w_k = 0 for alpha < k,  (1 - cos((alpha - k) pi)) / 2 for alpha - k in [0, 1),  1 beyond
 
     count:    of bands: octaves of waves, levels of a hash table
-    progress: share of the budget that is spent; alpha grows evenly with it, from FIRST of the bands to all of them,
+    progress: share of the budget that is spent; alpha grows evenly with it, from INITIAL_BANDS of them to all,
               between the shares `begins` and `ends`
     """
     grown = min(max((progress - begins) / (ends - begins), 0.0), 1.0)
-    first = max(1.0, FIRST * count)
+    first = max(1.0, INITIAL_BANDS * count)
     alpha = first + grown * (count - first)
     return (1 - torch.cos(math.pi * (alpha - torch.arange(count)).clamp(0, 1))) / 2
 
