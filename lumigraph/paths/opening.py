@@ -20,9 +20,7 @@ OUTWARD_FOCUS_DISTANCE = 0.02  # scene units from an outward-looking camera to i
 MIN_FOCUS_SHARE = 0.1  # of the typical distance to the focus: smallest distance of a pivot
 MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # limits of zooming, times the first distance to the target
 MAX_OPEN_DISTANCE = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
-HIGHEST = (
-    2.0  # degrees between up and the direction from the target to the camera, at least; likewise in web/src/stage.js
-)
+MIN_POLAR = 2.0  # degrees between up and the direction from the target to the camera; likewise in web/src/stage.js
 DEGREES_BELOW, DEGREES_BELOW_OPEN = 20.0, 5.0  # limit of the camera below the lowest photograph; for open scenes
 SUBJECT_SHARE = 0.7  # radius of the subject at most, as a share of the radius that the typical photograph shows
 MIN_SUBJECT_POINTS = 16  # sparse points from which on they say where the subject ends
@@ -92,7 +90,7 @@ class Opening:
         x, y, z = position - target
         distance = math.hypot(x, y, z)
         polar = math.degrees(math.acos(z / distance)) if distance else 0.0
-        polar = math.radians(min(max(polar, HIGHEST), self.lowest))
+        polar = math.radians(min(max(polar, MIN_POLAR), self.lowest))
         distance = min(max(distance, self.nearest), self.farthest)
         level, azimuth = distance * math.sin(polar), math.atan2(y, x)
         low, high = self.within or (target, target)
