@@ -30,7 +30,16 @@ from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from ..transforms import read as read_transforms
 from .demand import demand_of, fitted
-from .diagnosis import ALL_TURNED_SHARE, MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
+from .diagnosis import (
+    ALL_TURNED_SHARE,
+    MIN_FEATURES,
+    Diagnosis,
+    Matches,
+    diagnose,
+    folds,
+    read_matches,
+    triangulation_angle,
+)
 from .drawings import draw_capture, draw_photographs
 from .folder import (
     DRAWING_FILES,
@@ -52,6 +61,7 @@ from .stages import Stages, key_of
 from .stitching import stitch
 
 MIN_VIEWS = 3  # photographs of a model
+MIN_PARALLAX = 0.3  # degrees, median over points: below it photographs that turned have no depth
 BLACK = -10.5  # mean log2 of the luminance, below which a photograph is black: 2 of 255
 MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
@@ -63,7 +73,7 @@ MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must
 FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
-OUTPUT_VERSION = 3  # another number makes all outputs be written again
+OUTPUT_VERSION = 4  # another number makes all outputs be written again
 
 
 @dataclass(frozen=True)
@@ -428,7 +438,8 @@ class Reconstruction:
         found, told, _ = self.choose(matches)
         if self.refined.is_dir():
             found = [pycolmap.Reconstruction(self.refined), *found]
-        if not found or found[0].num_reg_images() < MIN_VIEWS or matches.are_turned(ALL_TURNED_SHARE):
+        flat = bool(found) and matches.are_turned() and triangulation_angle(found[0]) < MIN_PARALLAX
+        if not found or found[0].num_reg_images() < MIN_VIEWS or flat or matches.are_turned(ALL_TURNED_SHARE):
             instead = self.folder / PANORAMA_FILE
             stitched = matches.are_turned() and stitch(database, self.images, instead)
             raise LumigraphError(nothing_fits(self.intake, self.photos, matches, instead if stitched else None))

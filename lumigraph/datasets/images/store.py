@@ -57,7 +57,7 @@ class Runs:
 
 
 def runs_of(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:
-    """Where runs of trusted pixels begin, row by row, and how long they are."""
+    """Runs of trusted pixels, row by row: the pixel at which each begins, and its length in pixels."""
     edges = np.flatnonzero(np.diff(mask.ravel().astype(np.int8), prepend=0, append=0))
     return edges[::2], edges[1::2] - edges[::2]
 
