@@ -18,8 +18,8 @@ from lumigraph.camera import Camera
 from lumigraph.camera.crop import Crop, CropBox, Sphere
 from lumigraph.camera.rays import Rays
 from lumigraph.commands import cli
-from lumigraph.components.clouds.floaters import evidence
 from lumigraph.composition import PickedCloud, cropped
+from lumigraph.composition.floaters import evidence
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import cleaned, extent, joined, unwanted

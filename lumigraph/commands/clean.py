@@ -39,7 +39,7 @@ class Clean:
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..components.clouds.floaters import evidence
+        from ..composition.floaters import evidence
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cloud import gone, unwanted

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ...camera import Camera
-from ...datasets.scene import Frame
-from ...depth_maps import DepthMap
-from ...gaussians import Gaussians
-from ...gaussians.cloud import ISOLATION_NEIGHBOURS, gaps
-from ...gaussians.splatting import render
-from ...geometry import evenly
-from ...system.progress import track
+from ..camera import Camera
+from ..datasets.scene import Frame
+from ..depth_maps import DepthMap
+from ..gaussians import Gaussians
+from ..gaussians.cloud import ISOLATION_NEIGHBOURS, gaps
+from ..gaussians.splatting import render
+from ..geometry import evenly
+from ..system.progress import track
 
 STRENGTH = 0.4  # default share of the slider: Gaussians with a score above 1 - STRENGTH are removed
 MAX_VIEWS, MAX_SIDE = 32, 200  # depth maps of a pass, and pixels of the longer side of each
@@ -24,7 +24,7 @@ PASSES = 2  # of depth; from the second on, the first one's floaters hide no sur
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance, in front of which nothing is rendered
 CORE_DEVIATIONS = 1.5  # of isolation, up to which a Gaussian shows depth in the first pass
 MIN_DEVIATIONS, MAX_DEVIATIONS = 0.5, 3.0  # robust deviations of isolation at which its evidence is 0 and 1
-NEAR_SHARE = 0.5  # of the median depth of the nearest camera, up to which a Gaussian counts as near
+NEAR_SHARE = 0.5  # of the cameras' median depth, up to which a Gaussian counts as near
 MAX_CORE_NEAR, MAX_CORE_SCORE = 0.2, 0.25  # evidence and score of Gaussians that show depth
 FEW_VIEWS = 4  # cameras, from which on a Gaussian is not seen by few
 FEW_WEIGHT = 0.5  # of being seen by few; the border of a scene is too
@@ -33,12 +33,12 @@ SURFACE_SHARE, SURFACE_DEVIATIONS = 0.05, 2.0  # of the distance, and deviations
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Evidence that each Gaussian is a floater, each measure in [0, 1].
+class FloaterEvidence:
+    """FloaterEvidence that each Gaussian is a floater, each measure in [0, 1].
 
     isolated: distance to its neighbours in sizes of both, in robust deviations from the median
     in_front: share of cameras that see a surface clearly behind it, among those that it is not hidden from
-    near:     closeness to a camera, in median depths of what that camera sees
+    near:     closeness to a camera, in median depths of what cameras see
     few:      1 if no camera sees it, 0 from four cameras on
     """
 
@@ -49,7 +49,7 @@ class Evidence:
 
     @property
     def place(self) -> Float[Tensor, " gaussian"]:
-        """Evidence of the place: in front, near a camera, or seen by few, each of which suffices."""
+        """FloaterEvidence of the place: in front, near a camera, or seen by few, each of which suffices."""
         return 1 - (1 - self.in_front) * (1 - self.near) * (1 - FEW_WEIGHT * self.few)
 
     @property
@@ -63,18 +63,18 @@ class Evidence:
 
 
 @torch.no_grad()
-def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> Evidence:
-    """Evidence on each Gaussian of a cloud.
+def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> FloaterEvidence:
+    """FloaterEvidence on each Gaussian of a cloud.
 
     cameras: of the photographs, in the cloud's frame; None without photographs
     """
     device, count = gaussians.means.device, len(gaussians)
     isolated, none = isolation(gaussians), torch.zeros(count, device=device)
     if cameras is None or not count:
-        return Evidence(isolated, none + UNKNOWN_PLACE, none, none)
+        return FloaterEvidence(isolated, none + UNKNOWN_PLACE, none, none)
     chosen = cameras[torch.tensor(evenly(range(len(cameras)), MAX_VIEWS))].to("cpu")
     means, sizes = gaussians.means.cpu(), gaussians.log_scales.exp().amax(-1).cpu()
-    near = nearness(gaussians, chosen, frame)
+    near = nearness(gaussians, cameras, chosen, frame)
     core = (isolated.cpu() * (MAX_DEVIATIONS - MIN_DEVIATIONS) < CORE_DEVIATIONS - MIN_DEVIATIONS) & (
         near < MAX_CORE_NEAR
     )
@@ -87,13 +87,13 @@ def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> Evid
             past += finite & (compared.ahead > tolerance)
             on += finite & (compared.ahead.abs() <= tolerance)
         few = (1 - (past + on) / FEW_VIEWS).clamp(0, 1)
-        found = Evidence(*(x.to(device) for x in (isolated, past / (past + on + 1), near, few)))
+        found = FloaterEvidence(*(x.to(device) for x in (isolated, past / (past + on + 1), near, few)))
         core = (found.score.cpu() < MAX_CORE_SCORE) & (near < NEAR_SHARE)
     return found
 
 
 def isolation(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
-    """Evidence of isolation: the logarithm of `gaps`, in robust deviations, from 0 at 0.5 to 1 at 3."""
+    """FloaterEvidence of isolation: the logarithm of `gaps`, in robust deviations, from 0 at 0.5 to 1 at 3."""
     if len(gaussians) <= ISOLATION_NEIGHBOURS:
         return torch.zeros(len(gaussians), device=gaussians.means.device)
     logs = gaps(gaussians).log()
@@ -102,14 +102,19 @@ def isolation(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
     return ((deviations - MIN_DEVIATIONS) / (MAX_DEVIATIONS - MIN_DEVIATIONS)).clamp(0, 1)
 
 
-def nearness(gaussians: Gaussians, cameras: Camera, frame: Frame) -> Float[Tensor, " gaussian"]:
-    """Evidence of being near a camera: 1 at the camera, 0 from half of its median depth on."""
-    nearest = torch.full((len(gaussians),), torch.inf)
-    for seen in depth_maps(gaussians, cameras, frame):
-        if seen.solid.any():
-            away = (gaussians.means.cpu() - seen.camera.position).norm(dim=-1)
-            nearest = torch.minimum(nearest, away / seen.depth[seen.solid].median())
-    return (1 - nearest / NEAR_SHARE).clamp(0, 1)
+def nearness(gaussians: Gaussians, cameras: Camera, seen: Camera, frame: Frame) -> Float[Tensor, " gaussian"]:
+    """Evidence of being near one of the cameras: 1 at the camera, 0 from half of the median depth on.
+
+    seen: the cameras whose depth is measured
+    """
+    depths = [x.depth[x.solid].median() for x in depth_maps(gaussians, seen, frame) if x.solid.any()]
+    if not depths:
+        return torch.zeros(len(gaussians))
+    usual = torch.stack(depths).median()
+    nearest = torch.cat(
+        [torch.cdist(some, cameras.position.cpu()).amin(-1) for some in gaussians.means.cpu().split(1 << 14)]
+    )
+    return (1 - nearest / usual / NEAR_SHARE).clamp(0, 1)
 
 
 def depth_maps(gaussians: Gaussians, cameras: Camera, frame: Frame) -> Iterator[DepthMap]:
