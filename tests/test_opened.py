@@ -45,7 +45,7 @@ def folder(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("name", "title", "photographed", "renders"),
     [
-        ("ball", "in memory", True, "ball/renders"),
+        ("ball", "ball", True, "ball/renders"),
         ("red.compressed.ply", "red", False, "renders/red"),
         ("both.json", "both", True, "renders/both"),
     ],
