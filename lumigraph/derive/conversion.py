@@ -138,7 +138,7 @@ def convert(
 
 
 def stage_names(distil: bool, going_on: bool) -> list[str]:
-    """NumberedStages of a conversion. distil: learns from renderings; going_on: was interrupted, so it is initialised"""
+    """Stages of a conversion. distil: learns from renderings; going_on: was interrupted, so it is initialised"""
     return [*["render views to learn from"] * distil, *["initialise"] * (not going_on), "train", "compare"]
 
 
