@@ -326,7 +326,7 @@ def test_a_film_of_a_method(ball_run, tmp_path):
 def test_a_film_as_a_moving_picture_has_a_twin_of_depth(ball_run, tmp_path):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 3, (26, 24))
     film(ball_run.method(), path, tmp_path / "orbit.webp", fps=10, depth=True)
-    assert names(tmp_path) == ["orbit", "orbit-depth.webp", "orbit.json", "orbit.webp"]
+    assert names(tmp_path) == ["orbit-depth.webp", "orbit.json", "orbit.webp"]
     assert len(pictures_of(tmp_path / "orbit.webp")) == len(pictures_of(tmp_path / "orbit-depth.webp")) == 3
 
 
@@ -415,7 +415,7 @@ class Page(html.parser.HTMLParser):
 
 def test_the_report_is_one_file_that_loads_nothing(ball_run):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 6, (24, 24))
-    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4")
+    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4", depth=True)
     evaluation = evaluate(ball_run.method(), tiny.scene())
     result = evaluation.to_json() | {"evaluated_on": "cpu", "steps": 3}
     (ball_run.folder / "eval.json").write_text(json.dumps(result))

@@ -148,9 +148,9 @@ def listed() -> str:
     for name, into in ways().items():
         alike.setdefault(tuple(into.items()), []).append(name)
     lines = []
-    for into, names in alike.items():
+    for ways_in, names in alike.items():
         targets: dict[str, list[str]] = {}
-        for target, way in into:
+        for target, way in ways_in:
             targets.setdefault(way or "not into", []).append(target)
         ordered = sorted(targets.items(), key=lambda item: (item[0] == "not into", item[0]))
         lines += ["", *(listing(title, names) for title, names in [("from", names), *ordered])]
