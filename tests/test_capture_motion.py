@@ -22,6 +22,7 @@ from views import draw, look_at, panorama, pattern, pinhole, spoil, write_views
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
+from lumigraph.capture.coverage import use_of
 from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction, sphere, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
