@@ -23,6 +23,7 @@ from views import FOCAL, WIDTH, draw, look_at, panorama, pattern, pinhole, spoil
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
+from lumigraph.capture.coverage import use_of
 from lumigraph.capture.motion import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
@@ -544,6 +545,12 @@ def test_gaps_around_a_subject():
     assert [round(gap.degrees) for gap in some.gaps] == [105] and set(some.gaps[0].between) == {"17", "0"}
     ahead = np.stack([look_at(np.array([x, 0, 0.0]), np.array([x, 5, 0])) for x in range(3)])
     assert coverage(names[:3], ahead) is None
+    side = coverage(names[:7], ring(np.arange(0, 105, 15)))
+    assert side.ends == (names[0], names[6])
+    told = use_of(side.degrees, side.ends)
+    assert told.startswith(f"enough for views of one side of an object, from between {names[0]} and {names[6]}")
+    assert "take 13 photographs more" in told and "front" in use_of(40.0, side.ends)
+    assert use_of(360.0, None) == "enough for views from all sides"
 
 
 def test_exposure_rotation_and_reasons():

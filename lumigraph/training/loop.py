@@ -21,6 +21,7 @@ from ..figures import save_picture
 from ..method import Lesson, Method
 from ..run import Run, State, check_memory
 from ..system.memory import peak_memory
+from ..system.progress import counting
 from ..system.signals import Interrupt
 from .demand import about_memory
 from .display import TrainingDisplay
@@ -102,7 +103,10 @@ def fit(
     with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
         fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
         display.begin(data, about_memory(method, data))
-        compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
+        compile_seconds = state.compile_seconds
+        if rehearsal:
+            with display.aside(), counting("Compiling kernels"):
+                compile_seconds += rehearse(method, data, state.step)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
         if run:
             run.restore_training(optimizers, generator)
