@@ -67,7 +67,7 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # of a matrix
 
 
-def numbers(kind: Any) -> Iterator[tuple[type, msgspec.Meta | None]]:
+def numbers(kind: Any) -> Iterator[tuple[type, Any]]:
     """Every number within an annotation, as (int or float, its range, None where it has none)."""
     if get_origin(kind) is Annotated:
         inner, *about = get_args(kind)
