@@ -16,13 +16,14 @@ import tyro
 from rich.table import Table
 
 from lumigraph.derive.compression import LADDER, CompressionTarget
-from lumigraph.derive.compression.compress import Ladder, important, truth_of
+from lumigraph.derive.compression.compress import STAGES, Ladder, important, truth_of
 from lumigraph.evaluation import evaluate
 from lumigraph.figures.charts import Series, line_chart, standalone
-from lumigraph.files import write_bytes, write_json
+from lumigraph.files import scene_name, write_bytes, write_json
 from lumigraph.methods import colour
 from lumigraph.run import Run
 from lumigraph.system.console import console
+from lumigraph.system.progress import NumberedStages
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,18 @@ def rungs(run: Run, options: Options) -> list[dict]:
         CompressionTarget(loss=0.0, steps=options.steps, seconds=timed),
         options.device,
         important(before, truth),
+        NumberedStages(STAGES, "", show=False),
     )
     psnr = evaluate(before, truth.scene, "test", views=options.views).psnr
-    rows = [{"method": run.method_name, "scene": run.title, "rung": None, "bytes": run.model_bytes, "psnr": psnr}]
+    rows = [
+        {
+            "method": run.method_name,
+            "scene": scene_name(run.settings.scene.source),
+            "rung": None,
+            "bytes": run.model_bytes,
+            "psnr": psnr,
+        }
+    ]
     for number in range(0, len(LADDER), options.every):
         begin, model = time.perf_counter(), ladder.at(number)
         ladder.tune(model, 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -18,11 +19,12 @@ import torch
 from budgets import budget
 from PIL import Image
 from scipy.spatial import KDTree
-from views import draw, look_at, panorama, pattern, pinhole, spoil, write_views
+from views import FOCAL, WIDTH, draw, look_at, panorama, pattern, pinhole, spoil, write_views
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
-from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction, sphere, worker
+from lumigraph.capture.coverage import use_of
+from lumigraph.capture.motion import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
@@ -329,8 +331,19 @@ def test_a_camera_that_only_turned_shows_no_parallax(tmp_path):
     for i in range(4):
         aim = eye + [-np.cos(0.3 + 0.2 * i), -np.sin(0.3 + 0.2 * i), -0.2]
         draw(look_at(eye, aim), walls).save(photos / f"{i}.jpg", quality=95)
-    with pytest.raises(LumigraphError, match="taken from one place, so that nothing shows parallax.* a step apart"):
+    with pytest.raises(LumigraphError, match=r"nothing shows parallax.*; .*panorama.jpg is a panorama .* a step apart"):
         reconstruct([photos], tmp_path / "scene")
+    made = np.asarray(Image.open(tmp_path / "scene/panorama.jpg"), float)
+    level = look_at(eye, eye + [-np.cos(0.6), -np.sin(0.6), 0])
+    truth, (height, width) = np.asarray(draw(level, walls, panorama(2 * round(np.pi * FOCAL))), float), made.shape[:2]
+    assert width == pytest.approx((0.6 + 2 * np.arctan(WIDTH / 2 / FOCAL)) * FOCAL, rel=0.08)
+    shown, left = made.sum(-1) > 0, (truth.shape[1] - width) // 2
+    errors = [
+        np.abs(made - truth[row : row + height, column : column + width])[shown].mean()
+        for row in range(truth.shape[0] // 2 - height, truth.shape[0] // 2, 2)
+        for column in range(left - 12, left + 12, 2)
+    ]
+    assert min(errors) < 25 and np.median(errors) > 50  # of 255: it is that place, and nothing is doubled
 
 
 def test_turns_are_told_from_planes():
@@ -434,6 +447,22 @@ def photo(name: str, **facts) -> Photo:
     return Photo(name, Path(name), **{"size": (100, 80), **facts})
 
 
+def test_a_capture_that_would_not_fit_gets_fewer_threads_smaller_photographs_and_fewer_features():
+    photos = [photo(f"{i}", size=(4000, 3000)) for i in range(1000)]
+    asked = replace(demand.demand_of(photos, "retrieval", 1600, 2048), threads=8)
+    assert 20_000 < asked.pairs < 30_000 and 600 < asked.seconds < 36_000
+    found, cuts = demand.fitted(asked, 16e9)
+    assert found == asked and not cuts and "1,000 photographs of up to 4000x3000" in found.say()
+    for free, (threads, side, features) in {4e9: (4, 1600, 2048), 1e9: (1, 1182, 571)}.items():
+        found, cuts = demand.fitted(asked, free)
+        assert (found.threads, found.max_size, found.features) == (threads, side, features)
+        assert found.memory <= free and len(cuts) == (threads < 8) + (side < 1600) + (features < 2048)
+    assert re.search(r"1 thread at a time .* with 7\.0 GB free", cuts[0])
+    assert "features at 1,182 pixels instead of 1,600; with 2.3 GB free" in cuts[1] and "--max-size 1600" in cuts[1]
+    with pytest.raises(LumigraphError, match="1,000 photographs of 4000x3000 pixels would need .* and 0.5 GB are free"):
+        demand.fitted(asked, 5e8)
+
+
 def test_who_shares_a_lens():
     phone = [photo(f"p{i}", device="phone", focal=90.0 + i) for i in range(3)]
     tourists = [photo("t0", size=(90, 60)), photo("t1", size=(91, 60)), photo("t2", size=(60, 90))]
@@ -516,6 +545,12 @@ def test_gaps_around_a_subject():
     assert [round(gap.degrees) for gap in some.gaps] == [105] and set(some.gaps[0].between) == {"17", "0"}
     ahead = np.stack([look_at(np.array([x, 0, 0.0]), np.array([x, 5, 0])) for x in range(3)])
     assert coverage(names[:3], ahead) is None
+    side = coverage(names[:7], ring(np.arange(0, 105, 15)))
+    assert side.ends == (names[0], names[6])
+    told = use_of(side.degrees, side.ends)
+    assert told.startswith(f"enough for views of one side of an object, from between {names[0]} and {names[6]}")
+    assert "take 13 photographs more" in told and "front" in use_of(40.0, side.ends)
+    assert use_of(360.0, None) == "enough for views from all sides"
 
 
 def test_exposure_rotation_and_reasons():

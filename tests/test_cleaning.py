@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -13,13 +14,15 @@ import torch
 from balls import RED, WHITE, Dense, Splatted, eye
 from test_gaussian_splatting import new
 
+from lumigraph.camera import Camera
 from lumigraph.camera.crop import Crop, CropBox, Sphere
 from lumigraph.camera.rays import Rays
 from lumigraph.commands import cli
 from lumigraph.composition import PickedCloud, cropped
+from lumigraph.composition.floaters import evidence
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
-from lumigraph.gaussians.cloud import cleaned, extent, unwanted
+from lumigraph.gaussians.cloud import cleaned, extent, joined, unwanted
 from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.run import Run, open_any
 from lumigraph.training import fit
@@ -166,7 +169,7 @@ def test_exports_of_a_part_hold_as_many_as_another_reader_counts(cloud_run, tmp_
     for name in ("a.ply", "b.ply"):
         assert plyfile.PlyData.read(tmp_path / name)["vertex"].count == expected
     assert cli.main(["clean", str(tmp_path / "a.ply"), "--sphere", *"0 0 0 0.8".split(), "--units", "source",
-                     "--no-clean", "--output", str(tmp_path / "c.ply")]) == 0  # fmt: skip
+                     "--strength", "0", "--output", str(tmp_path / "c.ply")]) == 0  # fmt: skip
     there = plyfile.PlyData.read(tmp_path / "c.ply")["vertex"]
     positions = np.stack([there[k] for k in "xyz"], -1)
     assert 0 < len(positions) < expected and np.linalg.norm(positions, axis=-1).max() <= 0.8
@@ -205,3 +208,18 @@ def test_picked_gaussians_look_as_they_did():
     method, camera = Splatted(RED), eye((-3.0, 0, 0))
     seen = PickedCloud(WHITE, method.cloud).render(camera)
     assert torch.equal(seen.rgb, method.render(camera).rgb)
+
+
+def test_the_score_orders_blobs_above_the_surface_and_the_strength_is_monotone():
+    shell, _ = soiled()
+    around = torch.tensor([[3.0, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0], [0.1, 0.1, 3], [2, 2, 1], [-2, 2, 1]])
+    cameras = Camera.cat([eye(tuple(place.tolist())) for place in around])
+    blobs = replace(shell[:14], means=around.repeat(2, 1) * torch.tensor([0.3] * 7 + [0.7] * 7)[:, None])
+    cloud = joined([shell[:1500], blobs])
+    before = cloud.means.clone()
+    found = evidence(cloud, cameras, WHITE)
+    assert found.score[1500:].min() > found.score[:1500].max()
+    masks = [found.floaters(strength) for strength in (0.0, 0.2, 0.4, 0.7, 1.0)]
+    assert not masks[0].any() and masks[2][1500:].all() and not masks[2][:1500].any()
+    assert all((a <= b).all() for a, b in itertools.pairwise(masks))
+    assert torch.equal(cloud.means, before)

@@ -65,10 +65,12 @@ def test_eval_writes_what_programs_read(trained, capsys):
 def test_render_needs_no_photographs(trained, tmp_path, monkeypatch, path):
     monkeypatch.setattr(Run, "scene", lambda self, source=None: pytest.fail("asked for photographs"))
     output = tmp_path / f"{path}.mp4"
-    assert main(["render", str(trained), "--path", path, "--frames", "3", "--output", str(output)]) == 0
+    more = ["--depth", "--pictures", "png"] if path == "orbit" else []
+    assert main(["render", str(trained), "--path", path, "--frames", "3", "--output", str(output), *more]) == 0
     about = json.loads(output.with_suffix(".json").read_text())
     assert about["frames"] == 3 and about["size"] == [24, 24] and len(about["poses"]) == 3
-    assert output.exists() and output.with_stem(f"{path}-depth").exists()
+    made = {entry.name for entry in tmp_path.iterdir()} - {".lumigraph"}
+    assert made == {output.name, f"{path}.json", *[f"{path}-depth.mp4", path] * (path == "orbit")}
 
 
 def test_report_and_info_and_methods(trained, photographs, capsys):

@@ -26,7 +26,12 @@ pytestmark = budget("runs", 8)
 def test_a_log_says_what_begins_and_where_it_ends(capsys):
     fit(tiny.method(), tiny.scene(), steps=20)
     told = capsys.readouterr().err
-    first, compiling, learner, *_, last = told.splitlines()
+    first, memory, compiling, learner, *_, last = told.splitlines()
+    assert re.fullmatch(
+        r"Memory: photographs 0\.0 GB, in memory; voxel-grid up to 0\.0 GB with its optimizer state; 0\.0 GB for one "
+        r"picture in training and evaluation; [\d.,]+ GB are free",
+        memory,
+    )
     assert first == "Learning from 9 photographs, 3 held out, 24x24 pixels" and compiling.startswith(
         "Compiling kernels"
     )
@@ -80,7 +85,7 @@ def learn(display: TrainingDisplay, clock: list[float], seconds: int, steps_per_
     """Note so many steps, as the trainer does."""
     scene, budget = tiny.scene(), Budget(seconds=float(seconds))
     batch: Batch = scene.sample_rays(4, torch.Generator().manual_seed(0))
-    display.begin(scene)
+    display.begin(scene, "Memory: little")
     display.ready("voxel-grid", tiny.method(), budget, 0, 0.0)
     for step in range(1, seconds * steps_per_second + 1):
         clock[0] += 1 / steps_per_second

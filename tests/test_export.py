@@ -310,7 +310,7 @@ def test_errors_are_coloured_from_dark_to_bright():
 def test_a_film_of_a_method(ball_run, tmp_path):
     method = ball_run.method()
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 7, (26, 24))
-    about = film(method, path, tmp_path / "out" / "orbit.mp4", fps=10)
+    about = film(method, path, tmp_path / "out" / "orbit.mp4", fps=10, depth=True, pictures="png")
     out = tmp_path / "out"
     assert names(out) == ["orbit", "orbit-depth.mp4", "orbit.json", "orbit.mp4"]
     assert len(frames_of(out / "orbit.mp4")) == len(frames_of(out / "orbit-depth.mp4")) == 7
@@ -319,14 +319,14 @@ def test_a_film_of_a_method(ball_run, tmp_path):
     kept = torch.from_numpy(np.array(Image.open(out / "orbit" / "0003.png"))) / 255
     assert kept.shape == (24, 26, 3) and (kept - seen).abs().max() < 0.01
     assert json.loads((out / "orbit.json").read_text())["frames"] == 7 == about["frames"]
-    film(method, path[:2], out / "orbit.mp4")  # again: replaced, not mixed
+    film(method, path[:2], out / "orbit.mp4", depth=True, pictures="png")  # again: replaced, not mixed
     assert len(frames_of(out / "orbit.mp4")) == 2 and len(names(out / "orbit")) == 4
 
 
 def test_a_film_as_a_moving_picture_has_a_twin_of_depth(ball_run, tmp_path):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 3, (26, 24))
-    film(ball_run.method(), path, tmp_path / "orbit.webp", fps=10)
-    assert names(tmp_path) == ["orbit", "orbit-depth.webp", "orbit.json", "orbit.webp"]
+    film(ball_run.method(), path, tmp_path / "orbit.webp", fps=10, depth=True)
+    assert names(tmp_path) == ["orbit-depth.webp", "orbit.json", "orbit.webp"]
     assert len(pictures_of(tmp_path / "orbit.webp")) == len(pictures_of(tmp_path / "orbit-depth.webp")) == 3
 
 
@@ -415,7 +415,7 @@ class Page(html.parser.HTMLParser):
 
 def test_the_report_is_one_file_that_loads_nothing(ball_run):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 6, (24, 24))
-    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4")
+    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4", depth=True)
     evaluation = evaluate(ball_run.method(), tiny.scene())
     result = evaluation.to_json() | {"evaluated_on": "cpu", "steps": 3}
     (ball_run.folder / "eval.json").write_text(json.dumps(result))

@@ -34,8 +34,11 @@ pytestmark = budget("runs", 15)
 # What each command is told, and all that it would write.
 FILM = ("film.mp4", "film-depth.mp4", "film.json", "film/")
 WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "render": ("render ball --frames 2 --size 16 --output film.mp4", FILM),
-    "render, where films go": ("render ball --frames 2 --size 16", ("ball/renders/orbit.json", "ball/renders/orbit/")),
+    "render": ("render ball --frames 2 --size 16 --depth --pictures png --output film.mp4", FILM),
+    "render, where films go": (
+        "render ball --frames 2 --size 16 --pictures png",
+        ("ball/renders/orbit.json", "ball/renders/orbit/"),
+    ),
     "render, a run's own name": ("render ball --frames 2 --size 16 --output ball.gif", ("ball.gif", "ball.json")),
     "export web": ("export web gs page.html", ("page.html",)),
     "export octree": ("export octree octree o.npz", ("o.npz",)),

@@ -116,6 +116,51 @@ def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):
     assert bytes_of(kind, frame, kind.Config(voxels=fitting, coarse_voxels=4096), learning=True) <= 400_000_000
 
 
+GIGABYTE = 10**9
+GROUPS = {  # /proc/self/cgroup, where the group's files lie, and what they are called
+    "version 1": (
+        "4:memory:/jobs/one\n1:cpu:/",
+        "memory/jobs/one",
+        "limit_in_bytes",
+        "usage_in_bytes",
+        "total_inactive_file",
+    ),
+    "version 2": ("0::/jobs/one", "jobs/one", "max", "current", "inactive_file"),
+    "around it": ("0::/jobs/one", "jobs", "max", "current", "inactive_file"),
+}
+
+
+@pytest.mark.parametrize(("own", "place", "limit", "use", "cached"), GROUPS.values(), ids=GROUPS)
+def test_a_control_group_limits_what_is_free(own, place, limit, use, cached, tmp_path, monkeypatch):
+    folder = tmp_path / place
+    (tmp_path / "memory/jobs/one").mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "own").write_text(own)
+    (folder / f"memory.{limit}").write_text(f"{8 * GIGABYTE}\n")
+    (folder / f"memory.{use}").write_text(f"{8 * GIGABYTE - 10**8}\n")
+    (folder / "memory.stat").write_text(f"cache 5\n{cached} {4 * 10**7}\n")
+    monkeypatch.setattr(memory, "CONTROL_GROUPS", tmp_path)
+    monkeypatch.setattr(memory, "OWN_GROUPS", tmp_path / "own")
+    assert memory.group_limits() == [(8 * GIGABYTE, 8 * GIGABYTE - 14 * 10**7)]
+    assert memory.free_memory() == 14 * 10**7  # cached files count as free
+    assert memory.memory_for_images() == int(memory.FREE_IMAGES_SHARE * 14 * 10**7)
+    assert memory.threads_for(GIGABYTE) == 1
+
+
+LIMITED = """
+import resource
+from lumigraph.system import memory
+resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+[(limit, used)] = memory.address_limit()
+assert limit == 8 << 30 and 10**8 < used < limit and memory.free_memory() <= limit - used, (limit, used)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of addresses")
+def test_a_limit_of_addresses_limits_what_is_free():
+    subprocess.run([sys.executable, "-c", LIMITED], check=True)
+
+
 ESTIMATED = ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "nerf-w", "voxel-grid"]
 
 

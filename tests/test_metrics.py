@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lumigraph.metrics import psnr, ssim, ssim_map
+from lumigraph.metrics.detail import detail
 
 
 def pictures(height=40, width=53):
@@ -50,3 +51,20 @@ def test_ssim_counts_windows_inside_the_picture_only():
 
 EXPECTED_MEAN = 0.7233971789332362
 EXPECTED_CHANNELS = (0.7929736251070538, 0.5331190620284164, 0.8440988496642385)
+
+
+def test_detail_tells_a_shift_from_blur(generator):
+    noise = torch.rand(130, 130, 3, generator=generator)
+    texture = torch.nn.functional.avg_pool2d(noise.permute(2, 0, 1), 3, 1).permute(1, 2, 0)
+    photograph, shifted = texture[:-1, :-1], texture[1:, 1:]
+    blurred = torch.nn.functional.avg_pool2d(texture.permute(2, 0, 1), 11, 1).permute(1, 2, 0)
+    inner = texture[5:-5, 5:-5]
+    assert abs(psnr(shifted, photograph) - psnr(blurred, inner)) < 3  # PSNR has no word for the difference
+    assert "shifted by a pixel" in str(detail(shifted, photograph))
+    assert str(detail(blurred, inner)).startswith("blurred")
+    assert str(detail(photograph + 0.02 * noise[:127, :127], photograph)) == "as sharp as the photographs"
+    half = torch.zeros(118, 118, dtype=torch.bool)
+    half[:, :60] = True
+    seen = torch.where(half[..., None], inner, blurred)
+    assert detail(seen, inner, half).sharpness == pytest.approx(1, abs=0.05)
+    assert detail(texture[:9, :9], texture[:9, :9]) is None and detail(0 * texture, 0 * texture) is None

@@ -159,7 +159,7 @@ def test_light_is_compared_up_to_a_factor_and_an_offset():
 
 
 def test_frames_are_written_as_light(night, begun, tmp_path):
-    film(begun, night.cameras[:2], tmp_path / "film.mp4", light=True)
+    film(begun, night.cameras[:2], tmp_path / "film.mp4", pictures="exr")
     path = tmp_path / "film" / "0001.exr"
     assert kind_of(path).linear and kind_of(path).size == (24, 24)
     np.testing.assert_array_equal(read_numbers(path), begun.render(night.cameras[1]).extra["radiance"].numpy())

@@ -13,7 +13,7 @@ import torch
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
-from lumigraph.datasets.images import ImageSource, ImageStore, Runs, shuffled_order, spread
+from lumigraph.datasets.images import ImageSource, ImageStore, Runs, runs_of, shuffled_order, spread
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
 
@@ -111,7 +111,7 @@ def test_alpha_is_kept_where_any_image_has_it(images):
 
 def test_runs_of_a_mask_are_its_pixels():
     masks = [np.array([[1, 0, 1], [1, 1, 0]], bool), np.ones((1, 2), bool), np.array([[0, 1]], bool)]
-    runs = Runs.of(masks)
+    runs = Runs.of([runs_of(mask) for mask in masks])
     assert runs.start.tolist() == [0, 2, 0, 1] and runs.count.tolist() == [4, 2, 1]
     for i, mask in enumerate(masks):
         assert np.array_equal(runs.mask(i, mask.size), mask.ravel())

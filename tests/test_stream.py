@@ -123,6 +123,23 @@ def test_memory_holds_as_many_photographs_as_it_says():
     assert images._rgba_of.nbytes + images._pixel.nbytes == room * 8 * stream.KEPT_PIXELS
 
 
+def test_pictures_that_memory_does_not_hold_are_the_same_and_announced(tmp_path, monkeypatch, capsys):
+    held = stream.load(sources(5), memory=10**6)
+    assert capsys.readouterr().err == ""
+    filed = stream.load(sources(5), memory=100, cache=tmp_path)
+    assert (
+        "Photographs take 0.0 GB decoded, and memory has 0.0 GB for them, so they go to a file in"
+        in (said := capsys.readouterr().err)
+        and said.count("\n") == 1
+    )
+    monkeypatch.setattr(stream, "address_limit", lambda: [(10**6, 10**6 - 100)])  # a mapped file takes addresses
+    streamed = stream.load(sources(5), memory=100, cache=tmp_path)
+    assert "read from their files again and again" in capsys.readouterr().err
+    assert not filed.streams and filed.shuffled and isinstance(streamed, ImageStream)
+    for k in range(5):
+        assert torch.equal(held[k], filed[k]) and torch.equal(held[k], streamed[k])
+
+
 def test_a_folder_larger_than_memory_and_disk_opens_and_gives_rays(tmp_path, monkeypatch, ball_folder):
     """A capture streams where the disk has no room, and is the same as in memory."""
     inside = open_scene(ball_folder)

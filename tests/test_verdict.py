@@ -139,4 +139,7 @@ def test_next_commands_name_the_run(tmp_path):
 
 
 def test_what_is_known_by_heart_is_said():
-    assert "memorised" in beside_training(25.0, 19.0) and beside_training(25.0, 24.0) == "25.00 dB while training"
+    views = [{"name": name, "psnr": value} for name, value in (("a", 22.0), ("b", 16.0), ("c", 19.0))]
+    told = beside_training(25.0, {"psnr": 19.0, "views": views})
+    assert "memorised" in told and told.endswith("first from near b and c")
+    assert beside_training(25.0, {"psnr": 24.0}) == "25.00 dB while training"

@@ -234,7 +234,7 @@ def with_mask(picture: ImageSource, trusted: np.ndarray, why: str) -> ImageSourc
         image, mask = picture.read()
         return image, trusted if mask is None else mask & trusted
 
-    return ImageSource(picture.size, read, None if picture.identity is None else f"{picture.identity} {why}")
+    return replace(picture, read=read, identity=None if picture.identity is None else f"{picture.identity} {why}")
 
 
 def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:

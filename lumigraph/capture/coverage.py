@@ -22,6 +22,7 @@ MIN_BAND = 15.0  # degrees between the lowest and the highest tenth of the eleva
 ROUND_ELEVATION = 25.0  # degrees above or below the first round that a second one is advised at
 LOW_ROUND = 20.0  # degrees; a round below it is advised to be followed by one higher, others by one lower
 ROUND_PHOTOGRAPHS = 12
+FRONT_ANGLE = 60.0  # degrees covered, up to which photographs show a front
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Coverage:
     elevations: lowest and highest camera, degrees above the horizontal through the subject
     advice:     photographs to add, one sentence part each: "4 more from behind, between a.jpg and b.jpg"
     places:     positions of these photographs, in the frame of the cameras
+    ends:       first and last photograph, from left to right, if these cover at most half of the circle
     """
 
     degrees: float
@@ -46,6 +48,22 @@ class Coverage:
     elevations: tuple[float, float] = (0.0, 0.0)
     advice: list[str] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
+    ends: tuple[str, str] | None = None
+
+
+def use_of(degrees: float, ends: Sequence[str] | None) -> str:
+    """Views that an angle around the subject suffices for, and the place of photographs for others.
+
+    ends: see `Coverage`
+    """
+    if ends is None:
+        return "enough for views from all sides" if degrees >= 360 else "enough for views from most sides"
+    count = math.ceil((360 - degrees) / ADVISED_STEP) - 1
+    enough = "a front, such as a facade" if degrees <= FRONT_ANGLE else "one side of an object"
+    return (
+        f"enough for views of {enough}, from between {' and '.join(ends)}; for all sides take "
+        f"{counted(count, 'photograph')} more around the rest, one every {ADVISED_STEP:.0f} degrees"
+    )
 
 
 def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Coverage | None:
@@ -67,7 +85,8 @@ def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Cov
     degrees = float(360 - steps[wide].sum())
     band = float(elevation.min()), float(elevation.max())
     if degrees <= MIN_ORBIT:
-        return Coverage(degrees, [], band)
+        last, first = order[wide[0]], order[(wide[0] + 1) % len(order)]
+        return Coverage(degrees, [], band, ends=(names[first], names[last]))
     gaps, advice, places, usual = [], [], [], float(np.median(elevation))
     for i in wide:
         ends = order[i], order[(i + 1) % len(order)]

@@ -18,7 +18,17 @@ from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
 from .capture import PixelPlane, Shot
-from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, kind_of, read_numbers, tiff_tags, turned
+from .numbers import (
+    DECODING_COPIES,
+    TIFF_SUFFIXES,
+    Kind,
+    as_bytes,
+    check_pixels,
+    kind_of,
+    read_numbers,
+    tiff_tags,
+    turned,
+)
 
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
 MAX_KEPT = 1.2  # times as long a side stays as it is, rather than losing sharpness for few pixels
@@ -151,7 +161,12 @@ def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Ch
     if isinstance(shot.mask, np.ndarray):
         identity += f" {zlib.crc32(shot.mask.tobytes())}"
     return Chosen(
-        ImageSource(size, masked(lambda: read_image(path, turn, size), shot, size, turn), identity),
+        ImageSource(
+            size,
+            masked(lambda: read_image(path, turn, size), shot, size, turn),
+            identity,
+            DECODING_COPIES * 4 * math.prod(stored),
+        ),
         calibrated,
         wanted,
         deep_plane(path, turn, identity),

@@ -123,6 +123,7 @@ def show_result(folder: Path, result: dict[str, Any], onward: str | None = None)
 
 
 def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
+    from ..capture.coverage import use_of
     from ..capture.doctor import Finding
 
     placed, others = len(result["registered"]), result["other_models"]
@@ -141,7 +142,8 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
         found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
         found["around"] += ", from {:.0f} to {:.0f} degrees above the subject".format(*coverage["elevations"])
         gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]
-        found["around"] += f"; no photograph from {', '.join(gaps)}" if gaps else ""
+        gap = f"no photograph from {', '.join(gaps)}"
+        found["around"] += f"; {gap if gaps else use_of(coverage['degrees'], coverage.get('ends'))}"
     if result["gps"] and result["gps"]["used"]:
         found["place"] = result["gps"]["say"]
     found["time"] = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result["seconds"].items())

@@ -8,10 +8,13 @@ from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+from ..errors import LumigraphError
 from ..files import claim
+from ..files.ranges import Share
 from .common import choose_device, show
-from .options import Keeping, Overwrite, needed, option
+from .options import Cropping, Overwrite, needed, option
 
+CANDIDATE_COLOUR = (1.0, 0.1, 0.8)  # of Gaussians that are removed
 SIZE = 400  # pixels of the longer side of the pictures that compare
 
 
@@ -20,8 +23,8 @@ class Clean:
     """Remove floaters from a trained cloud of Gaussians, or crop it to a box or a sphere.
 
     The result is a new run, which opens, renders and resumes, or a splat file, if --output ends like one. The source
-    does not change. A picture beside the result shows the cloud before and after, and the removed Gaussians. To crop
-    without removing floaters, give --no-clean with --box or --sphere.
+    does not change. A picture beside the result shows the cloud with the removed Gaussians coloured, and afterwards.
+    To crop without removing floaters, give --strength 0 with --box or --sphere.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
@@ -29,14 +32,17 @@ class Clean:
     output: Annotated[Path, needed("NEW")]
     """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
     overwrite: Overwrite = False
-    part: OmitArgPrefixes[Keeping] = Keeping(clean=True)
+    strength: Annotated[Share, option("SHARE")] = 0.4
+    """Remove Gaussians with a floater score above 1 - strength; a larger value removes more, 0 none."""
+    part: OmitArgPrefixes[Cropping] = Cropping()
     device: Annotated[str, option("NAME")] = "auto"
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
+        from ..composition.floaters import evidence
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
-        from ..gaussians.cloud import gone
+        from ..gaussians.cloud import gone, unwanted
         from ..method.capabilities import HasGaussians, needs
         from ..run import open_any
         from ..run.derived import check_output, save_picked
@@ -48,8 +54,18 @@ class Clean:
         picture = beside if names_splats(self.output) else self.output / "clean.png"
         claim(picture, "comparison", self.overwrite, [self.source])
         gaussians = needs(opened.method(device), HasGaussians).gaussians()
-        reasons = self.part.unwanted(gaussians, self.part.crop(opened.frame))
+        reasons = unwanted(gaussians, self.part.crop(opened.frame))
         which = gone(reasons)
+        if self.strength:
+            cameras = opened.cameras()["train"] if opened.photographed else None
+            floating = evidence(gaussians, cameras, opened.frame).floaters(self.strength)
+            reasons |= {"floaters": floating & ~which}
+            which = which | floating
+        if len(gaussians) and which.all():
+            raise LumigraphError(
+                "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
+                "or a smaller --strength"
+            )
         counts = {reason: count for reason, some in reasons.items() if (count := int(some.sum()))}
         save_picked(opened, ~which.cpu(), self.output, {"removed": counts})
         save_picture(picture, before_and_after(opened, gaussians, which), "comparison")
@@ -62,21 +78,24 @@ class Clean:
 
 
 def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
-    """A sheet of some views: all Gaussians, those that stay, those that went. Some from afar, where floaters show."""
+    """A sheet of some views: all Gaussians, the removed ones coloured, those that stay. Two are from afar, where
+    floaters show."""
     from ..camera import ring
     from ..composition import PickedCloud
     from ..figures import Row, contact_sheet
+    from ..gaussians.cloud import painted
     from ..geometry import evenly
     from ..system.progress import track
 
-    clouds = [PickedCloud(opened.frame, some) for some in (gaussians, gaussians[~gone], gaussians[gone])]
+    shown = gaussians, painted(gaussians, gone, CANDIDATE_COLOUR), gaussians[~gone]
+    clouds = [PickedCloud(opened.frame, some) for some in shown]
     around = ring(opened.frame.bounds, size=SIZE)
     views = [around[i] for i in evenly(range(len(around)), 3)[:2]]
     if opened.photographed:
         own = opened.cameras()["train"]
-        views = [own[i] for i in evenly(range(len(own)), 3)[1:]] + views
+        views = [own[i] for i in evenly(range(len(own)), 4)[1:]] + views
     rows = [
         Row("", [cloud.render(camera.resized(min(1.0, SIZE / int(camera.size.max())))).rgb for cloud in clouds])
         for camera in track(views, "Drawing before and after", len(views))
     ]
-    return contact_sheet(opened.title, ("before", "after", "what went"), rows, SIZE)
+    return contact_sheet(opened.title, ("before", "removed Gaussians coloured", "after"), rows, SIZE)

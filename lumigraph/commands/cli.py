@@ -28,7 +28,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
-from ..files.ranges import coherent, domain, outside, shown
+from ..files.ranges import coherent, domain, is_surprising, outside, shown
 from ..system.allocation import settle_memory
 from ..system.signals import exit_code, listening, number_of
 from ..system.threads import considerate
@@ -81,9 +81,10 @@ def without_ranges() -> Iterator[None]:
 
 
 def with_range(kind: Any) -> Any:
-    """An option's annotation with its range beside the default in --help; itself where it has no range."""
-    if not (range := domain(kind)):
+    """An option's annotation with its range beside the default in --help; itself if the range is no surprise."""
+    if not is_surprising(kind):
         return kind
+    range = domain(kind)
     hints = [x.help_behavior_hint for x in get_args(kind)[1:] if getattr(x, "help_behavior_hint", None) is not None]
 
     def hint(default: str) -> str:

@@ -14,12 +14,13 @@ from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
 from ..system.console import console
-from .common import choose_device, show, typed
+from .common import choose_device, say, show, typed
 from .options import DeviceOption, PhotographsOption, needed, option
 
 LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
 DEFAULT: Quality = "good"
 DEFAULT_SECONDS = 60.0
+INVISIBLE_LOSS, VISIBLE_LOSS = 0.3, 1.0  # dB
 UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
 SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmg]?i?)b?\s*", re.IGNORECASE)
 ABOUT = "PSNR that may be lost: " + ", ".join(f"{name} {dB:g} dB" for name, dB in LOSSES.items()) + "."
@@ -66,14 +67,35 @@ class Compress:
         loss = None if size is not None else LOSSES[self.quality or DEFAULT] if self.max_loss is None else self.max_loss
         seconds = None if self.steps is not None else self.seconds or DEFAULT_SECONDS
         aim = CompressionTarget(size, loss, self.codebook, self.steps, seconds, self.views)
-        made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device))
+        try:
+            made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device), show=True)
+        except KeyboardInterrupt:
+            say(f"Stopped; {self.run_folder} is as it was and nothing else is kept, so the same command begins anew")
+            raise
         console().print(table(made))
         against = str(made.compared_with)
         if made.psnr_before is None:
             against += ", for its photographs cannot be opened; --scene says where they are"
         rows = {"compared with": f"{made.views} held-out {against}", "saved": str(self.output)}
-        show(rows | {"next": typed("view", self.output)})
+        show(rows | {"verdict": verdict(made, self.run_folder), "next": typed("view", self.output)})
         return 0
+
+
+def verdict(made: Any, run: Path) -> str:
+    """Gain in size and loss of quality in words; if nothing is gained, what to do."""
+    lost = 0.0 if made.psnr_before is None else made.psnr_before - made.psnr_after
+    if made.bytes_after >= made.bytes_before:
+        if lost > 0:
+            return f"worse in every row: keep {run}, or give a larger --max-loss, for example {2 * max(lost, 0.5):.1f}"
+        return f"no smaller; give a larger --max-loss than the {max(lost, 0):.2f} dB that were lost"
+    smaller = f"{made.times:.1f} times smaller"
+    if made.psnr_before is None:
+        return smaller
+    if lost <= INVISIBLE_LOSS:
+        return f"{smaller}, with no visible loss"
+    if lost <= VISIBLE_LOSS:
+        return f"{smaller}, with a loss that a comparison side by side shows"
+    return f"{smaller}, with a visible loss; for a smaller one give --quality best, a larger --to or more --seconds"
 
 
 def bytes_in(text: str) -> int:

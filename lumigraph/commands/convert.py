@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,12 +14,12 @@ from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Count, Seconds
 from ..system.console import console
-from .common import about_quality, choose_device, given_budget, method_config, show, typed
+from .common import about_quality, choose_device, given_budget, method_config, say, show, typed
 from .compress import size
 from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, needed, option
 
 DEFAULT_SECONDS = 30.0
-TABLE_WIDTH = 4096  # letters; a table cuts its lines where the console ends
+LIST_WIDTH, INDENT = 80, 12  # letters
 ABOUT = about_quality() + " A conversion from a field trains for half of these steps."
 QUALITY = option("draft|good|best", "as long as --seconds", ABOUT)
 
@@ -60,7 +62,7 @@ class Convert:
         from ..run import open_any
 
         if self.list:
-            console(width=TABLE_WIDTH, soft_wrap=True).print(listed())
+            print(listed())
             return 0
         if self.source is None or self.method is None or self.output is None:
             raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")
@@ -77,13 +79,52 @@ class Convert:
             views=self.views,
             seed=self.seed,
         )
-        made = convert(open_any(self.source), name, self.output, aim, device, show=True)
+        try:
+            made = convert(open_any(self.source), name, self.output, aim, device, show=True)
+        except KeyboardInterrupt:
+            say(kept(self.output))
+            raise
         console().print(table(made))
         took = f"{made.taking_over:.1f} s to take over, {made.steps} steps in {made.seconds:.1f} s to learn on"
         rows = {"alike": f"{made.psnr:.2f} dB, the mean of {made.views} held-out views", "by": f"{made.how}; {took}"}
         rows |= {"learnt from": made.learnt_from, "saved": str(self.output)}
-        show(rows | {"next": typed("view", self.output)})
+        show(rows | {"verdict": verdict(made, self.source, self.output), "next": typed("view", self.output)})
         return 0
+
+
+def kept(output: Path) -> str:
+    """Sentence on what an interrupted conversion keeps."""
+    from ..run import Run
+
+    if not (output / "config.json").exists() or not (run := Run(output)).has_state:
+        return "Stopped before training, so nothing is kept; the same command begins anew"
+    return f"Stopped and saved after step {run.state.step} of training; the same command goes on"
+
+
+def verdict(made: Any, source: Path, output: Path) -> str:
+    """Rows in which the new method is better and worse; if it is better in none, what to do."""
+    from ..budget import Budget
+    from ..run import Run
+    from .outcome import more_time
+
+    old, new = made.teacher, made.student
+    found = [
+        ("smaller", "larger", old.bytes / max(new.bytes, 1)),
+        ("faster", "slower", old.seconds / max(new.seconds, 1e-9)),
+    ]
+    said = {True: list[str](), False: list[str]()}
+    for good, bad, ratio in found:
+        said[ratio > 1].append(f"{max(ratio, 1 / ratio):.1f} times {good if ratio > 1 else bad}")
+    if old.psnr is not None and new.psnr is not None:
+        change = new.psnr - old.psnr
+        said[change > 0].append(f"{abs(change):.2f} dB {'closer to' if change > 0 else 'farther from'} the photographs")
+    better, worse = (" and ".join([", ".join(some[:-1]), some[-1]] if some[1:] else some) for some in said.values())
+    if better:
+        return f"better: {better}" + (f"; worse: {worse}" if worse else "")
+    longer = more_time(output, Budget.from_json(Run(output).settings.budget))
+    if made.learnt_from != "photographs":
+        longer = "convert again with a longer --seconds"
+    return f"worse in every row: {worse}; keep {source}, or train for longer: {longer}"
 
 
 def table(made: Any) -> Any:
@@ -99,14 +140,24 @@ def table(made: Any) -> Any:
     return rows
 
 
-def listed() -> Any:
-    """Table of conversions: a row for each source method, a column for each target."""
-    from rich.table import Table
-
+def listed() -> str:
+    """Conversions: source methods with the same targets together, below them the targets by way."""
     from ..derive.conversion import ways
 
-    found = ways()
-    rows = Table("from / into", *found)
-    for name, into in found.items():
-        rows.add_row(name, *(way or "–" for way in into.values()))
-    return rows
+    alike: dict[tuple[Any, ...], list[str]] = {}
+    for name, into in ways().items():
+        alike.setdefault(tuple(into.items()), []).append(name)
+    lines = []
+    for ways_in, names in alike.items():
+        targets: dict[str, list[str]] = {}
+        for target, way in ways_in:
+            targets.setdefault(way or "not into", []).append(target)
+        ordered = sorted(targets.items(), key=lambda item: (item[0] == "not into", item[0]))
+        lines += ["", *(listing(title, names) for title, names in [("from", names), *ordered])]
+    return "\n".join(lines[1:])
+
+
+def listing(title: str, names: Sequence[str]) -> str:
+    """Names behind a title, in lines of 80 letters."""
+    indent = " " * INDENT
+    return textwrap.fill(", ".join(names), LIST_WIDTH, initial_indent=f"{title:<{INDENT}}", subsequent_indent=indent)

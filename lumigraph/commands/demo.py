@@ -60,7 +60,7 @@ class Demo:
             return exit_code(outcome.signal)
         result = evaluate_run(run, method, data)
         orbit = run.folder / "renders" / "orbit.mp4"
-        film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit)
+        film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit, depth=True)
         report = write_report(run)
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
         rows = {

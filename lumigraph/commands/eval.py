@@ -11,6 +11,7 @@ from ..system.console import bold
 from .common import choose_device, show
 from .options import DeviceOption, Overwrite, RunOption, Set, controlled, option
 
+WORST_VIEWS = 2  # held-out views that are named
 MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
 
 
@@ -18,10 +19,10 @@ MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out 
 class Eval:
     """Compare a run with held-out photographs, or its surface with the training shapes.
 
-    Writes RUN/eval.json (per view and mean PSNR and SSIM, also by resolution where there are several, the protocol,
-    timings) and RUN/eval.png, a contact sheet of photograph, rendering, error and depth. File names
-    of other splits than test contain the split. LPIPS needs weights: torchvision's AlexNet and the LPIPS authors'
-    v0.1/alex.pth. Shapes have IoU, chamfer distance and normal consistency instead.
+    Writes RUN/eval.json (per view and mean PSNR, SSIM and fine detail, also by resolution where there are several, the
+    protocol, timings) and RUN/eval.png, a contact sheet of photograph, rendering, error and depth. File names of other
+    splits than test contain the split. LPIPS needs weights: torchvision's AlexNet and the LPIPS authors' v0.1/alex.pth.
+    Shapes have IoU, chamfer distance and normal consistency instead.
     """
 
     run_folder: RunOption
@@ -45,6 +46,7 @@ class Eval:
         from ..evaluation import claim_evaluation, evaluate_run, stem
         from ..large import BlockRun
         from ..metrics import scores_of
+        from ..metrics.detail import FineDetail
         from ..metrics.lpips import load_lpips, named_files
         from ..run import open_run
         from ..training.verdict import last_psnr
@@ -63,22 +65,27 @@ class Eval:
             data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
+        if "detail" in result:
+            rows["detail"] = str(FineDetail(**result["detail"]))
         for size, part in result.get("by_resolution", {}).items():
             rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         name = run.folder / stem(self.split)
         rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
         learnt = last_psnr(run.metrics())
         if learnt is not None and self.split != "train" and "psnr" in result:
-            rows["photographs learnt from"] = beside_training(learnt, result["psnr"])
+            rows["photographs learnt from"] = beside_training(learnt, result)
         show(rows | next_commands(run, "eval"))
         return 0
 
 
-def beside_training(learnt: float, psnr: float) -> str:
-    """PSNR of the training photographs as text, and the meaning of a gap to held-out ones."""
-    text, better = f"{learnt:.2f} dB while training", learnt - psnr
+def beside_training(learnt: float, result: dict[str, Any]) -> str:
+    """PSNR of the training photographs as text, the meaning of a gap to held-out ones, and views that lack others."""
+    text, better = f"{learnt:.2f} dB while training", learnt - result["psnr"]
     if better > MEMORISED_DB:
+        worst = sorted(result.get("views", []), key=lambda view: view["psnr"])[:WORST_VIEWS]
+        where = " and ".join(view["name"] for view in worst)
         text += f", {better:.1f} dB better: it has memorised them, so more photographs would help more than time"
+        text += f"; first from near {where}" if where else ""
     return text
 
 

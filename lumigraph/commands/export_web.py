@@ -41,7 +41,7 @@ class ExportWeb:
         ),
     ] = "auto"
     """Representation in the page: splats and volume render the scene itself, mesh is coarser, views are pictures."""
-    title: Annotated[str | None, option("TEXT", "the scene's name")] = None
+    title: Annotated[str | None, option("TEXT", "the run's name")] = None
     """Title of the page."""
     background: Annotated[
         str | None, option("#RRGGBB", "the training background; for open scenes the colours of sky and ground")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,7 @@ from ..capture.doctor import Finding, grouped
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..datasets.shapes import Shapes
+from ..derive.compression.compress import folder_bytes
 from ..errors import LumigraphError
 from ..evaluation.photographs import examined
 from ..exchange import size_of
@@ -24,7 +26,8 @@ from ..metrics import scores_of
 from ..run import Run
 from ..run.derived import Compressed, Converted, Inferred
 from ..system.console import bold, dim
-from ..training.verdict import cameras_moved
+from ..training.display import learner, pixel_sizes
+from ..training.verdict import cameras_moved, last_psnr
 
 MAX_MEMBERS = 12  # shapes that are listed
 
@@ -35,9 +38,10 @@ def run_tree(run: Run) -> Tree:
     options = dict(settings.scene.options)
     if (part := options.get("part")) is not None:  # of a block
         options["part"] = f"{len(part['photographs'])} photographs of a larger scene"
+    if rows := run_rows(run):
+        branch(tree, "run", rows)
     branch(tree, "scene", {"source": settings.scene.source, **settings.splits, **options})
     branch(tree, "frame", frame_rows(run.frame))
-    branch(tree, "config", settings.config)
     if controls := control_rows(run):
         branch(tree, "controls, by --set", controls)
     if run.has_state:
@@ -67,10 +71,10 @@ def run_tree(run: Run) -> Tree:
         origin: dict[str, Any] = {"from": f"{converted.source}, a {converted.teacher.method}", "by": converted.how}
         branch(tree, "converted", origin | {"alike": like, "then learnt from": converted.learnt_from})
     if evaluation := run.evaluation():
-        figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
+        figures: dict[str, Any] = {}
         figures["seconds per view"] = evaluation.get("seconds_per_view")
         protocol = ("split", "views", "shapes", "members", "resolution")
-        branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
+        branch(tree, "evaluation", figures | {name: evaluation["protocol"].get(name) for name in protocol})
     if checked := examined(run):
         add_findings(tree, checked.findings)
     places = [path for folder in (run.folder, run.folder / "renders") if folder.is_dir() for path in folder.iterdir()]
@@ -78,7 +82,24 @@ def run_tree(run: Run) -> Tree:
     pages.sort(key=lambda path: natural(path.as_posix()))
     if pages:
         branch(tree, "files", {str(path.relative_to(run.folder)): size(path.stat().st_size) for path in pages})
+    branch(tree, "config", settings.config)
     return tree
+
+
+def run_rows(run: Run) -> dict[str, Any]:
+    """Size of the model, size on disk, resolution of the photographs, duration of training, PSNR."""
+    rows: dict[str, Any] = {}
+    if run.has_state:
+        with contextlib.suppress(LumigraphError):
+            rows["model"] = learner(run.method_name, run.method("cpu")).partition(", ")[2]
+        rows["on disk"] = f"{size(run.model_bytes)} the model, {size(folder_bytes(run.folder))} the whole run"
+        rows["training"] = f"{run.state.step:,} steps in {run.state.seconds:.0f} s"
+    if run.photographed and len(cameras := run.cameras()["train"]):
+        rows["photographs"] = f"{len(cameras):,} of {pixel_sizes(cameras.size)} pixels"
+    if (psnr := last_psnr(run.metrics())) is not None:
+        rows["PSNR of training photographs"] = f"{psnr:.2f} dB"
+    scores = {f"{score.name} of the evaluation": str(score) for score in scores_of(run.evaluation() or {})}
+    return rows | scores
 
 
 def blocks_tree(run: BlockRun) -> Tree:

@@ -120,8 +120,8 @@ Four = tuple[Coordinate, Coordinate, Coordinate, Positive]
 
 
 @dataclass(frozen=True)
-class Keeping:
-    """Crop the scene, and remove floaters from Gaussians."""
+class Cropping:
+    """Crop the scene to a box or a sphere."""
 
     box: Annotated[Six | None, option("X0 Y0 Z0 X1 Y1 Z1", "everything")] = None
     """Crop to the box between two corners."""
@@ -130,27 +130,10 @@ class Keeping:
     units: Literal["scene", "source"] = "scene"
     """Frame of --box and --sphere: scene, as in `lumigraph info` and the viewer, or source, as in the photographs and
     exports."""
-    clean: bool = False
-    """Remove floaters from Gaussians: faint, huge or isolated ones, with limits that suit most scenes."""
-    min_opacity: Annotated[Share | None, option("SHARE", "0, with --clean 0.02")] = None
-    """Remove Gaussians with a lower opacity; a larger value removes more."""
-    max_scale: Annotated[Positive | None, option("SHARE", "any, with --clean 1")] = None
-    """Remove Gaussians with a larger standard deviation, in extents of the cloud; a smaller value removes more."""
-    isolation: Annotated[Positive | None, option("DEVIATIONS", "any, with --clean 3")] = None
-    """Remove Gaussians farther from neighbours than most, in standard deviations; a smaller value removes more."""
 
     @property
     def crops(self) -> bool:
         return self.box is not None or self.sphere is not None
-
-    @property
-    def floaters(self) -> Mapping[str, float]:
-        """Arguments of `cleaned` for floaters: the given numbers, with --clean the defaults of the rest."""
-        from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
-
-        usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
-        given = {name: value for name in usual if (value := getattr(self, name)) is not None}
-        return usual | given if self.clean else given
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -171,6 +154,29 @@ class Keeping:
         else:
             return None
         return crop if self.units == "scene" else crop.moved(frame.to_source.inverse)
+
+
+@dataclass(frozen=True)
+class Keeping(Cropping):
+    """Crop the scene, and remove floaters from Gaussians."""
+
+    clean: bool = False
+    """Remove floaters from Gaussians: faint, huge or isolated ones, with limits that suit most scenes."""
+    min_opacity: Annotated[Share | None, option("SHARE", "0, with --clean 0.02")] = None
+    """Remove Gaussians with a lower opacity; a larger value removes more."""
+    max_scale: Annotated[Positive | None, option("SHARE", "any, with --clean 1")] = None
+    """Remove Gaussians with a larger standard deviation, in extents of the cloud; a smaller value removes more."""
+    isolation: Annotated[Positive | None, option("DEVIATIONS", "any, with --clean 3")] = None
+    """Remove Gaussians farther from neighbours than most, in standard deviations; a smaller value removes more."""
+
+    @property
+    def floaters(self) -> Mapping[str, float]:
+        """Arguments of `cleaned` for floaters: the given numbers, with --clean the defaults of the rest."""
+        from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
+
+        usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
+        given = {name: value for name in usual if (value := getattr(self, name)) is not None}
+        return usual | given if self.clean else given
 
     def unwanted(self, gaussians: Any, crop: Any) -> Any:
         """Masks of the Gaussians to remove, by reason. Raises LumigraphError if that is all of them."""

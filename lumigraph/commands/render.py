@@ -11,11 +11,13 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from ..files.ranges import Count, FramesPerSecond, Pixels
 from .common import show
+from .compress import size as file_size
 from .options import Animate, DeviceOption, Overwrite, Set, animate, needed, open_method, option
 
 # As in `paths`, which help must not import.
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
-DEFAULT_SIZE, AUTO = 480, "auto"
+MAX_SIZE, MAX_RAYS_SIZE, AUTO = 1280, 640, "auto"  # pixels by default, of Gaussians and of methods that cast rays
+SIZES = f"that of the photographs, at most {MAX_SIZE}, and {MAX_RAYS_SIZE} for methods that cast rays"
 CHOSEN = {
     "orbit": "orbit, for the photographs go round",
     "sweep": "sweep, for all cameras have about the same direction; --path orbit goes to and fro",
@@ -24,7 +26,7 @@ CHOSEN = {
 
 @dataclass(frozen=True)
 class Render:
-    """Render a film of a run, a splat file or a composition: colour and depth, as videos and as pictures.
+    """Render a film of a run, a splat file or a composition.
 
     Paths stay near the positions of the photographs. orbit goes round (or to and fro). sweep is an oval among cameras
     that look the same way, as from a drone. auto is one of these two. spiral goes twice round while rising, interpolate
@@ -40,20 +42,23 @@ class Render:
     """Number of frames; more make a longer film."""
     fps: Annotated[FramesPerSecond | None, option("N", "30, or that of the path's file")] = None
     """Frames per second of the film."""
-    size: Annotated[Pixels | None, option("PIXELS", f"that of the photographs, at most {DEFAULT_SIZE}")] = None
+    size: Annotated[Pixels | None, option("PIXELS", SIZES)] = None
     """Longer side of the picture in pixels; larger renders slower."""
     output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
-    """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures are beside it."""
-    format: Annotated[Literal["png", "exr"], option("{png,exr}")] = "png"
-    """Format of the pictures beside the film. exr adds linear light with its full range, FILE/0000.exr."""
+    """The film: .mp4, .gif or .webp. FILE.json, its cameras, is beside it."""
+    depth: bool = False
+    """Also render a film of depth, FILE-depth."""
+    pictures: Annotated[Literal["png", "exr"] | None, option("{png,exr}", "none")] = None
+    """Also keep each frame as a picture, in the folder FILE. exr adds linear light with its full range."""
     overwrite: Overwrite = False
     settings: Set = ()
     animated: Animate = ()
     device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ..export.film import claim_film, film
+        from ..export.film import claim_film, depth_beside, film
         from ..export.video import kind_of
+        from ..method.capabilities import HasGaussians, can
         from ..paths import film_cameras, fitting
 
         flight = None if self.path in (AUTO, *PATH_KINDS) else read_path(self.path, self.fps)
@@ -61,24 +66,23 @@ class Render:
         reads = [self.source, *([Path(self.path)] if flight else [])]
         if self.output is not None:
             kind_of(self.output, fps)
-            claim_film(self.output, self.overwrite, reads)
+            claim_film(self.output, self.overwrite, reads, self.depth, self.pictures)
         opened, method, views = open_method(self.source, self.device, self.settings)
         path = fitting(views["train"], opened.frame) if self.path == AUTO else self.path
         output = self.output or opened.renders / f"{Path(path).stem}.mp4"
         kind_of(output, fps)
-        claim_film(output, self.overwrite, reads)
-        cameras = film_cameras(views, opened.frame, flight or path, self.frames, self.size)
+        claim_film(output, self.overwrite, reads, self.depth, self.pictures)
+        most = MAX_SIZE if can(method, HasGaussians) else MAX_RAYS_SIZE
+        size = self.size or min(most, int(views["train"].size.max()))
+        cameras = film_cameras(views, opened.frame, flight or path, self.frames, size)
         shown = animate(opened, method, self.animated, len(cameras))
-        about = film(shown, cameras, output, fps, light=self.format == "exr")
+        about = film(shown, cameras, output, fps, self.depth, self.pictures)
         width, height = about["size"]
-        rows = {
-            "film": str(output),
-            **({"path": CHOSEN[path]} if self.path == AUTO else {}),
-            "depth": str(output.with_stem(f"{output.stem}-depth")),
-            "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
-            "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
-        }
-        show(rows)
+        rows = {"film": f"{output}, {file_size(output.stat().st_size)}"}
+        rows |= {"path": CHOSEN[path]} if self.path == AUTO else {}
+        rows |= {"depth": str(depth_beside(output))} if self.depth else {}
+        rows |= {"pictures": f"{output.with_suffix('')}/0000.{self.pictures} …"} if self.pictures else {}
+        show(rows | {"frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each"})
         return 0
 
 

@@ -91,7 +91,7 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: An
     from ..viewer import Subject
 
     return Subject(
-        opened.path.name,
+        opened.title,
         opened.frame,
         cameras or opened.cameras(),
         opened.paths,

@@ -31,7 +31,7 @@ from ..method.capabilities import FromField, HasDensity, HasField, HasGaussians,
 from ..metrics import psnr
 from ..run import Opened, Run, State, build, check_new
 from ..run.derived import ConversionStart, Converted, LearntFrom, MeasuredModel
-from ..system.progress import track
+from ..system.progress import NumberedStages, clock, track
 from ..system.signals import go_on_unless
 from ..training import fit
 from .compression.compress import bytes_of
@@ -41,6 +41,7 @@ RENDERING_SHARE = 0.5  # of the training time that rendering of training views m
 PHOTOGRAPHS: LearntFrom = "photographs"
 RENDERINGS: LearntFrom = "renderings of the source"
 COMPARED_VIEWS = 8  # held-out views that are compared
+INITIALISATION_SECONDS = 60.0  # seconds that initialisation and comparison rarely exceed, on two cores
 Way = Literal["field", "gaussians", "depth", "pictures"]
 SPATIAL_CAPABILITIES = FromField, HasField, HasDensity, HasLooks, HasGaussians  # one of them is needed
 
@@ -82,7 +83,7 @@ def convert(
     """A run of the method of that name in a new folder, made of whatever was opened; gives what its convert.json says.
 
     output: a new or empty folder, or one in which the same conversion was interrupted, which continues
-    show:   whether training is shown
+    show:   whether stages and training are shown
     Raises LumigraphError for what cannot be converted, and Stopped after Ctrl-C, with the state saved.
     """
     if (going_on := unfinished(source, name, output)) is None:
@@ -94,15 +95,19 @@ def convert(
     assert how is not None  # for `check` has asked
     student = going_on[0].new_method(device) if going_on else new_student(kind, teacher, aim, device)
     around = teacher.refined(source.survey(cameras["train"]))
-    distil = going_on[1].learnt_from == RENDERINGS if going_on else aim.distil
-    if scene is None or distil:
+    distil = scene is None or (going_on[1].learnt_from == RENDERINGS if going_on else aim.distil)
+    stages = NumberedStages(stage_names(distil, going_on is not None), about_time(aim, distil), show)
+    if distil:
+        stages.begin()
         allowed = math.inf if aim.seconds is None else RENDERING_SHARE * aim.seconds
         learnt_from, data = RENDERINGS, rendered_scene(teacher, around, str(source.path), allowed)
     else:
+        assert scene is not None
         learnt_from, data = PHOTOGRAPHS, scene
         if not can(student, RefinesPoses):  # which learns from the poses as its teacher refined them
             data = replace(scene, cameras=teacher.refined(scene.cameras).to("cpu"))
     if going_on is None:
+        stages.begin()
         seconds = take_over(teacher, student, data, around, as_taken=learnt_from == PHOTOGRAPHS)
         begun = ConversionStart(str(source.path.resolve()), learnt_from, round(seconds, 3))
         budget = budget_of(student, data, aim)
@@ -110,8 +115,10 @@ def convert(
     else:
         run, begun = going_on
     budget = Budget.from_json(run.settings.budget)
+    stages.begin()
     outcome = fit(student, data, run, budget=budget, seed=run.settings.seed, show=show)
     go_on_unless(outcome.signal)
+    stages.begin()
     held_out = cameras["test"] if len(cameras.get("test", ())) else cameras["train"]
     seen = [shown(method, scene, held_out, aim.views) for method in (teacher, student)]
     made = Converted(
@@ -128,6 +135,19 @@ def convert(
     )
     made.write(run.folder)
     return made
+
+
+def stage_names(distil: bool, going_on: bool) -> list[str]:
+    """Stages of a conversion. distil: learns from renderings; going_on: was interrupted, so it is initialised"""
+    return [*["render views to learn from"] * distil, *["initialise"] * (not going_on), "train", "compare"]
+
+
+def about_time(aim: ConversionTarget, distil: bool) -> str:
+    """Duration of a conversion as text; empty if steps limit it."""
+    if aim.seconds is None:
+        return ""
+    least = aim.seconds * (1 + RENDERING_SHARE * distil)
+    return f", {clock(least)} to {clock(least + INITIALISATION_SECONDS)} in all"
 
 
 def new_student(kind: type[Method], teacher: Method, aim: ConversionTarget, device: torch.device) -> Method:

@@ -76,6 +76,7 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
         state = run.state
         figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))
         figures.append((f"{state.step:,}".replace(",", "\u202f"), "", "steps"))
+        figures.append((f"{run.model_bytes / 1e6:.3g}", "MB", "model"))
     if evaluation and "seconds_per_view" in evaluation:
         figures.append((f"{evaluation['seconds_per_view']:.2f}", "s", "to render a view"))
     sentence = f"{run.method_name}, trained on {counted(run)}"

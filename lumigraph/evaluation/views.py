@@ -29,6 +29,7 @@ from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet
 from ..geometry import evenly
 from ..method import Method
 from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
+from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
@@ -49,8 +50,8 @@ Picture = Float[Tensor, "height width 3"]
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view: PSNR in dB, SSIM, the seconds that rendering it took, LPIPS where its weights are at hand, and PSNR
-    against the photograph without passers-by where that is known."""
+    """One view: PSNR in dB, SSIM, the seconds that rendering it took, LPIPS where its weights are at hand, PSNR
+    against the photograph without passers-by where that is known, and fine detail where the photograph has any."""
 
     name: str
     resolution: str
@@ -59,6 +60,7 @@ class ViewScore:
     seconds: float
     lpips: float | None = None
     clean_psnr: float | None = None
+    detail: FineDetail | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,14 @@ class Evaluation:
     def lpips(self) -> float | None:
         """Mean LPIPS over the views; None if it was not measured."""
         return mean_known(view.lpips for view in self.views)
+
+    @property
+    def detail(self) -> FineDetail | None:
+        """Mean detail over the views; None if no photograph has fine detail."""
+        sharp, gain = (
+            mean_known(getattr(v.detail, name, None) for v in self.views) for name in FineDetail.__annotations__
+        )
+        return None if sharp is None or gain is None else FineDetail(sharp, gain)
 
     @property
     def seconds_per_view(self) -> float:
@@ -114,6 +124,7 @@ class Evaluation:
         return {
             **self.means(),
             **({"by_resolution": parts} if len(parts) > 1 else {}),
+            **({} if self.detail is None else {"detail": asdict(self.detail)}),
             "protocol": self.protocol,
             "seconds_per_view": self.seconds_per_view,
             "render_compile_seconds": self.compile_seconds,
@@ -222,12 +233,15 @@ def compare(
     likeness = ssim_map(rgb, photograph)
     if mask is None:
         perceived = lpips(rgb, photograph) if lpips else None
-        return ViewScore(name, size, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived, clean)
+        closeness = float(likeness.mean())
+        shown = detail(rgb, photograph)
+        return ViewScore(name, size, psnr(rgb, photograph), closeness, seconds, perceived, clean, shown)
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
     perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
     closeness = float(inner.mean()) if len(inner) else 0.0
-    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived, clean)
+    shown = detail(rgb, photograph, mask)
+    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived, clean, shown)
 
 
 def warm_up(method: Method, camera: Camera) -> float:

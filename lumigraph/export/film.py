@@ -7,7 +7,7 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import av
 import numpy as np
@@ -31,39 +31,52 @@ from .video import open_video
 PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, for the range of depth
 
 
+Pictures = Literal["png", "exr"]
+
+
 def film(
-    method: Method | Sequence[Method], cameras: Camera, path: Path, fps: float = 30.0, light: bool = False
+    method: Method | Sequence[Method],
+    cameras: Camera,
+    path: Path,
+    fps: float = 30.0,
+    depth: bool = False,
+    pictures: Pictures | None = None,
 ) -> dict[str, Any]:
     """Render every camera of one size. Returns what is written to the JSON file.
 
     method: one for all frames, or one for each, such as what `animated` makes
-    light:  write the pictures' linear light as well, path/orbit/0000.exr
-    For path/orbit.mp4 also writes path/orbit-depth.mp4, the pictures path/orbit/0000.png and 0000-depth.png, and
-    path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads back to the capture's) and
-    the controls of the method. Raises LumigraphError, before anything is rendered, if something else lies there.
+    depth:  write depth as well, path/orbit-depth.mp4
+    pictures: write the frames as well, path/orbit/0000.png and, with depth, 0000-depth.png; exr adds 0000.exr, their
+            linear light
+    Beside path/orbit.mp4 writes path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads
+    back to the capture's) and the controls of the method. Raises LumigraphError, before anything is rendered, if
+    something else lies there.
     """
-    claim_film(path)
+    claim_film(path, depth=depth, pictures=pictures)
     shown = [method] * len(cameras) if isinstance(method, Method) else list(method)
     assert len(shown) == len(cameras), f"{len(shown)} methods for {len(cameras)} frames"
     for one in shown:
         one.eval()
     width, height = cameras.size[0].tolist()
     ask_for_picture(width, height, shown[0].device)
-    within = film_depth_range(shown, cameras)
+    within = film_depth_range(shown, cameras) if depth else None
     with contextlib.ExitStack() as stack:
-        targets = [
-            stack.enter_context(open_video(path, fps, "film")),
-            stack.enter_context(open_video(depth_beside(path), fps, "film of depth")),
-        ]
-        folder = stack.enter_context(replacing_folder(path.with_suffix(""), "pictures of a film"))
+        targets = [stack.enter_context(open_video(path, fps, "film"))]
+        if depth:
+            targets.append(stack.enter_context(open_video(depth_beside(path), fps, "film of depth")))
+        if pictures:
+            folder = stack.enter_context(replacing_folder(path.with_suffix(""), "pictures of a film"))
         begin = time.perf_counter()
         for i in track(range(len(cameras)), f"Filming {path.name}", len(cameras)):
             seen = shown[i].render(cameras[i]).cpu()
-            pictures = to_bytes(seen.rgb), to_bytes(colour_depth(seen.depth, seen.opacity, within))
-            for target, ending, picture in zip(targets, ("", "-depth"), pictures, strict=True):
-                target.add(picture)
-                Image.fromarray(picture.numpy()).save(folder / f"{i:04d}{ending}.png")
-            if light:
+            frames = [to_bytes(seen.rgb)]
+            if within:
+                frames.append(to_bytes(colour_depth(seen.depth, seen.opacity, within)))
+            for target, ending, frame in zip(targets, ("", "-depth"), frames, strict=False):
+                target.add(frame)
+                if pictures:
+                    Image.fromarray(frame.numpy()).save(folder / f"{i:04d}{ending}.png")
+            if pictures == "exr":
                 (folder / f"{i:04d}.exr").write_bytes(exr(light_of(seen)))
         seconds = (time.perf_counter() - begin) / len(cameras)
     about = {
@@ -71,7 +84,7 @@ def film(
         "fps": fps,
         "size": cameras.size[0].tolist(),
         "seconds_per_frame": seconds,
-        "depth_range": list(within),
+        **({"depth_range": list(within)} if within else {}),
         "source_from_scene": shown[0].frame.source_from_scene,
         "lens": cameras.lens.to_json(),
         "poses": cameras.pose.tolist(),
@@ -84,12 +97,20 @@ def film(
     return about
 
 
-def claim_film(path: Path, overwrite: bool | None = None, reads: Collection[Path] = ()) -> None:
+def claim_film(
+    path: Path,
+    overwrite: bool | None = None,
+    reads: Collection[Path] = (),
+    depth: bool = False,
+    pictures: Pictures | None = None,
+) -> None:
     """Raise LumigraphError unless a film, and all that goes beside it, may be written there; see `files.claim`."""
     claim(path, "film", overwrite, reads)
-    claim(depth_beside(path), "film of depth", overwrite, reads)
     claim(path.with_suffix(".json"), "cameras of a film", overwrite, reads)
-    claim_folder(path.with_suffix(""), "pictures of a film")
+    if depth:
+        claim(depth_beside(path), "film of depth", overwrite, reads)
+    if pictures:
+        claim_folder(path.with_suffix(""), "pictures of a film")
 
 
 def depth_beside(path: Path) -> Path:

@@ -28,6 +28,8 @@ def between(least: float, most: float) -> msgspec.Meta:
     return msgspec.Meta(ge=least, le=most)
 
 
+UNSURPRISING, MAX_LEAST = 1_000_000, 4  # ranges from 4 or less to a million or more are not shown in help
+
 # What recurs. Ranges are as wide as any use that makes sense, and no wider.
 Count = Annotated[int, between(1, 1_000_000)]  # of photographs, views, frames
 Steps = Annotated[int, between(1, 1_000_000_000)]
@@ -65,7 +67,7 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # of a matrix
 
 
-def numbers(kind: Any) -> Iterator[tuple[type, msgspec.Meta | None]]:
+def numbers(kind: Any) -> Iterator[tuple[type, Any]]:
     """Every number within an annotation, as (int or float, its range, None where it has none)."""
     if get_origin(kind) is Annotated:
         inner, *about = get_args(kind)
@@ -82,6 +84,11 @@ def domain(kind: Any) -> str:
     """The range of an annotation's numbers in words, "1 to 32"; "" where it has none."""
     ranges = {(kind, x.ge, x.le): x for kind, x in numbers(kind) if x is not None}
     return " or ".join(f"{said(x.ge)} to {said(x.le)}" for x in ranges.values())
+
+
+def is_surprising(kind: Any) -> bool:
+    """True if an annotation refuses numbers that a user may give: not if it takes any positive number or count."""
+    return any(x.ge > MAX_LEAST or x.le < UNSURPRISING for _, x in numbers(kind) if x is not None)
 
 
 def said(number: Any) -> str:

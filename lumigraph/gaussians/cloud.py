@@ -20,6 +20,7 @@ from ..errors import LumigraphWarning
 from ..geometry import multiply, to_quaternion
 
 ISOLATION_NEIGHBOURS = 16  # nearest Gaussians whose mean distance measures isolation
+BAND_0 = 0.5 / math.sqrt(math.pi)  # the constant harmonic
 EXTENT_OPACITY = 0.1  # opacity from which on a Gaussian counts for the extent of the cloud
 EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
 
@@ -173,6 +174,13 @@ def unwanted(
         alone[keep] = logs > logs.mean() + isolation * logs.std()
     drop("isolated", alone)
     return reasons
+
+
+def painted(gaussians: Gaussians, which: Bool[Tensor, " gaussian"], colour: tuple[float, float, float]) -> Gaussians:
+    """The cloud with the Gaussians of a mask in one colour, sRGB-encoded, from every direction."""
+    plain = torch.zeros_like(gaussians.harmonics)
+    plain[:, 0] = (plain.new_tensor(colour) - 0.5) / BAND_0
+    return replace(gaussians, harmonics=torch.where(which[:, None, None], plain, gaussians.harmonics))
 
 
 def extent(gaussians: Gaussians) -> float:

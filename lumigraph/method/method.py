@@ -86,6 +86,10 @@ class Method(nn.Module, ABC):
         held = (getattr(config, x.name) for x in dataclasses.fields(config))
         return sum(x.further_bytes(frame, learning) for x in held if hasattr(x, "further_bytes"))
 
+    def growth_bytes(self) -> int:
+        """Bytes by which the method may grow while it learns, of those that are free."""
+        return 0
+
     # Learning
 
     def steps_per_pass(self, data: Any) -> float:

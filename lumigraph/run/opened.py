@@ -123,9 +123,8 @@ class Trained(Opened):
 
     @property
     def title(self) -> str:
-        """The scene's name."""
-        source = self.learnt_from.source
-        return Path(source.partition(":")[2]).name if source.startswith("procedural:") else Path(source).name
+        """Name of its folder: that of its pages and of files made from it."""
+        return self.folder.resolve().name
 
     @property
     def renders(self) -> Path:

@@ -17,7 +17,9 @@ from ..errors import LumigraphError
 
 STATUS_FILE = Path("/proc/self/status")
 SPARED_SHARE = 0.3  # of free memory, left to other programs
-IMAGES_SHARE = 0.4  # of the machine's memory that images may take; the rest is for training and other programs
+IMAGES_SHARE = 0.4  # of the memory that this process may take at most; the rest is for training
+FREE_IMAGES_SHARE = 0.6  # of the memory that is free, which images may take
+MAX_THREADS = 16  # more need more memory than they save time
 BYTES_PER_PIXEL = 128  # while a picture is rendered: ray, colour, depth and opacity, in parts and in total
 MEMORY_FAULTS = (
     "can't allocate memory",
@@ -26,10 +28,11 @@ MEMORY_FAULTS = (
     "Cannot allocate memory",
 )
 UNITS = {unit: 1024**power for power, unit in enumerate("bKMGTPE")}
-CONTAINER_LIMITS = (  # files with the limit of a container, and its use
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-)
+CONTROL_GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+GROUP_FILES = {  # limit of a control group, its use, and the use that the system takes back: cached files
+    2: ("memory.max", "memory.current", "inactive_file"),
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
 
 
 def peak_memory(device: torch.device) -> int:
@@ -96,29 +99,67 @@ def want_of_memory(error: BaseException) -> str | None:
 
 
 def free_memory() -> int:
-    """Bytes that a program may still have: the machine's, or what is left of a container's limit."""
+    """Bytes that this process may still have: of the machine, of its control groups, of its addresses."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             known = dict(line.split(":") for line in file)
         free = 1024 * int(known["MemAvailable"].split()[0])
     except (OSError, KeyError, ValueError):
-        return 1 << 50
-    for limit, used in CONTAINER_LIMITS:
-        try:
-            with open(limit, encoding="ascii") as most, open(used, encoding="ascii") as now:
-                free = min(free, int(most.read()) - int(now.read()))
-        except (OSError, ValueError):
-            continue
-    return max(free, 0)
+        free = 1 << 50
+    return max(0, min([free, *(limit - used for limit, used in limits())]))
+
+
+def limits() -> list[tuple[int, int]]:
+    """Limits of this process's memory and how much of each is used, in bytes: of its control groups (version 1 or 2),
+    of the groups around them, and of its addresses (`ulimit -v`)."""
+    return group_limits() + address_limit()
+
+
+def address_limit() -> list[tuple[int, int]]:
+    """Limit of addresses and how many are in use, mapped files included; empty without a limit."""
+    with suppress(OSError, ValueError, ImportError, IndexError):
+        resource = importlib.import_module("resource")
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        used = 1024 * int(re.findall(r"VmSize:\s*(\d+) kB", open_text(STATUS_FILE))[0])
+        return [(limit, used)] if limit != resource.RLIM_INFINITY else []
+    return []
+
+
+def group_limits() -> list[tuple[int, int]]:
+    """Limits and use of the control groups alone; cached files that are not in use count as free."""
+    found = []
+    with suppress(OSError, ValueError):
+        for line in open_text(OWN_GROUPS).splitlines():
+            number, controllers, path = line.split(":", 2)
+            version = 2 if number == "0" else 1
+            if version == 1 and "memory" not in controllers.split(","):
+                continue
+            top = CONTROL_GROUPS if version == 2 else CONTROL_GROUPS / "memory"
+            own = top / path.strip("/")
+            for folder in [own, *own.parents][: len(own.parts) - len(top.parts) + 1]:
+                limit, use, cached = GROUP_FILES[version]
+                with suppress(OSError, ValueError):  # the top has no limit
+                    most, now = (int(open_text(folder / name)) for name in (limit, use))
+                    rows = (row.split() for row in open_text(folder / "memory.stat").splitlines())
+                    found.append((most, now - sum(int(value) for name, value in rows if name == cached)))
+    return found
+
+
+def open_text(path: Path) -> str:
+    with open(path, encoding="utf-8") as file:
+        return file.read()
 
 
 def memory_for_images() -> int:
-    """Bytes of images to keep in memory: a share of the machine's, or of what a container allows."""
+    """Bytes of images to keep in memory: a share of what this process may have in all, and of what is free now."""
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         total = 8 << 30
-    for limit, _ in CONTAINER_LIMITS:
-        with suppress(OSError, ValueError):  # no container, or no limit
-            total = min(total, int(Path(limit).read_text()))
-    return int(IMAGES_SHARE * total)
+    total = min([total, *(limit for limit, _ in limits())])
+    return int(min(IMAGES_SHARE * total, FREE_IMAGES_SHARE * free_memory()))
+
+
+def threads_for(each: int, most: int = MAX_THREADS) -> int:
+    """Number of threads for work that takes so many bytes in each: at least one, at most the processor's."""
+    return max(1, min(os.cpu_count() or 1, most, room_for(each, torch.device("cpu"))))

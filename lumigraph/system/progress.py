@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -104,6 +104,23 @@ class ProgressStage:
             return told
         left = self.seconds * (self.total - self.count) / self.count
         return f"{told}, {100 * self.count / self.total:.0f} %, about {clock(left)} left"
+
+
+class NumberedStages:
+    """Stages of long work, each announced on stderr as it begins: "2 of 3: train"; silent unless shown."""
+
+    def __init__(self, names: Sequence[str], time: str, show: bool):
+        self._names, self._next, self._show = names, 0, show
+        self._tell(f"{len(names)} stages{time}: {', '.join(names)}")
+
+    def begin(self) -> None:
+        """Announce the next stage."""
+        self._next += 1
+        self._tell(f"{self._next} of {len(self._names)}: {self._names[self._next - 1]}")
+
+    def _tell(self, line: str) -> None:
+        if self._show:
+            tell(line)
 
 
 def tell(line: str) -> None:

@@ -95,9 +95,10 @@ class TrainingDisplay:
         self.bar.live.transient = False
         self.bar.start()
 
-    def begin(self, data: Dataset) -> None:
-        """Show the training data, and that kernels are compiled before the first step."""
+    def begin(self, data: Dataset, memory: str) -> None:
+        """Show the training data, the sentence about memory, and that kernels are compiled before the first step."""
         self._line(learnt_from(data))
+        self._line(memory)
         self.bar.update(self.task, description="Compiling kernels")
         if not self.terminal:
             self._line("Compiling kernels, which takes long the first time only")

@@ -21,7 +21,9 @@ from ..figures import save_picture
 from ..method import Lesson, Method
 from ..run import Run, State, check_memory
 from ..system.memory import peak_memory
+from ..system.progress import counting
 from ..system.signals import Interrupt
+from .demand import about_memory
 from .display import TrainingDisplay
 from .verdict import shares_seen
 
@@ -100,8 +102,11 @@ def fit(
     check_memory(type(method), method.frame, method.config, method.device, learning=True)
     with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
         fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
-        display.begin(data)
-        compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
+        display.begin(data, about_memory(method, data))
+        compile_seconds = state.compile_seconds
+        if rehearsal:
+            with display.aside(), counting("Compiling kernels"):
+                compile_seconds += rehearse(method, data, state.step)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
         if run:
             run.restore_training(optimizers, generator)

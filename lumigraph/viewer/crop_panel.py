@@ -69,7 +69,7 @@ class CropPanel:
                 for name, (label, limits, hint) in FLOATERS.items()
             }
             if keep is not None:
-                name = f"{shared.subject.title.partition('.')[0]}-part.ply"
+                name = f"{shared.subject.title}-part.ply"
                 hint = "Of a splat file, .ply or .spz, or of a folder for a new run"
                 self._name = gui.add_text("Name", name, hint=hint)
                 gui.add_button("Save").on_click(lambda _: self._save())

@@ -70,7 +70,7 @@ class Visitor:
         self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify)
         self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
         if shared.subject.exporter is not None:
-            about = shared.subject.exporter, shared.subject.title.partition(".")[0], self.request, self.notify
+            about = shared.subject.exporter, shared.subject.title, self.request, self.notify
             self.export = ExportPanel(client, shared.tabs["Export"], *about)
         self._seen: tuple[Any, ...] = ()
         self._at_rest: asyncio.TimerHandle | None = None  # until the camera counts as resting

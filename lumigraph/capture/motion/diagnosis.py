@@ -36,6 +36,8 @@ MAX_REPROJECTION_ERROR = 2.0  # pixels
 ANGLE_SAMPLES = 2000  # points whose angles are measured
 MAX_NAMES = 8  # photographs that a warning lists
 
+Homography = tuple[Float[np.ndarray, "3 3"], tuple[int, int], tuple[int, int]]  # and the sizes of both photographs
+
 
 @dataclass(frozen=True)
 class Matches:
@@ -85,7 +87,7 @@ def read_matches(database: Path) -> Matches:
     return Matches(features, shared, count_turns(flat))
 
 
-def count_turns(homographies: Sequence[tuple[Float[np.ndarray, "3 3"], tuple[int, int], tuple[int, int]]]) -> int:
+def count_turns(homographies: Sequence[Homography]) -> int:
     """Number of homographies between two pictures that a turn explains, and no plane: K R K⁻¹ with one focal length.
 
     Each with the widths and heights of its pictures. A plane before a camera that moves gives R + t nᵀ, which is no
@@ -93,6 +95,13 @@ def count_turns(homographies: Sequence[tuple[Float[np.ndarray, "3 3"], tuple[int
     """
     if not homographies:
         return 0
+    off, _ = deviation_from_turn(homographies)
+    return round(float((off < MAX_TURN_DEVIATION).mean()) * len(homographies))
+
+
+def deviation_from_turn(homographies: Sequence[Homography]) -> tuple[Float[np.ndarray, " pair"], float]:
+    """Deviation of some of the homographies from a turn, in terms of its motion, and the focal length that makes it
+    least, in terms of the longer side."""
     some, ratios = evenly(homographies, TURN_SAMPLES), np.geomspace(*FOCAL_RATIOS)
     worst = np.empty((len(some), len(ratios)))
     for row, (homography, *sizes) in zip(worst, some, strict=True):
@@ -101,8 +110,8 @@ def count_turns(homographies: Sequence[tuple[Float[np.ndarray, "3 3"], tuple[int
         motion /= np.cbrt(np.linalg.det(motion))[:, None, None]
         off = np.abs(motion.transpose(0, 2, 1) @ motion - np.eye(3)).max((1, 2))
         row[:] = off / (np.abs(motion - np.eye(3)).max((1, 2)) + MIN_MOTION)
-    best = worst[:, np.median(worst, axis=0).argmin()]
-    return round(float((best < MAX_TURN_DEVIATION).mean()) * len(homographies))
+    best = int(np.median(worst, axis=0).argmin())
+    return worst[:, best], float(ratios[best])
 
 
 def calibration(size: tuple[int, int], ratios: Float[np.ndarray, " ratio"]) -> Float[np.ndarray, "ratio 3 3"]:

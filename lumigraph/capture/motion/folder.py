@@ -29,7 +29,8 @@ RESULT_FILE = "capture.json"
 SOURCES_FILE = "sources.json"  # inside WORK_FOLDER: the sources of the folder
 POINTS_FILE = "points.ply"
 DRAWING_FILES = "capture.png", "photographs.png"
-WRITTEN_FILES = (RESULT_FILE, "transforms.json", POINTS_FILE, RAW_FILE, *DRAWING_FILES)
+PANORAMA_FILE = "panorama.jpg"  # of photographs from one place, which are no scene
+WRITTEN_FILES = (RESULT_FILE, "transforms.json", POINTS_FILE, RAW_FILE, PANORAMA_FILE, *DRAWING_FILES)
 
 # COLMAP's parameters by the names that transforms.json has for them.
 NAMES = {

@@ -20,7 +20,8 @@ from ...files.locks import held
 from ...files.names import counted, natural
 from ...files.ranges import typed
 from ...system.library import pycolmap
-from ...system.progress import counting
+from ...system.memory import free_memory
+from ...system.progress import counting, tell
 from ..colmap import poses_of
 from ..doctor import findings
 from ..photos import Intake, Photo, gather
@@ -28,11 +29,22 @@ from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from ..transforms import read as read_transforms
-from .diagnosis import ALL_TURNED_SHARE, MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
+from .demand import demand_of, fitted
+from .diagnosis import (
+    ALL_TURNED_SHARE,
+    MIN_FEATURES,
+    Diagnosis,
+    Matches,
+    diagnose,
+    folds,
+    read_matches,
+    triangulation_angle,
+)
 from .drawings import draw_capture, draw_photographs
 from .folder import (
     DRAWING_FILES,
     MASKS,
+    PANORAMA_FILE,
     RESULT_FILE,
     claim,
     claim_results,
@@ -46,8 +58,10 @@ from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens,
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .sphere import flat_views
 from .stages import Stages, key_of
+from .stitching import stitch
 
 MIN_VIEWS = 3  # photographs of a model
+MIN_PARALLAX = 0.3  # degrees, median over points: below it photographs that turned have no depth
 BLACK = -10.5  # mean log2 of the luminance, below which a photograph is black: 2 of 255
 MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
@@ -59,7 +73,7 @@ MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must
 FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
-OUTPUT_VERSION = 3  # another number makes all outputs be written again
+OUTPUT_VERSION = 4  # another number makes all outputs be written again
 
 
 @dataclass(frozen=True)
@@ -106,6 +120,9 @@ def reconstruct(
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
+        if (known := finished(folder, work_to_do.keys["result"])) is not None:
+            return known
+        work_to_do.fit(free_memory())
         return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
 
 
@@ -194,8 +211,18 @@ class Reconstruction:
         self.max_size = self.options.max_size * (2 if self.spherical else 1)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
         self.matching: Matching = chosen if self.options.matching == "auto" else self.options.matching
-
+        budgets = (features for most, features in FEATURE_BUDGETS if len(self.photos) <= most)
+        self.features = next(budgets, MIN_FEATURE_BUDGET)
         self.keys = self.make_keys()
+
+    def fit(self, free: int) -> None:
+        """Choose numbers that fit into so many free bytes, and announce memory and time."""
+        asked = demand_of(self.photos, self.matching, self.max_size, self.features)
+        chosen, cuts = fitted(asked, free)
+        self.max_size, self.features = chosen.max_size, chosen.features
+        self.keys = self.make_keys()
+        for sentence in (chosen.say(), *cuts):
+            tell(sentence)
 
     def make_keys(self) -> dict[str, str]:
         """For each stage a name of everything that its result depends on."""
@@ -204,7 +231,7 @@ class Reconstruction:
             [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
             [[prior(group), self.lens, [p.name for p in group]] for group in self.groups],
             self.max_size,
-            self.count_features(),
+            self.features,
         )
         places = [p.gps for p in self.photos] if self.matching == "retrieval" else None
         matching = key_of(features, self.matching, places)
@@ -225,9 +252,6 @@ class Reconstruction:
         with counting("Writing the scene"):
             return self.write(self.keys["result"])
 
-    def count_features(self) -> int:
-        return next((features for most, features in FEATURE_BUDGETS if len(self.photos) <= most), MIN_FEATURE_BUDGET)
-
     def find_features(self, key: str) -> None:
         if self.stages.is_done("features", key) and self.database.is_file():
             return
@@ -236,12 +260,15 @@ class Reconstruction:
             with replacing(self.database, ours=True) as partial:
                 write_database(partial, self.groups, self.lens)
         with self.stages.working("features", key):
-            self.detect("Finding details", self.database, self.names, self.max_size, self.count_features(), 1.0)
+            self.detect("Finding details", self.database, self.names, self.max_size, self.features, 1.0)
 
     def detect(
         self, description: str, database: Path, names: list[str], max_size: int, features: int, contrast: float
     ) -> None:
-        """Detect features of photographs that have none in a database; contrast: of COLMAP's threshold."""
+        """Detect features of photographs that have none in a database, as large as memory allows; contrast: of COLMAP's
+        threshold."""
+        asked = replace(demand_of(self.photos, self.matching, max_size, features), count=len(names))
+        chosen, _ = fitted(asked, free_memory())
         self.colmap(
             description,
             len(self.names),
@@ -250,9 +277,10 @@ class Reconstruction:
             names=names,
             images=str(self.images),
             masks=self.masks and str(self.masks),
-            max_size=max_size,
+            max_size=chosen.max_size,
             features=features,
             contrast=contrast,
+            threads=chosen.threads,
         )
 
     def compare(self, key: str) -> None:
@@ -405,12 +433,16 @@ class Reconstruction:
 
     def write(self, key: str) -> dict[str, Any]:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
-        matches = read_matches(self.second if self.second.is_file() else self.database)
+        database = self.second if self.second.is_file() else self.database
+        matches = read_matches(database)
         found, told, _ = self.choose(matches)
         if self.refined.is_dir():
             found = [pycolmap.Reconstruction(self.refined), *found]
-        if not found or found[0].num_reg_images() < MIN_VIEWS or matches.are_turned(ALL_TURNED_SHARE):
-            raise LumigraphError(nothing_fits(self.intake, self.photos, matches))
+        flat = bool(found) and matches.are_turned() and triangulation_angle(found[0]) < MIN_PARALLAX
+        if not found or found[0].num_reg_images() < MIN_VIEWS or flat or matches.are_turned(ALL_TURNED_SHARE):
+            instead = self.folder / PANORAMA_FILE
+            stitched = matches.are_turned() and stitch(database, self.images, instead)
+            raise LumigraphError(nothing_fits(self.intake, self.photos, matches, instead if stitched else None))
         for name in (RESULT_FILE, "transforms.json"):
             claim_file(self.folder / name, "capture")
             remove(self.folder / name)
@@ -467,7 +499,7 @@ class Reconstruction:
             "key": key,
             "source": self.intake.source,
             "sources": [str(path.resolve()) for path in self.sources],
-            "options": asdict(self.options) | {"matching": self.matching, "features": self.count_features()},
+            "options": asdict(self.options) | {"matching": self.matching, "features": self.features},
             **asdict(diagnosis),
             "cameras": cameras,
             "gps": gps,
@@ -545,8 +577,8 @@ def also_repeated(intake: Intake) -> str:
     return f" ({count} more {'shows' if count == 1 else 'show'} what {first} shows)" if count else ""
 
 
-def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches) -> str:
-    """Why no model came about, in a sentence."""
+def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches, panorama: Path | None = None) -> str:
+    """Why no model came about, in a sentence. panorama: of all of them, made instead"""
     poor = sum(matches.features.get(photo.name, 0) < MIN_FEATURES for photo in photos)
     if poor > len(photos) / 2:
         why = f"{poor} of {len(photos)} show too few details, being blank, dark or out of focus"
@@ -554,6 +586,7 @@ def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches) -> s
         why = f"no two of {len(photos)} show the same things"
     elif matches.are_turned():
         why = "they were taken from one place, so that nothing shows parallax, which depth is found by"
+        why += f"; {panorama} is a panorama of them instead" if panorama else ""
     else:
         largest = len(matches.groups()[0])
         why = f"at most {largest} of {len(photos)} show the same things, and not from places that tell depth"

@@ -273,7 +273,7 @@ def end_with_input() -> None:
 def main() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # COLMAP's logging library has taken it
     job = json.loads(sys.argv[1])
-    job["threads"] = min(os.cpu_count() or 1, MAX_THREADS)
+    job.setdefault("threads", min(os.cpu_count() or 1, MAX_THREADS))
     job["seed"] = 0
     threading.Thread(target=end_with_input, daemon=True).start()
     run, table = STAGES[job["stage"]]

@@ -16,6 +16,7 @@ from PIL import Image
 from ...errors import LumigraphError
 from ...files import explained
 from ...files.names import counted, natural
+from ...system.memory import threads_for
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import HEIC_SUFFIXES, NO_HEIC, describe, reads_heic, reductions
 from ..raw import Developed, is_raw
@@ -27,6 +28,7 @@ from .video import extract, is_video
 
 PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", *HEIC_SUFFIXES}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
+LOOKING_BYTES = 400_000_000  # of a photograph of 24 megapixels, decoded and turned
 PROGRAM_FILES = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # in folders of programs
 
 
@@ -92,7 +94,7 @@ def of_video(path: Path, source: str, work: Path, frames: int | None, track: Tra
 
 def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, Candidate | str]:
     """Every file as a candidate, or why it is none; several are read at a time."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+    with ThreadPoolExecutor(threads_for(LOOKING_BYTES)) as pool:
         found = pool.map(lambda name: take(name, files[name], copies), files)
         try:
             return dict(zip(files, track(found, "Looking at photographs", len(files)), strict=True))

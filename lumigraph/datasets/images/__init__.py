@@ -15,6 +15,7 @@ from .store import ImageSource as ImageSource
 from .store import ImageStore as ImageStore
 from .store import PixelBatch as PixelBatch
 from .store import Runs as Runs
+from .store import runs_of as runs_of
 from .store import shuffled_order as shuffled_order
 from .store import spread as spread
 from .stream import ImageStream as ImageStream

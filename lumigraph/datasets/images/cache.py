@@ -17,6 +17,7 @@ import numpy as np
 
 from ...errors import LumigraphError
 from ...files import is_file
+from ...system.memory import threads_for
 
 CACHE_FORMAT = 2  # version of the cache's files
 MARK_FILE = "store.json"  # written last: a folder that holds it is complete
@@ -92,10 +93,14 @@ def free_space(folder: Path) -> int:
 
 
 def in_parallel(
-    read: Callable[[int], Found], numbers: Sequence[int], progress: Callable[[int], object] = lambda done: None
+    read: Callable[[int], Found],
+    numbers: Sequence[int],
+    progress: Callable[[int], object] = lambda done: None,
+    each: int = 1,
 ) -> list[Found]:
-    """Results of `read` for each number, from several threads. progress: called with the number that is done."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+    """Results of `read` for each number, from several threads. progress: called with the number that is done; each:
+    bytes that one call takes, for as many threads as memory allows."""
+    with ThreadPoolExecutor(threads_for(each)) as pool:
         tasks = [pool.submit(read, number) for number in numbers]
         found = []
         try:

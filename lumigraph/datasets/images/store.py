@@ -40,12 +40,9 @@ class Runs:
         return self.start, self.before, ahead, first_run
 
     @staticmethod
-    def of(masks: Sequence[np.ndarray]) -> Runs:
-        starts, lengths = [], []
-        for mask in masks:
-            edges = np.flatnonzero(np.diff(mask.ravel().astype(np.int8), prepend=0, append=0))
-            starts.append(edges[::2])
-            lengths.append(edges[1::2] - edges[::2])
+    def of(found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Runs:
+        """Runs of images one after the other, each as of `runs_of`."""
+        starts, lengths = zip(*found, strict=True)
         length = torch.from_numpy(np.concatenate(lengths))
         count = torch.tensor([int(x.sum()) for x in lengths])
         return Runs(torch.from_numpy(np.concatenate(starts)), length.cumsum(0) - length, count)
@@ -57,6 +54,12 @@ class Runs:
         trusted = torch.zeros(pixels, dtype=torch.bool)
         trusted[self.start[run] + rank - self.before[run]] = True
         return trusted
+
+
+def runs_of(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:
+    """Runs of trusted pixels, row by row: the pixel at which each begins, and its length in pixels."""
+    edges = np.flatnonzero(np.diff(mask.ravel().astype(np.int8), prepend=0, append=0))
+    return edges[::2], edges[1::2] - edges[::2]
 
 
 def spread(count: int) -> int:
@@ -89,11 +92,13 @@ class ImageSource:
     size:     (width, height) that `read` will give
     read:     makes the pixels, uint8 (height, width, 3 or 4), and which of them to trust (None: all)
     identity: says all that the pixels depend on (file, its date and size, scaling); None if nothing can
+    decoding: bytes that `read` takes at most; fewer are read at a time where that is much
     """
 
     size: tuple[int, int]
     read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
     identity: str | None = None
+    decoding: int = 0
 
 
 @dataclass(frozen=True)
@@ -279,18 +284,18 @@ def fill(
     """Read all pictures into their places. Returns whether any is see-through, and what to trust."""
     ends = np.cumsum([p.size[0] * p.size[1] for p in pictures])
 
-    def read(index: int) -> tuple[bool, np.ndarray | None]:
+    def read(index: int) -> tuple[bool, tuple[np.ndarray, np.ndarray] | None]:
         pixels, mask = whole(pictures[index])
         one = pixels.view(np.int32).ravel()
         rgba[ends[index] - len(one) : ends[index]] = one[shuffled_order(len(one), mask)] if shuffled else one
-        return see_through(pixels), mask
+        return see_through(pixels), None if mask is None else runs_of(mask)
 
-    found = in_parallel(read, range(len(pictures)), progress)
-    masks = [mask for _, mask in found]
+    most = max(max(p.decoding, 8 * p.size[0] * p.size[1]) for p in pictures)
+    found = in_parallel(read, range(len(pictures)), progress, most)
     trusted = None
-    if any(mask is not None for mask in masks):
-        pairs = zip(masks, pictures, strict=True)
-        trusted = Runs.of([np.ones(p.size[::-1], bool) if mask is None else mask for mask, p in pairs])
+    if any(runs is not None for _, runs in found):
+        pairs = zip(found, pictures, strict=True)
+        trusted = Runs.of([runs or (np.array([0]), np.array([p.size[0] * p.size[1]])) for (_, runs), p in pairs])
     return any(alpha for alpha, _ in found), trusted
 
 

@@ -19,10 +19,12 @@ from torch import Tensor
 
 from ...errors import LumigraphError
 from ...geometry import evenly
-from ...system.memory import memory_for_images
+from ...system.memory import address_limit, gigabytes, memory_for_images
+from ...system.progress import tell
 from .cache import MARK_FILE, cache_folder, free_space, key
 from .store import ImageSource, ImageStore, PixelBatch, name_of, see_through, whole
 
+ADDRESS_SHARE = 0.5  # of the free addresses that a mapped file may take
 DISK_SHARE = 0.5  # of the free space that a file of photographs may take
 KEPT_PIXELS = 1 << 16  # random pixels kept per photograph
 RAYS_PER_READ = 1 << 13  # rays that are drawn before another photograph is read
@@ -54,8 +56,13 @@ def load(
         pictures = [kept(picture, cache or cache_folder()) for picture in pictures]
     if size > memory:
         folder = (cache or cache_folder() / "images") / name_of(pictures)
-        if not (folder / MARK_FILE).exists() and size > DISK_SHARE * free_space(folder):
+        held = f"Photographs take {gigabytes(size)} decoded, and memory has {gigabytes(memory)} for them, so they"
+        more = "a larger --downscale, or more free memory, keeps them in memory"
+        no_disk = not (folder / MARK_FILE).exists() and size > DISK_SHARE * free_space(folder)
+        if no_disk or any(size > ADDRESS_SHARE * (limit - used) for limit, used in address_limit()):
+            tell(f"{held} are read from their files again and again, which is slower; {more}")
             return ImageStream(pictures, memory, cache)
+        tell(f"{held} go to a file in {folder.parent}; {more}")
     return ImageStore.load(pictures, memory, cache, progress)
 
 

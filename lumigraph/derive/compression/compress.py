@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import shutil
+import time
 from bisect import bisect_left
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from ...method.capabilities import CanCompress, needs
 from ...run import Run, check_new
 from ...run.checkpoint import Checkpoints
 from ...run.derived import Compressed
-from ...system.progress import track
+from ...system.progress import NumberedStages, clock, track
 from ...training.verdict import last_psnr
 from .model import LADDER, RUNG_POSITIONS, Model, rung_at
 
@@ -38,6 +39,8 @@ JUDGED_VIEWS = 6  # training photographs that judge a rung; held-out ones judge 
 IMPORTANCE_VIEWS = 40  # photographs from which importance is computed
 TRIAL_SHARE = 1 / 6  # of all tuning, per tried rung; the selected rung gets the rest
 RENDERED_VIEWS = 40  # renderings in place of photographs, evenly spread
+GRADIENT_COST = 3  # renderings that the importance of one view takes as long as
+STAGES = "importance of each row", "pruning and codebook, by trial", "tune", "compare"
 DEFAULT_PSNR = 30.0  # dB of a run without a recorded training PSNR
 
 
@@ -65,12 +68,18 @@ class CompressionTarget:
 
 
 def compress(
-    run: Run, output: Path, aim: CompressionTarget, source: str | None = None, device: torch.device | str = "cpu"
+    run: Run,
+    output: Path,
+    aim: CompressionTarget,
+    source: str | None = None,
+    device: torch.device | str = "cpu",
+    show: bool = False,
 ) -> Compressed:
     """A smaller run in a new folder, which opens like any other; gives what compress.json says.
 
     source: where the photographs are now, if they have moved. Where they cannot be opened, the run's own renderings are
             learnt from and compared with.
+    show:   whether stages are announced
     Raises LumigraphError for a run that was compressed already, a method that cannot be, a codebook larger than what it
     would stand for, and a size that no rung reaches.
     """
@@ -82,22 +91,42 @@ def compress(
     if aim.codebook is not None:
         check_codebook(before, aim.codebook)
     truth = truth_of(run, before, source, JUDGED_VIEWS)
-    ladder = Ladder(run, truth, aim, device, important(before, truth))
+    stages = NumberedStages(STAGES, about_time(truth, aim), show)
+    stages.begin()
+    ladder = Ladder(run, truth, aim, device, important(before, truth), stages)
     model = ladder.by_size(aim.size) if aim.size is not None else ladder.by_loss(aim.loss or 0.0)
+    stages.begin()
     return written(run, before, model, truth, output, aim)
+
+
+def about_time(truth: Truth, aim: CompressionTarget) -> str:
+    """Duration of a compression as text; empty if steps limit it."""
+    if aim.seconds is None:
+        return ""
+    learnt, held_out = min(len(truth.scene.splits["train"]), IMPORTANCE_VIEWS), len(truth.scene.splits["test"])
+    views = GRADIENT_COST * learnt + len(LADDER).bit_length() * JUDGED_VIEWS + 2 * min(aim.views or held_out, held_out)
+    return f", about {clock(aim.seconds + views * truth.view_seconds)} in all"
 
 
 class Ladder:
     """Rungs that are tried, each from the run's own weights."""
 
     def __init__(
-        self, run: Run, truth: Truth, aim: CompressionTarget, device: torch.device | str, importance: dict[str, Tensor]
+        self,
+        run: Run,
+        truth: Truth,
+        aim: CompressionTarget,
+        device: torch.device | str,
+        importance: dict[str, Tensor],
+        stages: NumberedStages,
     ):
         self.run, self.truth, self.aim, self.device, self.importance = run, truth, aim, device, importance
+        self.stages = stages
         self.tuned = 0.0  # share of all tuning
 
     def by_loss(self, most: float) -> Model:
         """The highest rung on which no more is lost, by halving; the lowest, where even there more is."""
+        self.stages.begin()
         low, high, best = 0, len(LADDER) - 1, None
         while low <= high:
             middle = (low + high) // 2
@@ -108,13 +137,16 @@ class Ladder:
             else:
                 high = middle - 1
         model = best or self.at(0)
+        self.stages.begin()
         self.tune(model, 1 - self.tuned)
         return model
 
     def by_size(self, most: int) -> Model:
         """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
         take the next one."""
+        self.stages.begin()
         first = bisect_left(RUNG_POSITIONS, True, key=lambda place: len(self.at(place).packed()) <= most)
+        self.stages.begin()
         for place in RUNG_POSITIONS[first:]:
             model, self.tuned = self.at(place), 0.0
             self.tune(model, 1.0)
@@ -223,11 +255,13 @@ class Truth:
 
     photographed: whether these are photographs; renderings of the run before it was compressed otherwise
     error:        mean squared error of the run before, on the photographs that it has learnt
+    view_seconds: time to render a view of it
     """
 
     scene: Scene
     photographed: bool
     error: float
+    view_seconds: float
 
     def loss(self, method: Method, views: int) -> float:
         """dB that a method has lost on photographs it has learnt. Where renderings stand in for them, errors that know
@@ -240,12 +274,15 @@ def truth_of(run: Run, method: Method, source: str | None, views: int) -> Truth:
     """The run's photographs; where they cannot be opened, and no other place is named, its own renderings."""
     try:
         scene = run.scene(source)
-        return Truth(scene, True, squared_error(method, scene, "train", views))
+        found = evaluate(method, scene, "train", views=views)
+        return Truth(scene, True, 10 ** (-found.psnr / 10), found.seconds_per_view)
     except LumigraphError:
         if source is not None:
             raise
     learnt = last_psnr(run.metrics())
-    return Truth(rendered(run, method), False, 10 ** (-(DEFAULT_PSNR if learnt is None else learnt) / 10))
+    begin, scene = time.perf_counter(), rendered(run, method)
+    error = 10 ** (-(DEFAULT_PSNR if learnt is None else learnt) / 10)
+    return Truth(scene, False, error, (time.perf_counter() - begin) / len(scene))
 
 
 def squared_error(method: Method, scene: Scene, split: str, views: int) -> float:

@@ -26,7 +26,7 @@ from .adaptive import AdaptiveDensity, AdaptiveNumbers
 from .addition import Addition, Step
 from .appearance import AppearanceNumbers, SplatAppearance
 from .cloud import Cloud, RateNumbers, picture_share, thinned
-from .density_control import DensityControl, RefineNumbers
+from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
 from .few_views import FewViewNumbers, FewViews
 from .initialization import Initialization, cloud_of, initial_cloud, random_cloud, surface_cloud
 from .interval_schedule import intervals
@@ -132,6 +132,9 @@ class GaussianSplatting(Method):
             poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
             photographs=AppearanceNumbers(appearance="no"),
         )
+
+    def growth_bytes(self) -> int:
+        return BYTES_PER_GAUSSIAN * self.density_control.max_count(self.cloud)
 
     # Initialisation
 
