@@ -35,6 +35,10 @@ LENSES = {
 }
 
 
+def dense_cloud(scene, seconds=math.inf):
+    return dense_points.thinned(dense_points.seen_points(scene, seconds))
+
+
 def texture(places: torch.Tensor) -> torch.Tensor:
     """A colour at each place: waves of some pixels in many directions."""
     chance = torch.Generator().manual_seed(0)
@@ -67,7 +71,7 @@ def ball(lens: str = "pinhole", alpha: bool = True) -> Scene:
 @cache
 def dense(lens: str = "pinhole", alpha: bool = True) -> dense_points.Points:
     """What sweeps find in these photographs, in which no point is known."""
-    return dense_points.dense_points(ball(lens, alpha))
+    return dense_cloud(ball(lens, alpha))
 
 
 def off_surface(points: torch.Tensor) -> torch.Tensor:
@@ -99,7 +103,7 @@ def test_nothing_is_found_where_photographs_are_not_to_be_trusted():
     masks = [torch.zeros(SIZE, SIZE, dtype=torch.bool).numpy() for _ in images]
     for mask in masks:
         mask[:, : SIZE // 2] = True
-    found = dense_points.dense_points(replace(scene, images=ImageStore.from_arrays(images, masks)))
+    found = dense_cloud(replace(scene, images=ImageStore.from_arrays(images, masks)))
     cameras = scene.cameras
     columns = torch.stack([cameras[i].project(found.positions)[0][:, 0] for i in range(COUNT)])
     assert len(found.positions) > 100
@@ -109,17 +113,18 @@ def test_nothing_is_found_where_photographs_are_not_to_be_trusted():
 def test_one_photograph_alone_has_no_dense_points():
     scene = ball()
     alone = replace(scene, splits={"train": torch.tensor([3])})
-    assert len(dense_points.dense_points(alone).positions) == 0
+    assert len(dense_cloud(alone).positions) == 0
 
 
-def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator, monkeypatch):
+def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator):
     scene = ball(alpha=False)
-    monkeypatch.setattr(initialization, "dense_points", lambda scene, seconds: dense(alpha=False))
     known = RADIUS * normalize(torch.randn(300, 3, generator=generator), dim=-1)
-    begun = initialization.initial_cloud(replace(scene, points=known), "dense", 200, 2000, 1, generator)
+    begun = initialization.initial_cloud(
+        replace(scene, points=known), "dense", 200, 2000, 1, generator, lambda: dense(alpha=False)
+    )
     assert len(begun) == 667  # a third
     assert {tuple(p) for p in known.tolist()} <= {tuple(p) for p in begun.means.tolist()}
-    begun = initialization.initial_cloud(scene, "dense", 200, 5000, 1, generator)
+    begun = initialization.initial_cloud(scene, "dense", 200, 5000, 1, generator, lambda: dense(alpha=False))
     assert (begun.means[-40:].norm(dim=-1) > 1.7).all()  # a fifth of 200, outside the box
     assert len(initialization.initial_cloud(scene, "random", 200, 5000, 1, generator)) == 200
 
@@ -167,12 +172,12 @@ def test_a_short_budget_asks_fewer_photographs(monkeypatch):
     monkeypatch.setattr(dense_points, "MIN_VIEWS", 3)
     monkeypatch.setattr(dense_points, "choose_neighbours", alone)
     for seconds in (2.0, 8.0, math.inf):
-        dense_points.dense_points(ball(), seconds)
+        dense_cloud(ball(), seconds)
     assert swept == [3, 3, 4, 4, COUNT, COUNT]  # twice each, as no point is known
 
 
 def test_a_near_distance_that_is_much_too_small_keeps_the_neighbours():
     scene = ball()
-    found = dense_points.dense_points(replace(scene, frame=replace(scene.frame, near=0.05)))
+    found = dense_cloud(replace(scene, frame=replace(scene.frame, near=0.05)))
     assert len(found.positions) > 0.5 * len(dense().positions)
     assert off_surface(found.positions).median() < 0.01

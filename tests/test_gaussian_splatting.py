@@ -55,7 +55,7 @@ def test_it_learns_a_scene(config):
     assert 300 < len(method.cloud) <= 600
 
 
-@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc", "few_views": True}, {"filter_3d": True}])
+@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc", "few_views": "yes"}, {"filter_3d": True}])
 def test_resuming_across_a_growing_cloud_is_exact(config, tmp_path):
     """Stopped after the cloud has grown, and before it grows again."""
     config = {"refine_until": 0.9, "max_gaussians": 2000, "densify_grad_threshold": 1e-3, **config}

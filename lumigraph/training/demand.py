@@ -9,7 +9,7 @@ from ..method import Method
 from ..run.settings import bytes_of
 from ..system.memory import free_on, gigabytes
 
-PICTURE_BYTES = 500  # per pixel of a photograph, while a method learns from it or is compared with it
+PICTURE_BYTES = 120  # per pixel of a photograph, while a method learns from it or is compared with it; splats took 107
 
 
 def about_memory(method: Method, data: Dataset) -> str:

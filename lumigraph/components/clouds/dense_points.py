@@ -43,11 +43,6 @@ class Points:
     origins: Float[Tensor, "point 3"]
 
 
-def dense_points(scene: Scene, seconds: float = math.inf) -> Points:
-    """Points on what at least two or three of the training photographs see, a pixel or so apart; see `seen_points`."""
-    return thinned(seen_points(scene, seconds))
-
-
 @torch.no_grad()
 def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
     """Points on what at least two or three of the training photographs see, a pixel or so apart; maybe none.
@@ -67,7 +62,7 @@ def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
 
 
 def compile_sweep() -> None:
-    """Make the kernel ready, on one dark pixel, so that it takes no time of who calls `dense_points`."""
+    """Make the kernel ready, on one dark pixel, so that it takes no time of who calls `seen_points`."""
     dark, warp = torch.zeros(1, 1, 1), torch.eye(3, 4)[None]
     kernels.plane_sweep(dark[0], dark[0], dark, dark, warp, torch.ones(1), WINDOW, 1)
 

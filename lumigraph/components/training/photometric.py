@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import huber_loss
+from torch.nn.functional import huber_loss, normalize
 
 from ...camera import Camera
 from ...camera.rays import Rendering
@@ -26,6 +26,8 @@ MAX_SIDE = 200  # pixels along their longer side
 POINTS = 1 << 14  # places at most
 MIN_SHARED = 30  # places that two photographs must share to be compared
 MIN_COLOUR, MAX_COLOUR = 0.05, 0.95  # colours between which a ratio says something
+MAX_ANGLE = 20.0  # degrees between the directions from which two photographs see a place; shading differs beyond
+MAX_SCATTER = 0.5  # stops by which ratios of one pair deviate (median); beyond, occlusion and not light explains them
 ENCODED = 2.2  # stops of light to one of sRGB-encoded colours
 
 
@@ -35,7 +37,8 @@ def spread_of_light(scene: Scene) -> float | None:
     over photographs and channels of the median log2 ratio. None where the scene has no points to compare.
 
     Neighbours see about the same side of things and the same things before others, so that what is left is the light
-    and the camera's reading of it.
+    and the camera's reading of it. Of a sparse capture even neighbours may not: pairs with directions more than
+    MAX_ANGLE apart, or with ratios that scatter by more than MAX_SCATTER, do not count.
     """
     if scene.points is None or len(train := scene.splits["train"]) < 2:
         return None
@@ -72,7 +75,8 @@ def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
 
 
 def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, " 3"] | None:
-    """Stops by which one picture shows points brighter than another, for each channel; None if they share too few."""
+    """Stops by which one picture shows points brighter than another, for each channel; None if they share too few, or
+    differ by more than light and exposure."""
     colours, known = [], torch.ones(len(points), dtype=torch.bool)
     for view in (one, other):
         seen, row, column, _ = view.sees(points)
@@ -81,7 +85,12 @@ def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -
         known &= seen & (view.trust[row, column] > 0.5) & (rgb > MIN_COLOUR).all(-1) & (rgb < MAX_COLOUR).all(-1)
     if int(known.sum()) < MIN_SHARED:
         return None
-    return (colours[0][known] / colours[1][known]).log2().median(0).values
+    towards = [normalize(points[known] - view.pose[:, 3], dim=-1) for view in (one, other)]
+    angle = (towards[0] * towards[1]).sum(-1).clamp(-1, 1).acos().rad2deg()
+    ratios = (colours[0][known] / colours[1][known]).log2()
+    stops = ratios.median(0).values
+    scatter = (ratios - stops).abs().median(0).values
+    return stops if float(angle.median()) < MAX_ANGLE and float(scatter.mean()) < MAX_SCATTER else None
 
 
 Setting = Literal["auto", "yes", "no"]

@@ -94,6 +94,27 @@ def unseen_cameras(cameras: Camera, count: int, generator: torch.Generator) -> C
     return replace(lent, pose=pose.to(lent.pose), image_index=None)
 
 
+NEAREST_VIEWS = 3  # cameras around one, of which a camera between is drawn
+SIDEWAYS = 0.1  # deviation of a camera between two others, of their distance
+
+
+def camera_between(cameras: Camera, generator: torch.Generator) -> Camera:
+    """A camera between one of the given ones and one of the nearest to it, and a little aside; through the lens of the
+    first, turned from one to the other in the same share."""
+    poses = cameras.pose.cpu()
+    position = poses[:, :, 3]
+    first = int(torch.randint(len(poses), (1,), generator=generator))
+    away = (position - position[first]).norm(dim=-1)
+    near = away.argsort()[1 : NEAREST_VIEWS + 1] if len(poses) > 1 else torch.tensor([first])
+    second = int(near[torch.randint(len(near), (1,), generator=generator)])
+    share = torch.rand(1, generator=generator)
+    aside = SIDEWAYS * away[second] * torch.randn(3, generator=generator)
+    stand = torch.lerp(position[first], position[second], share) + aside
+    left, _, right = torch.linalg.svd(torch.lerp(poses[first, :, :3], poses[second, :, :3], share))
+    pose = torch.cat([left @ right, stand[:, None]], 1)[None]
+    return replace(cameras[torch.tensor([first])], pose=pose.to(cameras.pose), image_index=None)
+
+
 def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch.Generator) -> Rays:
     """Rays of one square patch of each camera, row by row: side * side of them.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Annotated, Any, Literal
 
 import torch
@@ -14,7 +15,7 @@ from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
-from ...components.clouds.dense_points import compile_sweep
+from ...components.clouds.dense_points import compile_sweep, seen_points
 from ...components.fields.teacher import teacher_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
@@ -91,7 +92,7 @@ class GaussianSplatting(Method):
         self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), c.rates)
         self.cloud.antialiased = c.filters.antialiased
         self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
-        self.few_views = FewViews(c.sparse.depth_weight) if c.sparse.few_views else None
+        self.few_views = FewViews(c.sparse) if c.sparse.few_views != "no" else None
         self.density_control: DensityControl = (
             MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
         )
@@ -118,7 +119,7 @@ class GaussianSplatting(Method):
         """A smaller cloud that begins dense: it learns more in the time."""
         c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
         c = replace(c, refine=RefineNumbers(max_gaussians=120_000), mcmc=McmcNumbers(joining_per_step=120.0))
-        return replace(c, rates=RateNumbers(most_haste=4.0))
+        return replace(c, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"))
 
     @classmethod
     def smallest(cls) -> Any:
@@ -140,14 +141,17 @@ class GaussianSplatting(Method):
 
     def compile_begin(self) -> None:
         super().compile_begin()
-        if self.config.initialization == "dense":
+        if self.config.initialization == "dense" or self.few_views:
             compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         c, cap = self.config, self.density_control.max_count(self.cloud)
         counts = min(c.initial_gaussians, cap), cap
-        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), SWEEP_SHARE * seconds)
+        sweep = cache(partial(seen_points, data, SWEEP_SHARE * seconds))
+        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
         self.begin_with(found, data.cameras[data.splits["train"]])
+        if self.few_views and not self.moves_cameras:
+            self.few_views.begin_scene(data, sweep)
         super().begin(data, seconds)
 
     @torch.no_grad()

@@ -1,55 +1,110 @@
-"""Few views: regularisation of a cloud that is learnt from a handful of photographs.
+"""Few views: regularisation of a cloud that is learnt from few photographs.
 
-Each step drops some Gaussians, so that those behind them learn too; depth is smooth in unobserved views; colours do not
-depend on the direction, which would explain wrong depth away.
+Each step drops some Gaussians, so that those behind them learn too, and looks at an unobserved view between two
+photographs. There depth is to be smooth, and where plane sweeps have found a surface, the view is to show it: whatever
+floats in front is carved away.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from ...camera import Camera
-from ...components.training.regularizers import normalized_distance, roughness, unseen_cameras
+from ...components.clouds.dense_points import Points
+from ...components.training.regularizers import camera_between, normalized_distance, roughness
+from ...datasets.scene import Scene
+from ...exchange.packing import Stored
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
-from ...gaussians.splatting import splat, view_of
+from ...gaussians.splatting import Splatted, splat, view_of
 from .addition import Addition, Step
 
-MAX_DROP_RATE = 0.2  # share of Gaussians at the end of training, to which it grows evenly (Park 2025, section 3.2)
+MAX_SPARSE_VIEWS = 40  # training photographs up to which an open capture is sparse
+MAX_PLAIN_VIEWS = 6  # training photographs up to which colours do not depend on the direction, which would explain
+# wrong depth away
+MAX_DROP_RATE = 0.3  # share of Gaussians at the end of training, to which it grows evenly (Park 2025, section 3.2)
 DROPPED_OPACITY = -30.0  # logit
 MAX_OPACITY = 0.999
-UNOBSERVED_PIXELS = 96  # along the shorter side of an unobserved view
+UNOBSERVED_PIXELS = 128  # along the shorter side of an unobserved view
+SURFACE_WEIGHT = 0.1  # of the depth error at known surfaces, in terms of the colour error there
+OPACITY_WEIGHT = 0.1  # of light that passes a known surface, in terms of the depth error
+MAX_LOG_ERROR = 2.0  # of depth; an error beyond has no gradient
+OCCLUSION = 1.03  # times the least depth of the pixels around, beyond which a point is hidden
 
 
 @dataclass(frozen=True)
 class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
-    few_views: bool = False  # for few photographs: dropout, smooth depth at unobserved views, plain colours
+    few_views: Literal["auto", "yes", "no"] = "no"  # regularisation for few photographs; auto: up to 40 of a place
     depth_weight: NonNegative = 1.0  # weight of depth's roughness at unobserved views, with few_views; 0: off
+    surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
 
 
 class FewViews(Addition):
-    """Dropout of Gaussians, depth smoothness at unobserved views, plain colours."""
+    """Dropout of Gaussians, smooth depth and known surfaces at unobserved views.
 
-    base_colours = True
+    active: whether the capture is sparse
+    plain:  whether colours stay plain
+    surface, surface_colours: points that plane sweeps have found
+    """
 
-    def __init__(self, depth_weight: float):
+    grows = ("surface", "surface_colours")
+
+    active: Tensor
+    plain: Tensor
+    surface: Tensor
+    surface_colours: Tensor
+
+    def __init__(self, numbers: FewViewNumbers):
         super().__init__()
-        self.depth_weight = depth_weight
+        self.numbers = numbers
+        self.register_buffer("active", torch.tensor(numbers.few_views == "yes"))
+        self.register_buffer("plain", torch.tensor(False))
+        for name in self.grows:
+            self.register_buffer(name, torch.zeros(0, 3))
+
+    @property
+    def base_colours(self) -> bool:  # type: ignore[override]
+        return bool(self.plain)
+
+    def begin_scene(self, data: Scene, sweep: Callable[[], Points]) -> None:
+        """Decide whether the capture is sparse, and keep what plane sweeps have found."""
+        count = len(data.splits["train"])
+        if self.numbers.few_views == "auto":
+            self.active.fill_(data.frame.is_open and not data.frame.has_alpha and count <= MAX_SPARSE_VIEWS)
+        if self.active:
+            self.plain.fill_(count <= MAX_PLAIN_VIEWS)
+            found = sweep()
+            self.surface, self.surface_colours = (x.to(self.surface) for x in (found.positions, found.colours))
 
     def before_raster(self, method: Any, step: Step) -> None:
-        step.cloud = drop_gaussians(step.cloud, MAX_DROP_RATE * method.progress, step.chance)
+        if self.active:
+            step.cloud = drop_gaussians(step.cloud, MAX_DROP_RATE * method.progress, step.chance)
 
     def regularize(self, method: Any, step: Step) -> None:
-        if self.depth_weight and method.cameras is not None:
-            rough = depth_roughness(step.whole, method.cameras, method.near_plane, step.chance)
-            step.terms["depth"] = self.depth_weight * rough
+        if not self.active or method.cameras is None:
+            return
+        camera = camera_between(method.cameras, step.chance).to(method.device)
+        camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
+        seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
+        step.terms["depth"] = self.numbers.depth_weight * depth_roughness(seen)
+        if self.numbers.surface_weight and len(self.surface):
+            place, depth, index = visible_points(self.surface, camera)
+            if len(index):
+                error = surface_error(seen, place, depth, self.surface_colours[index])
+                step.terms["surface"] = self.numbers.surface_weight * error
+
+    def storage(self) -> dict[str, Stored]:
+        """Rendering needs none of it."""
+        return dict.fromkeys(self.grows, Stored("nothing"))
 
 
 def drop_gaussians(cloud: Gaussians, share: float, generator: torch.Generator) -> Gaussians:
@@ -60,13 +115,35 @@ def drop_gaussians(cloud: Gaussians, share: float, generator: torch.Generator) -
     return replace(cloud, opacities=torch.where(there, opacity.logit(), DROPPED_OPACITY))
 
 
-def depth_roughness(cloud: Gaussians, cameras: Camera, near: float, generator: torch.Generator) -> Float[Tensor, ""]:
-    """Roughness of depth in a small unobserved view (Niemeyer 2022, eq. 6, over the whole of it).
-
-    cameras: of the photographs, between which the view lies;  near: the near plane
-    """
-    camera = unseen_cameras(cameras, 1, generator)
-    camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
-    seen = splat(cloud, view_of(camera, near), bands=1)
+def depth_roughness(seen: Splatted) -> Float[Tensor, ""]:
+    """Roughness of a picture's depth (Niemeyer 2022, eq. 6, over the whole of it)."""
     place = normalized_distance(seen.depth / seen.opacity.clamp_min(1e-3))
     return roughness(place[None], seen.opacity[None])
+
+
+def visible_points(
+    points: Float[Tensor, "point 3"], camera: Camera
+) -> tuple[tuple[Tensor, Tensor], Float[Tensor, " seen"], Int[Tensor, " seen"]]:
+    """Row and column, depth along the axis, and index of the points that one camera sees, unless another point within
+    a pixel lies in front."""
+    width, height = camera.size[0].tolist()
+    place, inside = camera.locate(points)
+    depth = (points - camera.position[0]) @ camera.forward[0]
+    index = (inside & (depth > 0)).nonzero()[:, 0]
+    (row, column), depth = place[index].unbind(-1), depth[index]
+    cell = row * width + column
+    least = depth.new_full((height * width,), torch.inf).scatter_reduce(0, cell, depth, "amin")
+    front = -max_pool2d(-least.view(1, 1, height, width), 3, 1, 1).view(-1)
+    seen = depth < OCCLUSION * front[cell]
+    return (row[seen], column[seen]), depth[seen], index[seen]
+
+
+def surface_error(
+    seen: Splatted, place: tuple[Tensor, Tensor], depth: Float[Tensor, " point"], colours: Float[Tensor, "point 3"]
+) -> Float[Tensor, ""]:
+    """Error of a picture at points that it is to show: of colours, of the logarithm of depth, and light that passes."""
+    opacity = seen.opacity[place]
+    ratio = (seen.depth[place] / opacity.clamp_min(1e-3)).clamp_min(1e-4) / depth
+    off = (ratio.log().abs().clamp(max=MAX_LOG_ERROR) * opacity.detach()).mean()
+    colour = (seen.rgb[place] - colours).abs().mean()
+    return colour + SURFACE_WEIGHT * (off + OPACITY_WEIGHT * (1 - opacity).mean())

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...components.clouds.dense_points import dense_points
+from ...components.clouds.dense_points import Points, seen_points, thinned
 from ...components.fields.teacher import Teacher
 from ...components.sampling.occupancy import visual_hull
 from ...datasets.scene import Frame, Scene
@@ -35,20 +37,21 @@ def initial_cloud(
     max_count: int,
     degree: int,
     generator: torch.Generator,
-    seconds: float = math.inf,
+    sweep: Callable[[], Points] | None = None,
 ) -> Gaussians:
     """At most `max_count` Gaussians at the points that are known, or where there are none, `count` random ones.
 
     initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
                     points as they are, "random" takes neither
-    seconds:        that plane sweeps may take
+    sweep:          gives points that plane sweeps find; `seen_points` by default
     Random ones lie inside the silhouettes of photographs with alpha, otherwise inside the box of interest.
     """
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
         means, colours = sparse_points(scene, max_count, generator)
     if initialization == "dense" and len(means) < (dense_count := math.ceil(MAX_DENSE_SHARE * max_count)):
-        means, colours = with_dense_points(scene, means, colours, count, dense_count, generator, seconds)
+        found = thinned((sweep or partial(seen_points, scene))())
+        means, colours = with_dense_points(scene, means, colours, count, dense_count, generator, found)
     if len(means) < 2:
         means = random_points(scene, min(count, max_count), generator)
         colours = torch.rand(len(means), 3, generator=generator)
@@ -69,10 +72,15 @@ def sparse_points(scene: Scene, max_count: int, generator: torch.Generator) -> t
 
 
 def with_dense_points(
-    scene: Scene, means: Tensor, colours: Tensor, count: int, max_count: int, generator: torch.Generator, seconds: float
+    scene: Scene,
+    means: Tensor,
+    colours: Tensor,
+    count: int,
+    max_count: int,
+    generator: torch.Generator,
+    found: Points,
 ) -> tuple[Tensor, Tensor]:
     """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
-    found = dense_points(scene, seconds)
     inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
     if len(inside) < MIN_DENSE_POINTS:
         return means, colours
