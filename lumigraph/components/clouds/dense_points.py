@@ -111,7 +111,7 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
         sizes.append(depths[i][found][kept] / view.intrinsics[0, 0])
         origins.append(view.pose[:, 3].expand(int(kept.sum()), 3))
     share = sum(len(x) for x in positions) / max(sum(view.trust.numel() for view in views), 1)
-    return Points(*(torch.cat(parts) for parts in (positions, colours, sizes, origins)), share)
+    return Points(torch.cat(positions), torch.cat(colours), torch.cat(sizes), torch.cat(origins), share)
 
 
 def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
