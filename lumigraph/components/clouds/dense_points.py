@@ -35,12 +35,17 @@ WINDOW = 5  # pixels
 
 @dataclass(frozen=True)
 class Points:
-    """Places in the scene's frame, their colours in [0, 1], and how large a pixel is there."""
+    """Places in the scene's frame, their colours in [0, 1], and how large a pixel is there.
+
+    origins: positions of the cameras that found them
+    share:   of the swept pixels at which a point was found
+    """
 
     positions: Float[Tensor, "point 3"]
     colours: Float[Tensor, "point 3"]
     sizes: Float[Tensor, " point"]
     origins: Float[Tensor, "point 3"]
+    share: float = 1.0
 
 
 @torch.no_grad()
@@ -105,7 +110,8 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
         colours.append(view.rgb[found][kept])
         sizes.append(depths[i][found][kept] / view.intrinsics[0, 0])
         origins.append(view.pose[:, 3].expand(int(kept.sum()), 3))
-    return Points(*(torch.cat(parts) for parts in (positions, colours, sizes, origins)))
+    share = sum(len(x) for x in positions) / max(sum(view.trust.numel() for view in views), 1)
+    return Points(torch.cat(positions), torch.cat(colours), torch.cat(sizes), torch.cat(origins), share)
 
 
 def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
@@ -194,4 +200,4 @@ def thinned(points: Points, spacing: float = 1.0) -> Points:
         total = values.new_zeros(len(count), *values.shape[1:]).index_add_(0, place, values)
         return total / count.view(-1, *[1] * (values.ndim - 1))
 
-    return Points(mean(points.positions), mean(points.colours), mean(points.sizes), mean(points.origins))
+    return Points(mean(points.positions), mean(points.colours), mean(points.sizes), mean(points.origins), points.share)

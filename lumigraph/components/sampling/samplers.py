@@ -186,7 +186,8 @@ def some(points: Points, generator: torch.Generator) -> Points:
     if len(points.positions) <= MAX_POINTS:
         return points
     chosen = torch.randperm(len(points.positions), generator=generator)[:MAX_POINTS]
-    return Points(*(x[chosen] for x in (points.positions, points.colours, points.sizes, points.origins)))
+    rows = {name: getattr(points, name)[chosen] for name in ("positions", "colours", "sizes", "origins")}
+    return Points(**rows, share=points.share)
 
 
 # Numbers of a Config for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.

@@ -26,7 +26,8 @@ from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted, splat, view_of
 from .addition import Addition, Step
 
-MAX_SPARSE_VIEWS = 40  # training photographs up to which an open capture is sparse
+MAX_SPARSE_VIEWS = 40  # training photographs up to which an open capture may be sparse
+MAX_SURFACE_SHARE = 0.2  # share of pixels whose surface plane sweeps find, from which on a capture is not sparse
 MAX_PLAIN_VIEWS = 6  # training photographs up to which colours do not depend on the direction, which would explain
 # wrong depth away
 MAX_DROP_RATE = 0.3  # share of Gaussians at the end of training, to which it grows evenly (Park 2025, section 3.2)
@@ -43,7 +44,9 @@ OCCLUSION = 1.03  # times the least depth of the pixels around, beyond which a p
 class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
-    few_views: Literal["auto", "yes", "no"] = "no"  # regularisation for few photographs; auto: up to 40 of a place
+    few_views: Literal["auto", "yes", "no"] = (
+        "no"  # regularisation for few photographs; auto: if plane sweeps agree little
+    )
     depth_weight: NonNegative = 1.0  # weight of depth's roughness at unobserved views, with few_views; 0: off
     surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
 
@@ -79,7 +82,8 @@ class FewViews(Addition):
         """Decide whether the capture is sparse, and keep what plane sweeps have found."""
         count = len(data.splits["train"])
         if self.numbers.few_views == "auto":
-            self.active.fill_(data.frame.is_open and not data.frame.has_alpha and count <= MAX_SPARSE_VIEWS)
+            few = data.frame.is_open and not data.frame.has_alpha and count <= MAX_SPARSE_VIEWS
+            self.active.fill_(few and sweep().share < MAX_SURFACE_SHARE)
         if self.active:
             self.plain.fill_(count <= MAX_PLAIN_VIEWS)
             found = sweep()
