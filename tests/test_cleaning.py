@@ -19,7 +19,7 @@ from lumigraph.camera.crop import Crop, CropBox, Sphere
 from lumigraph.camera.rays import Rays
 from lumigraph.commands import cli
 from lumigraph.composition import PickedCloud, cropped
-from lumigraph.composition.floaters import evidence
+from lumigraph.composition.floaters import STRENGTH, evidence
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import cleaned, extent, joined, unwanted
@@ -79,8 +79,8 @@ def test_a_cropped_method_shows_what_lies_inside(method):
     assert seen[y < -0.1].max() < 0.05 < 0.9 < whole[y < -0.1].max()
 
 
-def soiled() -> tuple[Gaussians, dict[str, slice]]:
-    """A shell of 1500 Gaussians, and after them ten of each kind that nobody wants."""
+def soiled() -> Gaussians:
+    """A shell of 1500 Gaussians, and after them ten faint ones, ten large ones and ten isolated ones."""
     shell, chance = Splatted(RED).cloud, torch.Generator().manual_seed(1)
     away = torch.nn.functional.normalize(torch.randn(30, 3, generator=chance), dim=-1)
     bad = replace(
@@ -91,29 +91,25 @@ def soiled() -> tuple[Gaussians, dict[str, slice]]:
     )
     tensors = ("means", "quaternions", "log_scales", "opacities", "harmonics")
     both = {name: torch.cat([getattr(shell, name), getattr(bad, name)]) for name in tensors}
-    kinds = {"too faint": slice(1500, 1510), "too large": slice(1510, 1520), "isolated": slice(1520, 1530)}
-    return Gaussians(**both), kinds
+    return Gaussians(**both)
 
 
 @pytest.mark.parametrize("unit", [1.0, 700.0])
-def test_floaters_go_each_for_its_reason_in_any_unit(unit):
-    cloud, kinds = soiled()
-    cloud = cloud.transformed(Similarity.make(unit).matrix)
+def test_gaussians_go_each_for_its_first_reason_in_any_unit(unit):
+    cloud = soiled().transformed(Similarity.make(unit).matrix)
     assert extent(cloud) == pytest.approx(unit, rel=0.15)  # of a ball of radius 0.5
-    reasons = unwanted(cloud, min_opacity=0.02, max_scale=1.0, isolation=4.0)
-    for reason, some in kinds.items():
-        expected = torch.zeros(len(cloud), dtype=torch.bool)
-        expected[some] = True
-        assert torch.equal(reasons[reason], expected), reason
-    assert not reasons["outside the crop"].any()
-    assert torch.equal(cleaned(cloud, None, 0.02, 1.0, 4.0).means, cloud.means[:1500])
-    assert len(cleaned(cloud)) == len(cloud)
-
-
-def test_one_that_goes_for_two_reasons_counts_once():
-    cloud, _ = soiled()
-    reasons = unwanted(cloud, Sphere((0.0, 0.0, 0.0), 1.0), 0.02, 1.0, 4.0)
-    assert [int(which.sum()) for which in reasons.values()] == [10, 10, 10, 0]
+    floating = evidence(cloud, None, WHITE).floaters(STRENGTH)
+    assert floating[1520:].all() and not floating[:1500].any()
+    reasons = unwanted(cloud, Sphere((0.0, 0.0, 0.0), unit), 1.0, floating | (cloud.means.norm(dim=-1) > 0.9 * unit))
+    assert (
+        [some.nonzero()[:, 0].tolist() for some in reasons.values()]
+        == [
+            list(range(1520, 1530)),  # outside the crop, whatever else
+            list(range(1510, 1520)),
+            floating[:1510].nonzero()[:, 0].tolist(),
+        ]
+    )
+    assert len(cleaned(cloud)) == len(cloud) and len(cleaned(cloud, None, 1.0)) == len(cloud) - 10
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +207,7 @@ def test_picked_gaussians_look_as_they_did():
 
 
 def test_the_score_orders_blobs_above_the_surface_and_the_strength_is_monotone():
-    shell, _ = soiled()
+    shell = soiled()
     around = torch.tensor([[3.0, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0], [0.1, 0.1, 3], [2, 2, 1], [-2, 2, 1]])
     cameras = Camera.cat([eye(tuple(place.tolist())) for place in around])
     blobs = replace(shell[:14], means=around.repeat(2, 1) * torch.tensor([0.3] * 7 + [0.7] * 7)[:, None])
