@@ -18,14 +18,17 @@ from lumigraph.camera import Camera
 from lumigraph.camera.crop import Crop, CropBox, Sphere
 from lumigraph.camera.rays import Rays
 from lumigraph.commands import cli
+from lumigraph.commands.export_menu import export_menu
 from lumigraph.composition import PickedCloud, cropped
 from lumigraph.composition.floaters import STRENGTH, evidence
+from lumigraph.evaluation.photographs import of_floaters
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import cleaned, extent, joined, unwanted
 from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.run import Run, open_any
 from lumigraph.training import fit
+from lumigraph.viewer.cameras import ViewRequest
 
 CROPS: dict[str, Crop] = {
     "box": CropBox((-0.3, -0.5, -0.2), (0.4, 0.1, 0.6)),
@@ -171,6 +174,35 @@ def test_exports_of_a_part_hold_as_many_as_another_reader_counts(cloud_run, tmp_
     assert 0 < len(positions) < expected and np.linalg.norm(positions, axis=-1).max() <= 0.8
     assert len(read_gaussians(tmp_path / "c.ply")) == len(positions)
     assert f"{len(positions):,} of {expected:,} stay" in capsys.readouterr().out
+
+
+def test_an_export_removes_the_floaters_of_the_viewer(tmp_path):
+    cloud = soiled()
+    source, output = tmp_path / "soiled.ply", tmp_path / "clean.ply"
+    write_gaussians(source, cloud)
+    menu = export_menu(opened := open_any(source), opened.method(), (), "auto")
+    defaults = {option.name: option.default for option in menu.formats["splats"].options}
+    plain = ViewRequest(((1.0,),), 1.0, (9, 9), 9, "colour", (1.0, 1.0, 1.0), strength=STRENGTH)
+    assert menu.command("splats", str(output), defaults, plain)[5:] == []  # coloured, and not removed
+    command = menu.command("splats", str(output), defaults, replace(plain, cleaned=True))
+    assert command[5:] == ["--strength=0.4"] and cli.main(command[1:]) == 0
+    left = ~evidence(cloud, None, WHITE).floaters(STRENGTH)
+    assert len(read_gaussians(output)) == int(left.sum()) < len(cloud)
+    inside = menu.command("splats", str(output), defaults, replace(plain, crop=Sphere((0.0, 0.0, 0.0), 20.0)))
+    assert inside[-1] == "--max-scale=0.25" and cli.main([*inside[1:], "--overwrite"]) == 0
+    assert len(read_gaussians(output)) == len(cloud) - 10
+
+
+def test_floaters_of_a_run_are_a_finding(cloud_run):
+    scene, method = tiny.scene(), cloud_run.method()
+    around = scene.cameras.position
+    method.cloud.replace(joined([method.gaussians(), replace(soiled()[:12], means=0.7 * around[:12])]))
+    [finding] = of_floaters(cloud_run, method, scene)
+    gaussians, cameras = method.gaussians(), scene.cameras[scene.splits["train"]]
+    count = int(evidence(gaussians, cameras, scene.frame).floaters(STRENGTH).sum())
+    assert count >= 10 and finding.photograph == "" and finding.fault == "floaters"
+    assert f"{count} of {len(gaussians)} Gaussians" in finding.evidence and "lumigraph clean" in finding.advice
+    assert of_floaters(cloud_run, tiny.method(scene.frame), scene) == []
 
 
 REFUSED = {

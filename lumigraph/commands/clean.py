@@ -38,7 +38,7 @@ class Clean:
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..composition.floaters import STRENGTH, evidence
+        from ..composition.floaters import STRENGTH, floaters
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cloud import gone, unwanted
@@ -55,8 +55,8 @@ class Clean:
         method = opened.method(device)
         gaussians = needs(method, HasGaussians).gaussians()
         strength = STRENGTH if self.strength is None else self.strength
-        found = evidence(gaussians, photographers(opened, method), opened.frame) if strength else None
-        reasons = unwanted(gaussians, self.part.crop(opened.frame), floating=found and found.floaters(strength))
+        floating = floaters(gaussians, photographers(opened, method), opened.frame, strength)
+        reasons = unwanted(gaussians, self.part.crop(opened.frame), floating=floating)
         which = gone(reasons)
         if len(gaussians) and which.all():
             raise LumigraphError(

@@ -182,12 +182,11 @@ class Keeping(Cropping):
 
         cameras: of the photographs, in the cloud's frame; None without photographs
         """
-        from ..composition.floaters import STRENGTH, evidence
+        from ..composition.floaters import STRENGTH, floaters
         from ..gaussians.cloud import gone, unwanted
 
         strength = (STRENGTH if self.clean else 0.0) if self.strength is None else self.strength
-        found = evidence(gaussians, cameras, frame) if strength else None
-        lost = gone(unwanted(gaussians, crop, self.max_scale, found and found.floaters(strength)))
+        lost = gone(unwanted(gaussians, crop, self.max_scale, floaters(gaussians, cameras, frame, strength)))
         if len(gaussians) and lost.all():
             raise LumigraphError(
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "

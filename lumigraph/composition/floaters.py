@@ -63,6 +63,13 @@ class FloaterEvidence:
         return self.score > 1 - strength
 
 
+def floaters(
+    gaussians: Gaussians, cameras: Camera | None, frame: Frame, strength: float
+) -> Bool[Tensor, " gaussian"] | None:
+    """Gaussians to remove at a strength, by `evidence`; None at strength 0."""
+    return evidence(gaussians, cameras, frame).floaters(strength) if strength else None
+
+
 @torch.no_grad()
 def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> FloaterEvidence:
     """FloaterEvidence on each Gaussian of a cloud.
