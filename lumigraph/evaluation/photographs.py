@@ -37,7 +37,7 @@ MIN_SIDE, MAX_SIDE = 48, 256  # pixels of the longer side of a rendering
 NEIGHBOURS = 12  # nearest cameras that free space is asked of
 SURFACE_SAMPLES = 500  # points of each rendered surface
 SHEET_SIDE = 400.0  # pixels of the longer side in the report
-SURE_STRENGTH = 0.2  # of cleaning, at which floaters are almost certain
+SURE_STRENGTH = 0.2  # of cleaning, at which floaters are probable
 MIN_FLOATERS = 1e-3  # share of the Gaussians, from which on floaters are a finding
 SHOWN = 5  # worst photographs in the report
 RESULT_FILE, SHEET_FILE = "photographs.json", "photographs.png"
@@ -94,8 +94,8 @@ def of_floaters(run: Run, method: Method, scene: Scene) -> list[Finding]:
     if count < max(1, MIN_FLOATERS * len(gaussians)):
         return []
     text = (
-        f"{count:,} of {len(gaussians):,} Gaussians are likely floaters, with a score above {1 - STRENGTH:g}; "
-        f"{sure:,} of them are almost certain, above {1 - SURE_STRENGTH:g}"
+        f"{count:,} of {len(gaussians):,} Gaussians may be floaters, with a score above {1 - STRENGTH:g}; "
+        f"{sure:,} of them probably are, above {1 - SURE_STRENGTH:g}"
     )
     return [Finding("", "floaters", text, f"to remove them: lumigraph clean {quote(str(run.folder))} --output NEW")]
 
