@@ -18,14 +18,17 @@ from lumigraph.camera import Camera
 from lumigraph.camera.crop import Crop, CropBox, Sphere
 from lumigraph.camera.rays import Rays
 from lumigraph.commands import cli
+from lumigraph.commands.export_menu import export_menu
 from lumigraph.composition import PickedCloud, cropped
-from lumigraph.composition.floaters import evidence
+from lumigraph.composition.floaters import STRENGTH, evidence
+from lumigraph.evaluation.photographs import of_floaters
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import cleaned, extent, joined, unwanted
 from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.run import Run, open_any
 from lumigraph.training import fit
+from lumigraph.viewer.cameras import ViewRequest
 
 CROPS: dict[str, Crop] = {
     "box": CropBox((-0.3, -0.5, -0.2), (0.4, 0.1, 0.6)),
@@ -79,8 +82,8 @@ def test_a_cropped_method_shows_what_lies_inside(method):
     assert seen[y < -0.1].max() < 0.05 < 0.9 < whole[y < -0.1].max()
 
 
-def soiled() -> tuple[Gaussians, dict[str, slice]]:
-    """A shell of 1500 Gaussians, and after them ten of each kind that nobody wants."""
+def soiled() -> Gaussians:
+    """A shell of 1500 Gaussians, and after them ten faint ones, ten large ones and ten isolated ones."""
     shell, chance = Splatted(RED).cloud, torch.Generator().manual_seed(1)
     away = torch.nn.functional.normalize(torch.randn(30, 3, generator=chance), dim=-1)
     bad = replace(
@@ -91,29 +94,25 @@ def soiled() -> tuple[Gaussians, dict[str, slice]]:
     )
     tensors = ("means", "quaternions", "log_scales", "opacities", "harmonics")
     both = {name: torch.cat([getattr(shell, name), getattr(bad, name)]) for name in tensors}
-    kinds = {"too faint": slice(1500, 1510), "too large": slice(1510, 1520), "isolated": slice(1520, 1530)}
-    return Gaussians(**both), kinds
+    return Gaussians(**both)
 
 
 @pytest.mark.parametrize("unit", [1.0, 700.0])
-def test_floaters_go_each_for_its_reason_in_any_unit(unit):
-    cloud, kinds = soiled()
-    cloud = cloud.transformed(Similarity.make(unit).matrix)
+def test_gaussians_go_each_for_its_first_reason_in_any_unit(unit):
+    cloud = soiled().transformed(Similarity.make(unit).matrix)
     assert extent(cloud) == pytest.approx(unit, rel=0.15)  # of a ball of radius 0.5
-    reasons = unwanted(cloud, min_opacity=0.02, max_scale=1.0, isolation=4.0)
-    for reason, some in kinds.items():
-        expected = torch.zeros(len(cloud), dtype=torch.bool)
-        expected[some] = True
-        assert torch.equal(reasons[reason], expected), reason
-    assert not reasons["outside the crop"].any()
-    assert torch.equal(cleaned(cloud, None, 0.02, 1.0, 4.0).means, cloud.means[:1500])
-    assert len(cleaned(cloud)) == len(cloud)
-
-
-def test_one_that_goes_for_two_reasons_counts_once():
-    cloud, _ = soiled()
-    reasons = unwanted(cloud, Sphere((0.0, 0.0, 0.0), 1.0), 0.02, 1.0, 4.0)
-    assert [int(which.sum()) for which in reasons.values()] == [10, 10, 10, 0]
+    floating = evidence(cloud, None, WHITE).floaters(STRENGTH)
+    assert floating[1520:].all() and not floating[:1500].any()
+    reasons = unwanted(cloud, Sphere((0.0, 0.0, 0.0), unit), 1.0, floating | (cloud.means.norm(dim=-1) > 0.9 * unit))
+    assert (
+        [some.nonzero()[:, 0].tolist() for some in reasons.values()]
+        == [
+            list(range(1520, 1530)),  # outside the crop, whatever else
+            list(range(1510, 1520)),
+            floating[:1510].nonzero()[:, 0].tolist(),
+        ]
+    )
+    assert len(cleaned(cloud)) == len(cloud) and len(cleaned(cloud, None, 1.0)) == len(cloud) - 10
 
 
 @pytest.fixture(scope="module")
@@ -177,6 +176,35 @@ def test_exports_of_a_part_hold_as_many_as_another_reader_counts(cloud_run, tmp_
     assert f"{len(positions):,} of {expected:,} stay" in capsys.readouterr().out
 
 
+def test_an_export_removes_the_floaters_of_the_viewer(tmp_path):
+    cloud = soiled()
+    source, output = tmp_path / "soiled.ply", tmp_path / "clean.ply"
+    write_gaussians(source, cloud)
+    menu = export_menu(opened := open_any(source), opened.method(), (), "auto")
+    defaults = {option.name: option.default for option in menu.formats["splats"].options}
+    plain = ViewRequest(((1.0,),), 1.0, (9, 9), 9, "colour", (1.0, 1.0, 1.0), strength=STRENGTH)
+    assert menu.command("splats", str(output), defaults, plain)[5:] == []  # coloured, and not removed
+    command = menu.command("splats", str(output), defaults, replace(plain, cleaned=True))
+    assert command[5:] == ["--strength=0.4"] and cli.main(command[1:]) == 0
+    left = ~evidence(cloud, None, WHITE).floaters(STRENGTH)
+    assert len(read_gaussians(output)) == int(left.sum()) < len(cloud)
+    inside = menu.command("splats", str(output), defaults, replace(plain, crop=Sphere((0.0, 0.0, 0.0), 20.0)))
+    assert inside[-1] == "--max-scale=0.25" and cli.main([*inside[1:], "--overwrite"]) == 0
+    assert len(read_gaussians(output)) == len(cloud) - 10
+
+
+def test_floaters_of_a_run_are_a_finding(cloud_run):
+    scene, method = tiny.scene(), cloud_run.method()
+    around = scene.cameras.position
+    method.cloud.replace(joined([method.gaussians(), replace(soiled()[:12], means=0.7 * around[:12])]))
+    [finding] = of_floaters(cloud_run, method, scene)
+    gaussians, cameras = method.gaussians(), scene.cameras[scene.splits["train"]]
+    count = int(evidence(gaussians, cameras, scene.frame).floaters(STRENGTH).sum())
+    assert count >= 10 and finding.photograph == "" and finding.fault == "floaters"
+    assert f"{count} of {len(gaussians)} Gaussians" in finding.evidence and "lumigraph clean" in finding.advice
+    assert of_floaters(cloud_run, tiny.method(scene.frame), scene) == []
+
+
 REFUSED = {
     "no Gaussians": (["RAYS", "--output", "OUT"], "holds no Gaussians"),
     "a file to a run": (["FILE", "--output", "OUT"], "is no run"),
@@ -211,7 +239,7 @@ def test_picked_gaussians_look_as_they_did():
 
 
 def test_the_score_orders_blobs_above_the_surface_and_the_strength_is_monotone():
-    shell, _ = soiled()
+    shell = soiled()
     around = torch.tensor([[3.0, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0], [0.1, 0.1, 3], [2, 2, 1], [-2, 2, 1]])
     cameras = Camera.cat([eye(tuple(place.tolist())) for place in around])
     blobs = replace(shell[:14], means=around.repeat(2, 1) * torch.tensor([0.3] * 7 + [0.7] * 7)[:, None])

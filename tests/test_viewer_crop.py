@@ -14,12 +14,14 @@ from viewer_client import Client
 
 import lumigraph.methods
 from lumigraph.camera.crop import CropBox, Sphere
+from lumigraph.composition.floaters import CANDIDATE_COLOUR, evidence
 from lumigraph.errors import LumigraphError
-from lumigraph.gaussians.cloud import ISOLATION, MAX_SCALE, cleaned
+from lumigraph.gaussians.cloud import cleaned, gone
 from lumigraph.paths import Surroundings
 from lumigraph.paths.opening import subject_of
 from lumigraph.viewer import Viewer, choose_address
-from lumigraph.viewer.crop_panel import ALL, BOX, CROPPED_MAX_SCALE, SPHERE, circles, edges
+from lumigraph.viewer.crop_panel import ALL, BOX, SPHERE, circles, edges
+from lumigraph.viewer.shared import CROPPED_MAX_SCALE
 
 # A client may leave at any moment; viser warns of what was still on its way.
 pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
@@ -27,21 +29,22 @@ pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* 
 
 @pytest.fixture
 def cloud_viewer(tmp_path):
-    """Of 200 Gaussians, some faint, one alone; what it is told to save it notes."""
+    """Of 200 Gaussians, one alone before a camera; what it is told to save it notes."""
     cloud = some_cloud(200, degree=0)
-    cloud.means[0] = 40.0
+    cloud.means[0] = 0.6 * tiny.scene().cameras.position[0]
+    cloud.log_scales[0] = -4.0
     kind = lumigraph.methods.find("gaussian-splatting")
     method = kind(tiny.scene().frame, kind.Config(sh_degree=0))
     method.cloud.replace(cloud)
     saved = []
 
-    def keep(name, crop, floaters) -> str:
+    def keep(name, reasons) -> str:
         if name == "taken":
             raise LumigraphError("taken is there already")
-        saved.append((name, crop, dict(floaters)))
+        saved.append((name, gone(reasons)))
         return f"runs/{name}"
 
-    about = subject(tiny.scene(), tmp_path, keep=keep)
+    about = subject(tiny.scene(), tmp_path, keep=keep, open_scene=tiny.scene)
     with Viewer(method.eval(), about, choose_address(port=0)) as viewer:
         client = Client(viewer.address.url)
         until(lambda: viewer._everyone() and viewer._everyone()[0]._splats is not None)
@@ -52,37 +55,37 @@ def cloud_viewer(tmp_path):
 def test_a_cloud_is_cropped_cleaned_and_saved(cloud_viewer):
     visitor, client, cloud, saved = cloud_viewer
     panel = visitor.crop
-    assert visitor.request().crop is None and visitor.request().floaters == ()
+    assert visitor.request().crop is None and not visitor.request().part
 
     client.turn(panel._radius, 0.5)
     client.turn(panel._shape, SPHERE)
     until(lambda: visitor.request().crop == Sphere((0.0, 0.0, 0.0), 0.5))
-    assert visitor.request().floaters == (("max_scale", CROPPED_MAX_SCALE),)  # what sticks out of a crop is gone
-    inside = cleaned(cloud, visitor.request().crop, max_scale=CROPPED_MAX_SCALE)
+    inside = cleaned(cloud, visitor.request().crop, CROPPED_MAX_SCALE)  # Gaussians that stick out of a crop are gone
     assert 10 < len(inside) < 190
     until(lambda: len(visitor._splats.buffer) == len(inside))
 
-    client.turn(panel._floaters["min_opacity"], 0.5)
-    client.turn(panel._clean, True)
-    floaters = {"min_opacity": 0.5, "max_scale": CROPPED_MAX_SCALE, "isolation": ISOLATION}
-    until(lambda: dict(visitor.request().floaters) == floaters)
-    solid = cleaned(cloud, visitor.request().crop, **floaters)
-    assert 0 < len(solid) < len(inside)
-    until(lambda: len(visitor._splats.buffer) == len(solid))
-
-    camera = visitor.request().camera((60, 45))
-    drawn = visitor._shared.render(camera, visitor.request()).opacity  # as `Draw exactly` does
-    assert 0.05 < drawn.mean() < visitor._shared.render(camera, replace(visitor.request(), floaters=())).opacity.mean()
+    client.turn(panel._shape, ALL)
+    until(lambda: len(visitor._splats.buffer) == len(cloud))
+    plain = visitor._splats.rgbs.copy()
+    client.turn(panel._strength, 0.7)
+    found = evidence(cloud, visitor._shared.subject.cameras["train"], tiny.scene().frame).floaters(0.7)
+    assert found[0] and found.sum() < 20
+    until(lambda: np.array_equal((visitor._splats.rgbs != plain).any(-1), found.numpy()))  # coloured, and still there
+    assert np.allclose(visitor._splats.rgbs[0] / 255, CANDIDATE_COLOUR, atol=0.01)
+    assert not gone(visitor._shared.unwanted(visitor.request())).any()
+    client.turn(panel._remove, True)
+    until(lambda: len(visitor._splats.buffer) == int((~found).sum()))
+    assert visitor._shared.cloud(visitor.request()).means.shape == cloud[~found].means.shape
 
     panel._name.value = "part"
     panel._save()
-    assert saved == [("part", Sphere((0.0, 0.0, 0.0), 0.5), floaters)]
+    assert [(name, lost.tolist()) for name, lost in saved] == [("part", found.tolist())]
     assert "runs/part" in panel._about.content
     panel._name.value = "taken"
     panel._save()  # says so, and goes on
     assert len(saved) == 1
-    client.turn(panel._shape, ALL)
-    until(lambda: dict(visitor.request().floaters) == floaters | {"max_scale": MAX_SCALE})
+    client.turn(panel._remove, True)
+    until(lambda: len(visitor._splats.buffer) == len(cloud))
 
 
 def test_a_box_is_dragged_by_its_corners(cloud_viewer):
@@ -96,8 +99,8 @@ def test_a_box_is_dragged_by_its_corners(cloud_viewer):
     until(lambda: visitor.request().crop == CropBox(lower, (0.25, 0.0, 0.5)))
     assert panel._upper.value == (0.25, 0.0, 0.5)
     assert np.allclose(panel._nodes["outline"].points.reshape(-1, 3).max(0), (0.25, 0.0, 0.5))
-    shown = dict(visitor.request().floaters)
-    until(lambda: len(visitor._splats.buffer) == len(cleaned(cloud, visitor.request().crop, **shown)))
+    inside = cleaned(cloud, visitor.request().crop, CROPPED_MAX_SCALE)
+    until(lambda: len(visitor._splats.buffer) == len(inside))
     client.turn(panel._upper, (0.3, 0.3, 0.3))  # by its number: the handle follows
     until(lambda: np.allclose(panel._nodes["upper"].position, 0.3))
     client.turn(panel._shape, SPHERE)
@@ -143,7 +146,7 @@ def test_other_methods_crop_and_save_nothing(tmp_path):
         client = Client(viewer.address.url)
         client.picture(width=120)
         (visitor,) = viewer._everyone()
-        assert not visitor.crop._clean.visible and not hasattr(visitor.crop, "_name")
+        assert not visitor.crop._strength.visible and not hasattr(visitor.crop, "_name")
         client.turn(visitor.crop._shape, SPHERE)
         until(lambda: isinstance(visitor.request().crop, Sphere))
         client.close()

@@ -12,9 +12,8 @@ from ..errors import LumigraphError
 from ..files import claim
 from ..files.ranges import Share
 from .common import choose_device, show
-from .options import Cropping, Overwrite, needed, option
+from .options import Cropping, Overwrite, needed, option, photographers
 
-CANDIDATE_COLOUR = (1.0, 0.1, 0.8)  # of Gaussians that are removed
 SIZE = 400  # pixels of the longer side of the pictures that compare
 
 
@@ -32,14 +31,14 @@ class Clean:
     output: Annotated[Path, needed("NEW")]
     """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
     overwrite: Overwrite = False
-    strength: Annotated[Share, option("SHARE")] = 0.4
+    strength: Annotated[Share | None, option("SHARE", "0.4")] = None
     """Remove Gaussians with a floater score above 1 - strength; a larger value removes more, 0 none."""
     part: OmitArgPrefixes[Cropping] = Cropping()
     device: Annotated[str, option("NAME")] = "auto"
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..composition.floaters import evidence
+        from ..composition.floaters import STRENGTH, floaters
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cloud import gone, unwanted
@@ -53,14 +52,12 @@ class Clean:
         beside = place.with_name(f"{place.name}.png")
         picture = beside if names_splats(self.output) else self.output / "clean.png"
         claim(picture, "comparison", self.overwrite, [self.source])
-        gaussians = needs(opened.method(device), HasGaussians).gaussians()
-        reasons = unwanted(gaussians, self.part.crop(opened.frame))
+        method = opened.method(device)
+        gaussians = needs(method, HasGaussians).gaussians()
+        strength = STRENGTH if self.strength is None else self.strength
+        floating = floaters(gaussians, photographers(opened, method), opened.frame, strength)
+        reasons = unwanted(gaussians, self.part.crop(opened.frame), floating=floating)
         which = gone(reasons)
-        if self.strength:
-            cameras = opened.cameras()["train"] if opened.photographed else None
-            floating = evidence(gaussians, cameras, opened.frame).floaters(self.strength)
-            reasons |= {"floaters": floating & ~which}
-            which = which | floating
         if len(gaussians) and which.all():
             raise LumigraphError(
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
@@ -82,6 +79,7 @@ def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
     floaters show."""
     from ..camera import ring
     from ..composition import PickedCloud
+    from ..composition.floaters import CANDIDATE_COLOUR
     from ..figures import Row, contact_sheet
     from ..gaussians.cloud import painted
     from ..geometry import evenly

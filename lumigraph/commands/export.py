@@ -14,7 +14,18 @@ from ..files import claim
 from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Share, SphereSize, between
 from .common import show
 from .export_web import ExportWeb
-from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, controlled, needed, open_method, option
+from .options import (
+    DeviceOption,
+    Keeping,
+    Overwrite,
+    Set,
+    SourceOption,
+    controlled,
+    needed,
+    open_method,
+    option,
+    photographers,
+)
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
 
@@ -71,7 +82,7 @@ class ExportMesh:
         claim(self.output, "mesh", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
         mesh = extract_mesh(
-            self.part.without_floaters(method),
+            self.part.without_floaters(method, opened),
             opened.survey(cameras["train"]),
             extent=self.extent,
             crop=self.part.crop(opened.frame),
@@ -163,15 +174,16 @@ class ExportSplats:
             if self.settings:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
             written = read_gaussians(self.source)
-            if self.part.crops or self.part.floaters:
+            if self.part.crops or self.part.removes:
                 frame = frame_of(written)
                 crop = self.part.crop(frame)
-                written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source))
+                written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source), frame, None)
         else:
             opened = open_any(self.source)
             method = controlled(opened, opened.method(), self.settings)
             gaussians = needs(method, HasGaussians).gaussians()
-            gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
+            crop = self.part.crop(method.frame)
+            gaussians = self.part.of_gaussians(gaussians, crop, method.frame, photographers(opened, method))
             written = gaussians.transformed(method.frame.to_source.matrix)
         write_gaussians(output, written, detail)
         size = size_of(output)
@@ -251,7 +263,7 @@ class ExportPoints:
 
         opened, method, cameras = open_method(self.source, self.device, self.settings)
         seers = opened.survey(cameras["train"])
-        method, crop = self.part.without_floaters(method), self.part.crop(opened.frame)
+        method, crop = self.part.without_floaters(method, opened), self.part.crop(opened.frame)
         points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
         write_points(self.output, points)
         rows = {
@@ -293,7 +305,7 @@ class SphereExport:
         sphere_size(self.size)
         claim(self.output, "panorama", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
-        return opened, self.part.of_method(method), *standpoint(cameras["train"], opened.frame, self.place)
+        return opened, self.part.of_method(method, opened), *standpoint(cameras["train"], opened.frame, self.place)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) 
     """
     from ..camera.crop import CropBox
     from ..method.capabilities import HasAtlas, HasGaussians, HasOctree, can
-    from ..viewer.shared import Exporter, ExportFormat
+    from ..viewer.shared import CROPPED_MAX_SCALE, Exporter, ExportFormat
 
     needs: dict[str, Any] = {"splats": HasGaussians, "octree": HasOctree, "snerg": HasAtlas}
     kinds = {marks.name: kind for kind, marks in map(get_args, get_args(What))}
@@ -48,7 +48,10 @@ def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) 
                 words += ["--box", *(f"{x:.6f}" for x in (*crop.lower, *crop.upper))]
             elif crop is not None:
                 words += ["--sphere", *(f"{x:.6f}" for x in (*crop.middle, crop.radius))]
-            words += [f"--{key.replace('_', '-')}={value:g}" for key, value in request.floaters]
+            if crop is not None and can(method, HasGaussians):
+                words.append(f"--max-scale={CROPPED_MAX_SCALE:g}")
+            if request.cleaned:
+                words.append(f"--strength={request.strength:g}")
         if "settings" in hints(kinds[name]):
             chosen = [*settings, *(f"{key}={value}" for key, value in request.settings)]
             words += [word for text in chosen for word in ("--set", text)]

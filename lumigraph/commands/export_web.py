@@ -15,7 +15,7 @@ from ..errors import LumigraphError
 from ..files import claim
 from ..files.ranges import Seconds, between
 from .common import choose_device, show
-from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, needed, open_method, option
+from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, needed, open_method, option, photographers
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "volume", "mesh", "views"]
@@ -76,19 +76,21 @@ class ExportWeb:
         behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
-        held = self._write(kind, method, cameras["train"], opening)
+        held = self._write(kind, method, opened, cameras["train"], opening)
         size = f"{self.output.stat().st_size / 1e6:.1f} MB"
         show(rows | {"page": str(self.output), "holds": held, "size": size})
         return 0
 
-    def _write(self, kind: str, method: Any, cameras: Any, opening: Any) -> str:
+    def _write(self, kind: str, method: Any, opened: Any, cameras: Any, opening: Any) -> str:
         """Write the page. Returns its contents in words."""
         from ..export.mesh import extract_mesh
         from ..export.page import mesh_page, splats_page, views_page, volume_page
         from ..method.capabilities import HasGaussians, needs
 
         if kind == "splats":
-            gaussians = self.part.of_gaussians(needs(method, HasGaussians).gaussians(), self.part.crop(method.frame))
+            seers, crop = photographers(opened, method), self.part.crop(method.frame)
+            gaussians = needs(method, HasGaussians).gaussians()
+            gaussians = self.part.of_gaussians(gaussians, crop, method.frame, seers)
             splats_page(self.output, gaussians, opening)
             return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}"
         if kind == "volume":
@@ -96,9 +98,10 @@ class ExportWeb:
             volume_page(self.output, volume, opening)
             return held
         if kind == "views":
-            views_page(self.output, self.part.of_method(method), cameras, opening, self.views, self.size)
+            views_page(self.output, self.part.of_method(method, opened), cameras, opening, self.views, self.size)
             return f"{self.views} views"
-        mesh = extract_mesh(self.part.without_floaters(method), cameras, crop=self.part.crop(method.frame), faces=FACES)
+        whole, crop = self.part.without_floaters(method, opened), self.part.crop(method.frame)
+        mesh = extract_mesh(whole, cameras, crop=crop, faces=FACES)
         mesh_page(self.output, mesh, opening)
         return f"{len(mesh.faces):,} triangles"
 

@@ -3,7 +3,7 @@ floaters (--box, --sphere, --clean)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -63,6 +63,11 @@ def open_method(source: Any, device: str, settings: Iterable[str] = ()) -> tuple
     opened = open_any(source)
     method = controlled(opened, opened.method(choose_device(device)), settings)
     return opened, method, {split: method.refined(cameras) for split, cameras in opened.cameras().items()}
+
+
+def photographers(opened: Any, method: Any) -> Any:
+    """Cameras of the training photographs, as the method has refined them; None without photographs."""
+    return method.refined(opened.cameras()["train"]) if opened.photographed else None
 
 
 def controlled(opened: Any, method: Any, settings: Iterable[str]) -> Any:
@@ -161,51 +166,49 @@ class Keeping(Cropping):
     """Crop the scene, and remove floaters from Gaussians."""
 
     clean: bool = False
-    """Remove floaters from Gaussians: faint, huge or isolated ones, with limits that suit most scenes."""
-    min_opacity: Annotated[Share | None, option("SHARE", "0, with --clean 0.02")] = None
-    """Remove Gaussians with a lower opacity; a larger value removes more."""
-    max_scale: Annotated[Positive | None, option("SHARE", "any, with --clean 1")] = None
+    """Remove floaters from Gaussians, as `lumigraph clean` does."""
+    strength: Annotated[Share | None, option("SHARE", "0, with --clean 0.4")] = None
+    """Remove Gaussians with a floater score above 1 - strength; a larger value removes more."""
+    max_scale: Annotated[Positive | None, option("SHARE", "any")] = None
     """Remove Gaussians with a larger standard deviation, in extents of the cloud; a smaller value removes more."""
-    isolation: Annotated[Positive | None, option("DEVIATIONS", "any, with --clean 3")] = None
-    """Remove Gaussians farther from neighbours than most, in standard deviations; a smaller value removes more."""
 
     @property
-    def floaters(self) -> Mapping[str, float]:
-        """Arguments of `cleaned` for floaters: the given numbers, with --clean the defaults of the rest."""
-        from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
+    def removes(self) -> bool:
+        """True if Gaussians go for another reason than a crop."""
+        return self.clean or bool(self.strength) or self.max_scale is not None
 
-        usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
-        given = {name: value for name in usual if (value := getattr(self, name)) is not None}
-        return usual | given if self.clean else given
+    def of_gaussians(self, gaussians: Any, crop: Any, frame: Any, cameras: Any) -> Any:
+        """Gaussians to keep. Raises LumigraphError if that is none.
 
-    def unwanted(self, gaussians: Any, crop: Any) -> Any:
-        """Masks of the Gaussians to remove, by reason. Raises LumigraphError if that is all of them."""
+        cameras: of the photographs, in the cloud's frame; None without photographs
+        """
+        from ..composition.floaters import STRENGTH, floaters
         from ..gaussians.cloud import gone, unwanted
 
-        reasons = unwanted(gaussians, crop, **self.floaters)
-        if len(gaussians) and gone(reasons).all():
+        strength = (STRENGTH if self.clean else 0.0) if self.strength is None else self.strength
+        lost = gone(unwanted(gaussians, crop, self.max_scale, floaters(gaussians, cameras, frame, strength)))
+        if len(gaussians) and lost.all():
             raise LumigraphError(
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
                 "or clean less"
             )
-        return reasons
+        return gaussians[~lost]
 
-    def of_gaussians(self, gaussians: Any, crop: Any) -> Any:
-        """Gaussians to keep. Raises LumigraphError if that is none."""
-        from ..gaussians.cloud import gone
+    def of_method(self, method: Any, opened: Any) -> Any:
+        """The cropped method without floaters, ready to render. Raises LumigraphError where it can have no floaters.
 
-        return gaussians[~gone(self.unwanted(gaussians, crop))]
-
-    def of_method(self, method: Any) -> Any:
-        """The cropped method without floaters, ready to render. Raises LumigraphError where it can have no floaters."""
+        opened: the run or file that the method is of
+        """
         from ..composition import PickedCloud, cropped
         from ..method.capabilities import HasGaussians, can, needs
 
         crop = self.crop(method.frame)
-        if self.floaters or (crop is not None and can(method, HasGaussians)):
-            return PickedCloud(method.frame, self.of_gaussians(needs(method, HasGaussians).gaussians(), crop))
+        if self.removes or (crop is not None and can(method, HasGaussians)):
+            gaussians = needs(method, HasGaussians).gaussians()
+            kept = self.of_gaussians(gaussians, crop, method.frame, photographers(opened, method))
+            return PickedCloud(method.frame, kept)
         return method if crop is None else cropped(method, crop)
 
-    def without_floaters(self, method: Any) -> Any:
+    def without_floaters(self, method: Any, opened: Any) -> Any:
         """All of a method but its floaters, for what crops by itself."""
-        return replace(self, box=None, sphere=None).of_method(method)
+        return replace(self, box=None, sphere=None).of_method(method, opened)

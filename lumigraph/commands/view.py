@@ -104,18 +104,16 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: An
 
 
 def saver(opened: Any) -> Any:
-    """A function that saves a part of a cloud of Gaussians, as `lumigraph clean` does: a splat file or a new run."""
+    """A function that saves a cloud without some Gaussians, as `lumigraph clean` does: a splat file or a new run."""
 
-    def save(name: str, crop: Any, floaters: Mapping[str, float]) -> str:
-        from ..gaussians.cloud import gone, unwanted
-        from ..method.capabilities import HasGaussians, needs
+    def save(name: str, reasons: Mapping[str, Any]) -> str:
+        from ..gaussians.cloud import gone
         from ..run.derived import save_picked
 
         output = opened.path.parent / name
         if os.path.lexists(output):
             raise LumigraphError(f"{output} is there already; choose another name")
-        reasons = unwanted(needs(opened.method(), HasGaussians).gaussians(), crop, **floaters)
-        keep = ~gone(reasons)
+        keep = ~gone(reasons).cpu()
         if not keep.any():
             raise LumigraphError("No Gaussian is left; crop or clean less")
         save_picked(opened, keep, output, {"removed": {reason: int(some.sum()) for reason, some in reasons.items()}})

@@ -19,6 +19,7 @@ from ..geometry import evenly
 from ..system.progress import track
 
 STRENGTH = 0.4  # default share of the slider: Gaussians with a score above 1 - STRENGTH are removed
+CANDIDATE_COLOUR = (1.0, 0.1, 0.8)  # of floaters that are shown
 MAX_VIEWS, MAX_SIDE = 32, 200  # depth maps of a pass, and pixels of the longer side of each
 PASSES = 2  # of depth; from the second on, the first one's floaters hide no surface
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance, in front of which nothing is rendered
@@ -60,6 +61,13 @@ class FloaterEvidence:
     def floaters(self, strength: float) -> Bool[Tensor, " gaussian"]:
         """Gaussians to remove: a score above 1 - strength. A larger strength removes no fewer."""
         return self.score > 1 - strength
+
+
+def floaters(
+    gaussians: Gaussians, cameras: Camera | None, frame: Frame, strength: float
+) -> Bool[Tensor, " gaussian"] | None:
+    """Gaussians to remove at a strength, by `evidence`; None at strength 0."""
+    return evidence(gaussians, cameras, frame).floaters(strength) if strength else None
 
 
 @torch.no_grad()

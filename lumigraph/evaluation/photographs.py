@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from typing import NamedTuple
 
 import torch
@@ -17,6 +18,7 @@ from ..camera import Camera
 from ..camera.rays import Rendering
 from ..capture import read_capture
 from ..capture.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
+from ..composition.floaters import STRENGTH, evidence
 from ..datasets.scene import Photograph, Scene
 from ..depth_maps import DepthMap, free
 from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range, save_picture
@@ -24,6 +26,7 @@ from ..files import read_json, write_json
 from ..files.ranges import typed
 from ..geometry import evenly
 from ..method import Method
+from ..method.capabilities import HasGaussians, can, needs
 from ..metrics import psnr
 from ..run import Run
 from ..system.progress import track
@@ -34,6 +37,8 @@ MIN_SIDE, MAX_SIDE = 48, 256  # pixels of the longer side of a rendering
 NEIGHBOURS = 12  # nearest cameras that free space is asked of
 SURFACE_SAMPLES = 500  # points of each rendered surface
 SHEET_SIDE = 400.0  # pixels of the longer side in the report
+SURE_STRENGTH = 0.2  # of cleaning, at which floaters are probable
+MIN_FLOATERS = 1e-3  # share of the Gaussians, from which on floaters are a finding
 SHOWN = 5  # worst photographs in the report
 RESULT_FILE, SHEET_FILE = "photographs.json", "photographs.png"
 
@@ -69,12 +74,30 @@ def examine(run: Run, method: Method, scene: Scene) -> list[Finding]:
         found = findings(capture, None, scene.frame.to_source.rotation.T.double().numpy(), residuals)
     else:
         found = of_residuals(residuals, (), set())
+    found += of_floaters(run, method, scene)
     write_json(run.folder / RESULT_FILE, asdict(Examined(found, residuals)), ours=True)
     if compared:
         save_picture(
             run.folder / SHEET_FILE, sheet(method, scene, worst(compared, found), found, len(compared)), ours=True
         )
     return found
+
+
+def of_floaters(run: Run, method: Method, scene: Scene) -> list[Finding]:
+    """Finding on the floaters of a cloud of Gaussians; none for fewer than one in a thousand, and for other methods."""
+    if not can(method, HasGaussians):
+        return []
+    gaussians = needs(method, HasGaussians).gaussians()
+    cameras = method.refined(scene.cameras[scene.splits["train"]])
+    score = evidence(gaussians, cameras, scene.frame).score
+    count, sure = (int((score > 1 - strength).sum()) for strength in (STRENGTH, SURE_STRENGTH))
+    if count < max(1, MIN_FLOATERS * len(gaussians)):
+        return []
+    text = (
+        f"{count:,} of {len(gaussians):,} Gaussians may be floaters, with a score above {1 - STRENGTH:g}; "
+        f"{sure:,} of them probably are, above {1 - SURE_STRENGTH:g}"
+    )
+    return [Finding("", "floaters", text, f"to remove them: lumigraph clean {quote(str(run.folder))} --output NEW")]
 
 
 def examined(run: Run) -> Examined | None:

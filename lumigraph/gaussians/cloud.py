@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -23,9 +23,6 @@ ISOLATION_NEIGHBOURS = 16  # nearest Gaussians whose mean distance measures isol
 BAND_0 = 0.5 / math.sqrt(math.pi)  # the constant harmonic
 EXTENT_OPACITY = 0.1  # opacity from which on a Gaussian counts for the extent of the cloud
 EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
-
-# What most captures gain from and few lose by; the command line's `--clean`.
-MIN_OPACITY, MAX_SCALE, ISOLATION = 0.02, 1.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -125,18 +122,12 @@ def joined(clouds: Sequence[Gaussians]) -> Gaussians:
     return Gaussians(**columns, harmonics=harmonics, antialiased=majority)
 
 
-def cleaned(
-    gaussians: Gaussians,
-    crop: Crop | None = None,
-    min_opacity: float = 0.0,
-    max_scale: float | None = None,
-    isolation: float | None = None,
-) -> Gaussians:
-    """The Gaussians that a crop holds, without floaters; see `unwanted`."""
-    return gaussians[~gone(unwanted(gaussians, crop, min_opacity, max_scale, isolation))]
+def cleaned(gaussians: Gaussians, crop: Crop | None = None, max_scale: float | None = None) -> Gaussians:
+    """The Gaussians that a crop holds; see `unwanted`."""
+    return gaussians[~gone(unwanted(gaussians, crop, max_scale))]
 
 
-def gone(reasons: dict[str, Bool[Tensor, " gaussian"]]) -> Bool[Tensor, " gaussian"]:
+def gone(reasons: Mapping[str, Bool[Tensor, " gaussian"]]) -> Bool[Tensor, " gaussian"]:
     """Mask of all Gaussians to remove."""
     return torch.stack(list(reasons.values())).any(0)
 
@@ -145,35 +136,22 @@ def gone(reasons: dict[str, Bool[Tensor, " gaussian"]]) -> Bool[Tensor, " gaussi
 def unwanted(
     gaussians: Gaussians,
     crop: Crop | None = None,
-    min_opacity: float = 0.0,
     max_scale: float | None = None,
-    isolation: float | None = None,
+    floating: Bool[Tensor, " gaussian"] | None = None,
 ) -> dict[str, Bool[Tensor, " gaussian"]]:
     """Masks of Gaussians to remove, by reason, in the order of the arguments; each under its first reason.
 
-    crop:        keeps those whose centres it holds, in the cloud's frame
-    min_opacity: that is left, in [0, 1]
-    max_scale:   largest standard deviation that is left, as a share of `extent`; None for any
-    isolation:   how many standard deviations above the mean the logarithm of `gaps` may be; None for any
+    crop:      keeps those whose centres it holds, in the cloud's frame
+    max_scale: largest standard deviation that is left, as a share of `extent`; None for any
+    floating:  floaters; None for none
     """
-    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    reasons = {}
-
-    def drop(reason: str, which: Bool[Tensor, " gaussian"]) -> None:
-        nonlocal keep
-        reasons[reason] = keep & which
-        keep = keep & ~which
-
-    drop("outside the crop", ~keep if crop is None else ~crop.holds(gaussians.means))
-    drop("too faint", gaussians.opacities.sigmoid() < min_opacity)
-    largest = math.inf if max_scale is None or not keep.any() else max_scale * extent(gaussians[keep])
-    drop("too large", gaussians.log_scales.exp().amax(-1) > largest)
-    alone = ~keep
-    if isolation is not None and int(keep.sum()) > ISOLATION_NEIGHBOURS:
-        logs = gaps(gaussians[keep]).log()
-        alone[keep] = logs > logs.mean() + isolation * logs.std()
-    drop("isolated", alone)
-    return reasons
+    outside = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    if crop is not None:
+        outside = ~crop.holds(gaussians.means)
+    largest = math.inf if max_scale is None or outside.all() else max_scale * extent(gaussians[~outside])
+    large = ~outside & (gaussians.log_scales.exp().amax(-1) > largest)
+    reasons = {"outside the crop": outside, "too large": large}
+    return reasons if floating is None else reasons | {"floaters": floating & ~outside & ~large}
 
 
 def painted(gaussians: Gaussians, which: Bool[Tensor, " gaussian"], colour: tuple[float, float, float]) -> Gaussians:

@@ -82,7 +82,8 @@ class ViewRequest:
     crop:       what is shown of the scene; None for all of it
     depth:      whether the browser needs depth, because it draws something beside the scene
     settings:   names and values of the method's controls that the client has turned
-    floaters:   arguments of `cleaned` for them, names and numbers; none if they stay
+    strength:   of `FloaterEvidence.floaters`; 0 for none
+    cleaned:    whether these floaters are left out; otherwise they are coloured
     """
 
     pose: tuple[tuple[float, ...], ...]
@@ -95,12 +96,13 @@ class ViewRequest:
     crop: Crop | None = None
     depth: bool = False
     settings: tuple[tuple[str, Value], ...] = ()
-    floaters: tuple[tuple[str, float], ...] = ()
+    strength: float = 0.0
+    cleaned: bool = False
 
     @property
     def part(self) -> bool:
-        """True if a part of the scene is hidden by a crop or as floaters."""
-        return self.crop is not None or bool(self.floaters)
+        """True if a part of the scene is hidden by a crop, or hidden or coloured as floaters."""
+        return self.crop is not None or self.strength > 0
 
     @property
     def full(self) -> tuple[int, int]:

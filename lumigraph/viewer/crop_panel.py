@@ -1,4 +1,4 @@
-"""A client's tab `Crop`: which part of the scene is shown, which Gaussians are left out, and what is left saved."""
+"""A client's tab `Crop`: the part of the scene that is shown, floaters that are left out, and the rest saved."""
 
 from __future__ import annotations
 
@@ -11,33 +11,26 @@ import numpy as np
 from jaxtyping import Float
 
 from ..camera.crop import Crop, CropBox, Sphere
+from ..composition.floaters import STRENGTH
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
-from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
 from .path_panel import code
-from .shared import NAME, NAME_RULE, Keep, Shared
+from .shared import NAME, NAME_RULE, Shared
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
 HANDLE = 0.25  # length of a handle's arrows, in radii of the subject
 CIRCLE_SEGMENTS = 64  # pieces of a drawn circle
-CROPPED_MAX_SCALE = 0.25  # extents of the crop; larger Gaussians stick out of it
 NUMBER_STEP = 0.001  # scene units: step of the numbers
-FLOATERS = {  # arguments of `cleaned`: label, range with step and default, hint
-    "min_opacity": ("Least opacity", (0.0, 0.5, 0.005, MIN_OPACITY), "Fainter Gaussians are left out"),
-    "max_scale": ("Largest size", (0.01, 1.0, 0.01, MAX_SCALE), "In extents of what is shown; also in a box or sphere"),
-    "isolation": (
-        "Isolation",
-        (0.0, 8.0, 0.1, ISOLATION),
-        "How much farther from its neighbours than most one may be, in standard deviations",
-    ),
-}
+STRENGTH_STEP = 0.02
+REMOVE, RESTORE = "Remove floaters", "Bring floaters back"
 
 
 class CropPanel:
     """The contents of the tab.
 
     changed: called when the crop or the floaters change
+    cleaned: whether floaters are left out
     keep:    saves the rest under a name and returns its path; None where nothing can be saved
     notify:  shows the client a title and a text
     """
@@ -47,14 +40,14 @@ class CropPanel:
         client: Any,
         shared: Shared,
         changed: Callable[[], None],
-        keep: Keep | None,
+        keep: Callable[[str], str] | None,
         notify: Callable[[str, str], None],
     ):
         self._client, self._shared, self._changed, self._keep, self._notify = client, shared, changed, keep, notify
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
         gui, (sphere, (lower, upper)) = client.gui, shared.subject_crops()
-        self._size, self._cropped = sphere.radius, False
+        self._size, self.cleaned = sphere.radius, False
         with shared.tabs["Crop"]:
             self._shape = gui.add_dropdown("Show", (ALL, BOX, SPHERE))
             self._lower = gui.add_vector3("Lower", lower, step=NUMBER_STEP, visible=False)
@@ -63,11 +56,11 @@ class CropPanel:
             self._radius = gui.add_number("Radius", sphere.radius, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
             self._fit = gui.add_button("Fit to subject", hint="The sphere, or its box, around what the cameras look at")
             self._fit.on_click(lambda _: self.fit(SPHERE if self._shape.value == ALL else None))
-            self._clean = gui.add_checkbox("Leave out floaters", False, visible=shared.is_cloud)
-            self._floaters = {
-                name: gui.add_slider(label, *limits, hint=hint, visible=False)
-                for name, (label, limits, hint) in FLOATERS.items()
-            }
+            floats = shared.is_cloud and not shared.turns.training
+            hint = f"Colours floaters; a larger strength finds more. {STRENGTH:g} is that of `lumigraph clean`"
+            self._strength = gui.add_slider("Floaters", 0.0, 1.0, STRENGTH_STEP, 0.0, hint=hint, visible=floats)
+            self._remove = gui.add_button(REMOVE, visible=False)
+            self._remove.on_click(lambda _: self.remove(not self.cleaned))
             if keep is not None:
                 name = f"{shared.subject.title}-part.ply"
                 hint = "Of a splat file, .ply or .spz, or of a folder for a new run"
@@ -75,8 +68,9 @@ class CropPanel:
                 gui.add_button("Save").on_click(lambda _: self._save())
                 self._about = gui.add_markdown("")
         numbers = self._lower, self._upper, self._middle, self._radius
-        for handle in (self._shape, *numbers, self._clean, *self._floaters.values()):
+        for handle in (self._shape, *numbers):
             handle.on_update(lambda _: self._update())
+        self._strength.on_update(lambda _: self.remove(False))
 
     @property
     def crop(self) -> Crop | None:
@@ -89,13 +83,15 @@ class CropPanel:
         return None
 
     @property
-    def floaters(self) -> tuple[tuple[str, float], ...]:
-        """Arguments of `cleaned` for floaters; the largest size alone in a crop whose floaters stay."""
-        return tuple((name, float(x.value)) for name, x in self._floaters.items() if self._applies(name))
+    def strength(self) -> float:
+        """Strength of floaters that are coloured or left out; 0 for none."""
+        return float(self._strength.value)
 
-    def _applies(self, name: str) -> bool:
-        """True if a limit of floaters is in force."""
-        return bool(self._clean.value) or (name == "max_scale" and self._cropped and self._shared.is_cloud)
+    def remove(self, cleaned: bool) -> None:
+        """Leave the floaters out, or show them coloured."""
+        self.cleaned = cleaned
+        self._remove.label = RESTORE if cleaned else REMOVE
+        self._update()
 
     def fit(self, shape: str | None = None) -> None:
         """Set sphere and box to the subject of the capture. shape: shown from now on; None leaves it"""
@@ -119,13 +115,10 @@ class CropPanel:
         if self._following:
             return
         shape = self._shape.value
-        if self._cropped != (shape != ALL):
-            self._cropped = not self._cropped
-            self._floaters["max_scale"].value = CROPPED_MAX_SCALE if self._cropped else MAX_SCALE
         for handle, shown in (
             *((x, shape == BOX) for x in (self._lower, self._upper)),
             *((x, shape == SPHERE) for x in (self._middle, self._radius)),
-            *((x, self._applies(name)) for name, x in self._floaters.items()),
+            (self._remove, self.strength > 0),
         ):
             if handle.visible != shown:
                 handle.visible = shown
@@ -188,7 +181,7 @@ class CropPanel:
             self._notify("Not saved", NAME_RULE)
             return
         try:
-            where = self._keep(name, self.crop, dict(self.floaters))
+            where = self._keep(name)
         except LumigraphError as error:
             self._notify("Not saved", str(error))
             return

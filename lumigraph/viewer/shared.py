@@ -16,9 +16,10 @@ from torch import Tensor
 from ..camera import Camera
 from ..camera.crop import Crop, Sphere
 from ..camera.rays import Rays, Rendering
+from ..composition.floaters import CANDIDATE_COLOUR, FloaterEvidence, evidence
 from ..datasets.scene import Frame, Scene, Vector
 from ..gaussians import Gaussians, splatting
-from ..gaussians.cloud import cleaned
+from ..gaussians.cloud import gone, painted, unwanted
 from ..method import Method, RayMethod
 from ..method.capabilities import HasGaussians, needs
 from ..paths import Surroundings
@@ -29,7 +30,9 @@ from .turns import Turns
 
 NAME = re.compile(r"\w[\w .-]{0,80}")  # of a saved file or folder
 NAME_RULE = "A name is made of letters, digits, spaces, dots and dashes"
-Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
+CROPPED_MAX_SCALE = 0.25  # extents of the crop; larger Gaussians stick out of it
+Masks = Mapping[str, Bool[Tensor, " gaussian"]]  # of Gaussians to remove, by reason
+Keep = Callable[[str, Masks], str]
 
 
 @dataclass(frozen=True)
@@ -81,8 +84,8 @@ class Subject:
     render_command: command line that renders films of the scene, without `--path`
     open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
     rows:           of metrics.jsonl, as far as the method has been trained
-    keep:           saves the cropped and cleaned cloud under a name, and returns its path; None where nothing
-                    can be saved
+    keep:           saves the cloud without some Gaussians under a name, and returns its path; None where nothing can be
+                    saved
     page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
     behind:         colours and floor of a scene under the open sky
     exporter:       exports the scene; None where nothing can be exported
@@ -137,17 +140,39 @@ class Shared:
     step: int = 0
     stopped: bool = False
     _picked: tuple[Any, Gaussians] | None = None  # the last part of the cloud, after the settings that it depends on
+    _evidence: tuple[Any, FloaterEvidence] | None = None  # of the last cloud, in the same way
 
     def cloud(self, request: ViewRequest) -> Gaussians:
-        """Gaussians of the method with the controls, crop and cleaning of a client. Raises
-        LumigraphError if it has none. Call it inside `turns.turn`."""
+        """Gaussians of the method with the controls, crop and cleaning of a client; floaters that are not left out are
+        coloured. Raises LumigraphError if it has none. Call it inside `turns.turn`."""
+        cloud = needs(self._given(request), HasGaussians).gaussians()
         if not request.part:
-            return needs(self._given(request), HasGaussians).gaussians()
-        wanted = self.step, request.settings, request.crop, request.floaters
+            return cloud
+        wanted = self.step, request.settings, request.crop, request.strength, request.cleaned
         if self._picked is None or self._picked[0] != wanted:
-            cloud = needs(self._given(request), HasGaussians).gaussians()
-            self._picked = wanted, cleaned(cloud, request.crop, **dict(request.floaters))
+            lost = gone(self.unwanted(request))
+            if (floating := self.floaters(request)) is not None and not request.cleaned:
+                cloud = painted(cloud, floating, CANDIDATE_COLOUR)
+            self._picked = wanted, cloud[~lost]
         return self._picked[1]
+
+    def unwanted(self, request: ViewRequest) -> Masks:
+        """Masks of the Gaussians that a client has cropped or removed, by reason. Call it inside `turns.turn`."""
+        cloud = needs(self._given(request), HasGaussians).gaussians()
+        max_scale = None if request.crop is None else CROPPED_MAX_SCALE
+        return unwanted(cloud, request.crop, max_scale, self.floaters(request) if request.cleaned else None)
+
+    def floaters(self, request: ViewRequest) -> Bool[Tensor, " gaussian"] | None:
+        """Mask of floaters at a client's strength; None at 0. Evidence takes seconds, once for each cloud."""
+        if not request.strength:
+            return None
+        wanted = self.step, request.settings
+        if self._evidence is None or self._evidence[0] != wanted:
+            photographed = self.subject.open_scene is not None
+            cameras = self.subject.cameras["train"] if photographed else None
+            cloud = needs(self._given(request), HasGaussians).gaussians()
+            self._evidence = wanted, evidence(cloud, cameras, self.subject.frame)
+        return self._evidence[1].floaters(request.strength)
 
     def render(self, camera: Camera, request: ViewRequest) -> Rendering:
         """Rendering of the method with a client's controls and crop, on the CPU. Call it inside `turns.turn`."""

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,6 @@ from torch import Tensor
 
 from .. import kernels
 from ..camera import Camera
-from ..camera.crop import Crop
 from ..camera.rays import Rendering
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
@@ -132,11 +131,11 @@ class Visitor:
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
 
-    def _keep(self, name: str, crop: Crop | None, floaters: Mapping[str, float]) -> str:
+    def _keep(self, name: str) -> str:
         """Save what is left of the cloud. Raises LumigraphError if it cannot be."""
         assert self._shared.subject.keep is not None
         with self._shared.turns.turn():
-            return self._shared.subject.keep(name, crop, floaters)
+            return self._shared.subject.keep(name, self._shared.unwanted(self.request()))
 
     @property
     def _here(self) -> bool:
@@ -168,7 +167,8 @@ class Visitor:
             self.crop.crop,
             controls.surrounded or self.path.drawn or self.crop.drawn,
             self.method_controls.values,
-            self.crop.floaters,
+            self.crop.strength,
+            self.crop.cleaned,
         )
 
     def _draw(self, seconds: float, wanted: Wanted) -> bool:
@@ -251,7 +251,7 @@ class Visitor:
             self._flat = request.background
         if self._splats is not None:
             self._splats.visible = True
-        now = self._shared.step, request.crop, request.settings, request.floaters
+        now = self._shared.step, request.crop, request.settings, request.strength, request.cleaned
         eye = torch.tensor(request.pose)[:, 3]
         if self._splats is None or (seconds > MOVING_SECONDS and self._sent != now):
             self._send_splats(request, eye, wanted)
@@ -265,9 +265,11 @@ class Visitor:
         return seconds > MOVING_SECONDS
 
     def _send_splats(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
+        if request.strength:
+            self._say("Looking for floaters")
         with self._shared.turns.turn(wanted):
             cloud = self._shared.cloud(request)
-            made = splats(cloud, eye)
+            made, floating = splats(cloud, eye), self._shared.floaters(request)
         if not self._here:
             raise NotWantedError
         arrays = made.centres, made.covariances, made.colours, made.opacities
@@ -275,7 +277,8 @@ class Visitor:
             self._splats = self._client.scene.add_gaussian_splats("/gaussians", *arrays, scale=1 / UNIT_SCALE)
         else:
             self._splats.set_gaussians(*arrays)
-        self._say(f"{len(cloud)} Gaussians, drawn by the browser")
+        found = "" if floating is None else f", {int(floating.sum())} floaters"
+        self._say(f"{len(cloud)} Gaussians, drawn by the browser{found}")
 
     def _recolour(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
         """Send the colours seen from where the eye rests now."""
