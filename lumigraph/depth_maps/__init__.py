@@ -10,6 +10,7 @@ from .depth_map import TSDF as TSDF
 from .depth_map import DepthMap as DepthMap
 from .depth_map import SurfacePoints as SurfacePoints
 from .depth_map import Tolerance as Tolerance
+from .depth_map import agreed as agreed
 from .depth_map import back_project as back_project
 from .depth_map import free as free
 from .depth_map import fused_colours as fused_colours
