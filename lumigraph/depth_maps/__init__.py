@@ -5,6 +5,7 @@ infinity where nothing is, NaN where nothing was measured. `DepthMap.of_renderin
 a method, `DepthMap.measured` of a sensor, a depth file or a plane sweep.
 """
 
+from ..system import kernel_cache as kernel_cache
 from .depth_map import DEPTH_EDGE as DEPTH_EDGE
 from .depth_map import TSDF as TSDF
 from .depth_map import DepthMap as DepthMap
