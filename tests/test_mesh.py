@@ -24,13 +24,13 @@ from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Frame
-from lumigraph.depth_maps import Tolerance, render_depth_maps
+from lumigraph.depth_maps import Tolerance, agreed, render_depth_maps
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
-from lumigraph.export.surface import BLOCK, Grid, simplified, smoothed, zero_level
+from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, simplified, smoothed, zero_level
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.run import Run
@@ -41,6 +41,8 @@ pytestmark = budget("exports", 25)
 CELL = 1 / 24
 # A scene that was shrunk to half, turned a quarter about z and moved.
 MOVED = ((0.0, -2.0, 0.0, 5.0), (2.0, 0.0, 0.0, -1.0), (0.0, 0.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0))
+
+OPEN = Frame(bounds=((-1.0,) * 3, (1.0,) * 3), near=0.1, reach=4.0)
 
 
 def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
@@ -156,8 +158,70 @@ def test_smoothing_takes_noise_and_leaves_the_volume():
     assert after.volume == pytest.approx(before.volume, rel=0.01)
     assert np.linalg.norm(smooth, axis=-1).std() < 0.5 * np.linalg.norm(rough, axis=-1).std()
     half = np.asarray(solid.faces)[solid.triangles_center[:, 2] > 0]
-    edge = trimesh.Trimesh(rough, half, process=False).outline().referenced_vertices
-    assert len(edge) and (smoothed(rough, half, 5)[edge] == rough[edge]).all()
+    rim = trimesh.Trimesh(rough, half, process=False).outline().referenced_vertices
+    even = smoothed(rough, half, 20)[rim]
+    assert even[:, 2].std() < 0.6 * rough[rim][:, 2].std()  # a jagged border becomes even, and stays where it was
+    assert np.hypot(*even[:, :2].T).mean() == pytest.approx(np.hypot(*rough[rim][:, :2].T).mean(), rel=0.01)
+
+
+def test_edges_have_two_faces_and_vertices_one_fan():
+    """Two boxes that share an edge, two that share a corner, and a face that has shrunk to a line."""
+    box, rng = trimesh.creation.box(), np.random.default_rng(0)
+    apart = [np.asarray(box.vertices) + shift for shift in ((0, 0, 0), (1, 1, 0), (-1, -1, -1))]
+    where, same = np.unique(np.concatenate(apart), axis=0, return_inverse=True)
+    faces = same[np.concatenate([np.asarray(box.faces) + 8 * k for k in range(3)])]
+    faces = np.concatenate([faces, [[0, 0, 1]]])[rng.permutation(len(faces) + 1)]
+    assert len(where) == 24 - 2 - 1 and not is_manifold(faces)
+    taken, split = manifold(faces)
+    assert is_manifold(split) and len(split) == 36
+    assert (where[taken][split] == where[faces[(faces != np.roll(faces, 1, 1)).all(-1)]]).all()
+    assert trimesh.Trimesh(where[taken], split, process=False).body_count == 3
+    wild = rng.integers(0, 9, (60, 3))  # any faces at all
+    assert not is_manifold(wild) and is_manifold(manifold(wild)[1])
+
+
+def is_manifold(faces: np.ndarray) -> bool:
+    """Whether no edge has more than two faces, and the edges across from each vertex are one chain."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    if (np.unique(edges, axis=0, return_counts=True)[1] > 2).any():
+        return False
+    for vertex in np.unique(faces):
+        left = [set(face) - {vertex} for face in faces.tolist() if vertex in face]
+        chain = left.pop()
+        while touching := [edge for edge in left if edge & chain]:
+            chain = chain.union(*touching)
+            left = [edge for edge in left if edge not in touching]
+        if left:
+            return False
+    return True
+
+
+def test_an_open_surface_is_cut_where_one_camera_alone_sees_it():
+    floor = Seen(lambda points: points[:, 2] + 0.02 * (9 * points[:, :2]).sin().sum(-1), OPEN)
+    cameras = around(9, lowest=40.0, distance=1.5)
+    one, all_of_them = (extract_mesh(floor, x, cell=CELL, smooth=0) for x in (cameras[:1], cameras))
+    assert len(one.faces) > 1000  # nobody can confirm what it sees
+    assert is_manifold(all_of_them.faces) and as_trimesh(all_of_them).body_count == 1
+    points = torch.from_numpy(all_of_them.vertices).float()
+    maps = render_depth_maps(floor.render, cameras, OPEN.background)
+    once = ~agreed(points, maps, Tolerance(5 * CELL))
+    inner = ~np.isin(np.arange(len(points)), border(len(points), all_of_them.faces).nonzero()[0])
+    assert once[inner].float().mean() < 0.02 and agreed(points, maps[:1], Tolerance(5 * CELL)).float().mean() < 0.9
+
+
+def test_the_outline_of_a_mask_becomes_even():
+    """A square of a grid of triangles, with a thread that leaves it and a hole of one vertex."""
+    side = 40
+    number = np.arange(side * side).reshape(side, side)
+    a, b, c, d = (number[i : side - 1 + i, j : side - 1 + j].ravel() for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
+    square = np.zeros((side, side), bool)
+    square[8:28, 8:28] = True
+    spoilt = square.copy()
+    spoilt[15, 28:38], spoilt[20, 20] = True, False
+    found = majority(spoilt.ravel(), faces, 30).reshape(side, side)
+    assert found[20, 20] and not found[:, 30:].any()
+    assert (found ^ square).sum() < 0.1 * square.sum() and (majority(square.ravel(), faces, 0) == square.ravel()).all()
 
 
 def test_fewer_faces_keep_shape_and_colours():

@@ -5,11 +5,13 @@ infinity where nothing is, NaN where nothing was measured. `DepthMap.of_renderin
 a method, `DepthMap.measured` of a sensor, a depth file or a plane sweep.
 """
 
+from ..system import kernel_cache as kernel_cache
 from .depth_map import DEPTH_EDGE as DEPTH_EDGE
 from .depth_map import TSDF as TSDF
 from .depth_map import DepthMap as DepthMap
 from .depth_map import SurfacePoints as SurfacePoints
 from .depth_map import Tolerance as Tolerance
+from .depth_map import agreed as agreed
 from .depth_map import back_project as back_project
 from .depth_map import free as free
 from .depth_map import fused_colours as fused_colours

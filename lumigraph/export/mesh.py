@@ -17,12 +17,24 @@ from ..camera import Camera
 from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
-from ..depth_maps import TSDF, DepthMap, Tolerance, fused_colours, hidden, render_depth_maps
+from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, render_depth_maps
 from ..errors import LumigraphError
 from ..method import Method
 from ..method.capabilities import HasDensity, can, needs
 from ..system.progress import counting, track
-from .surface import BLOCK, Faces, Grid, Vertices, larger_pieces, simplified, smoothed, vertex_normals, zero_level
+from .surface import (
+    BLOCK,
+    Faces,
+    Grid,
+    Vertices,
+    larger_pieces,
+    majority,
+    manifold,
+    simplified,
+    smoothed,
+    vertex_normals,
+    zero_level,
+)
 
 DEFAULT_CELLS = 256  # default, along the longest side of the box
 OPEN_BOX = 1.5  # times the box of interest, for rooms and open scenes
@@ -30,6 +42,7 @@ MIN_CELLS, MAX_CELLS = 8, 2048  # cells along it that make sense
 PROBE_CELLS = 160  # probes along it that locate the surface
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
 TRUNCATION_CELLS = 5  # cells from the surface that depth maps are fused over
+CUT_ROUNDS = 30  # rounds of diffusion in which the line where an open surface is cut becomes even
 INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
@@ -85,10 +98,16 @@ def extract_mesh(
         value = from_density(method, level, interpolated(seen, grid, step))
     vertices, triangles = find_surface(grid, step, holds, value, -1.0 if closed else math.nan)
     if len(triangles):
-        unseen = hidden(torch.from_numpy(vertices).float(), depth_maps, Tolerance(2 * grid.cell)).numpy()
-        if not closed:
-            triangles = triangles[~unseen[triangles].all(-1)]
-        vertices, triangles = larger_pieces(vertices, triangles, keep, ~unseen)
+        points = torch.from_numpy(vertices).float()
+        if closed:
+            seen_well = ~hidden(points, depth_maps, Tolerance(2 * grid.cell)).numpy()
+        else:
+            confirmed = agreed(points, depth_maps, Tolerance(TRUNCATION_CELLS * grid.cell)).numpy()
+            seen_well = majority(confirmed, triangles, CUT_ROUNDS)
+            triangles = triangles[seen_well[triangles].all(-1)]
+        corners, triangles = manifold(triangles)
+        if len(triangles):
+            vertices, triangles = larger_pieces(vertices[corners], triangles, keep, seen_well[corners])
     if not len(triangles):
         raise LumigraphError(
             "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "
@@ -98,6 +117,8 @@ def extract_mesh(
         vertices = smoothed(vertices, triangles, smooth)
         if faces is not None:
             vertices, triangles = simplified(vertices, triangles, faces)
+            corners, triangles = manifold(triangles)
+            vertices = vertices[corners]
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())

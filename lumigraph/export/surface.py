@@ -178,18 +178,53 @@ def larger_pieces(vertices: Vertices, faces: Faces, share: float, seen: Bool[np.
     return compact(vertices, faces[keep[piece[faces[:, 0]]]])
 
 
+def majority(chosen: Bool[np.ndarray, " vertex"], faces: Faces, times: int) -> Bool[np.ndarray, " vertex"]:
+    """Mask of vertices with an even outline: where at least half of the surroundings is chosen, after so many rounds of
+    diffusion. Spikes and threads of it go, small gaps are filled."""
+    around = mean_of_neighbours(adjacency(len(chosen), faces))
+    share = chosen.astype(np.float64)
+    for _ in range(times):
+        share = 0.5 * (share + around @ share)
+    return share >= 0.5
+
+
+def manifold(faces: Faces) -> tuple[Int[np.ndarray, " vertex"], Int[np.ndarray, "kept 3"]]:
+    """Vertices to take, some of them several times, and the faces between these: a manifold with borders.
+
+    A vertex whose faces form several fans becomes one vertex for each fan. Edges of more than two faces become borders,
+    so that no edge has more than two faces. Faces without three distinct vertices go.
+    """
+    faces = faces[(faces != np.roll(faces, 1, 1)).all(-1)]
+    corner = np.arange(faces.size).reshape(faces.shape)  # a number for each vertex of each face
+    ends = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2)
+    corners = np.stack([corner, np.roll(corner, -1, 1)], -1).reshape(-1, 2)
+    swap = ends[:, 0] > ends[:, 1]
+    ends[swap], corners[swap] = ends[swap, ::-1], corners[swap, ::-1]
+    _, edge, count = np.unique(ends[:, 0] << 32 | ends[:, 1], return_inverse=True, return_counts=True)
+    shared = np.argsort(edge, kind="stable")
+    one, other = corners[shared[count[edge[shared]] == 2]].reshape(-1, 2, 2).swapaxes(0, 1)
+    joined = sparse.coo_array((np.ones(one.size), (one.ravel(), other.ravel())), (faces.size, faces.size))
+    _, fan = connected_components(joined, directed=False)
+    _, first = np.unique(fan, return_index=True)
+    return faces.ravel()[first], fan.reshape(faces.shape).astype(np.int64)
+
+
 def smoothed(vertices: Vertices, faces: Faces, times: int) -> Vertices:
-    """Vertices moved towards the mean of their neighbours and back again (Taubin 1995). Borders stay where they are."""
+    """Vertices moved towards the mean of their neighbours and back again (Taubin 1995). Borders move along themselves:
+    neighbours of a vertex of a border are those on the border."""
     if not times:
         return vertices
-    neighbours = adjacency(len(vertices), faces)
-    mean = sparse.diags_array(1 / np.maximum(neighbours.sum(1), 1)) @ neighbours
-    free = np.ones((len(vertices), 1))
-    free[border(faces)] = 0
+    neighbours, rim = adjacency(len(vertices), faces), border(len(vertices), faces)
+    mean = mean_of_neighbours(sparse.diags_array((rim.sum(1) == 0).astype(float)) @ neighbours + rim)
     for _ in range(times):
         for factor in (LAMBDA, MU):
-            vertices = vertices + factor * free * (mean @ vertices - vertices)
+            vertices = vertices + factor * (mean @ vertices - vertices)
     return vertices
+
+
+def mean_of_neighbours(neighbours: sparse.csr_array) -> sparse.csr_array:
+    """The matrix that gives each vertex the mean of its neighbours' values, 0 without neighbours."""
+    return sparse.diags_array(1 / np.maximum(neighbours.sum(1), 1)) @ neighbours
 
 
 def simplified(vertices: Vertices, faces: Faces, count: int) -> Triangles:
@@ -222,9 +257,10 @@ def adjacency(count: int, faces: Faces) -> sparse.csr_array:
     return matrix
 
 
-def border(faces: Faces) -> Int[np.ndarray, " vertex"]:
-    """The vertices of edges that only one face has."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1).astype(np.int64)
-    found, count = np.unique(edges[:, 0] << 32 | edges[:, 1], return_counts=True)
-    alone = found[count == 1]
-    return np.unique(np.concatenate([alone >> 32, alone & 0xFFFFFFFF]))
+def border(count: int, faces: Faces) -> sparse.csr_array:
+    """Adjacency matrix of vertices by edges that only one face has: 1 for each, symmetric."""
+    a, b = faces.ravel(), np.roll(faces, -1, 1).ravel()
+    matrix = sparse.coo_array((np.ones(2 * len(a)), (np.append(a, b), np.append(b, a))), (count, count)).tocsr()
+    matrix.data[:] = matrix.data == 1
+    matrix.eliminate_zeros()
+    return matrix

@@ -1,5 +1,6 @@
 """Hot loops, one folder per operation: a reference in PyTorch, engines in Numba and Triton."""
 
+from ..system import kernel_cache as kernel_cache
 from ._operation import Engine as Engine
 from ._operation import using as using
 from .block_march import Blocks as Blocks

@@ -34,6 +34,7 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..capture.capture import Capture, PixelPlane, Shot
 from ..capture.raw import RawPhoto, facts, planes
+from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
 from .members import is_category as is_category

@@ -17,23 +17,13 @@ import numpy as np
 
 from ...errors import LumigraphError
 from ...files import is_file
+from ...system.cache import cache_folder as cache_folder
 from ...system.memory import threads_for
 
 CACHE_FORMAT = 2  # version of the cache's files
 MARK_FILE = "store.json"  # written last: a folder that holds it is complete
 
 Found = TypeVar("Found")
-
-
-def cache_folder() -> Path:
-    """Folder of this user for data that can be made again."""
-    if chosen := os.environ.get("LUMIGRAPH_CACHE"):
-        return Path(chosen)
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "lumigraph"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "lumigraph" / "cache"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lumigraph"
 
 
 def key(parts: Iterable[str | None]) -> str:
