@@ -31,7 +31,7 @@ POINTS_PER_TASK = 10_000  # PyTorch shares out no operation on so few, and they 
 MIN_FACING = 0.3  # cosine that weights a pixel at least: one without a surface shows that nothing is there
 MIN_COSINE = 0.05  # between a surface's normal and the way to a camera whose colour counts
 MIN_FREE_VIEWS = 2  # cameras that must see past a point for it to lie in free space
-MIN_AGREEING_VIEWS = 2  # cameras that must see a surface at the same place, at least
+MIN_AGREEING_VIEWS = 2  # cameras that must see a surface at the same place
 CAMERAS_PER_VIEW = 16  # one camera in so many must see a point, and at least one: single depths err at edges
 
 
@@ -376,7 +376,7 @@ def hidden(
 def agreed(
     points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap], tolerance: Tolerance
 ) -> Bool[Tensor, " point"]:
-    """Mask of points on a surface that several cameras see at the same place: two, or one more than one in 16 of them.
+    """Mask of points on a surface that two cameras see at the same place, or the only one.
 
     tolerance: distance along the ray from a camera's own surface up to which it agrees
     """
@@ -385,7 +385,7 @@ def agreed(
         compared = seen.compare(some, tolerance)
         return compared.smooth & (compared.ahead.abs() < tolerance(compared.distance))
 
-    needed = min(max(MIN_AGREEING_VIEWS, 1 + len(depth_maps) // CAMERAS_PER_VIEW), len(depth_maps))
+    needed = min(MIN_AGREEING_VIEWS, len(depth_maps))
     return _confirmed(points, track(depth_maps, "Looking where cameras agree", len(depth_maps)), needed, agrees)
 
 
