@@ -423,7 +423,7 @@ def test_its_density_becomes_a_mesh(lenient):
 
 def test_it_becomes_a_film(taught, tmp_path):
     cameras = camera_path("orbit", taught.cameras, taught.method.frame, 2, (16, 16)).to(taught.device)
-    about = film(taught.method, cameras, tmp_path / "orbit.mp4")
+    about = film(taught.method, cameras, tmp_path / "orbit.mp4", depth=True, pictures="png")
     assert about["frames"] == 2 and len(list((tmp_path / "orbit").glob("*.png"))) == 4
     assert (tmp_path / "orbit.mp4").stat().st_size > 0
 

@@ -370,7 +370,8 @@ def test_a_film_turns_controls_from_frame_to_frame():
 def test_render_sets_and_animates(trained, tmp_path):
     output = tmp_path / "film.webp"
     arguments = ["--frames", "3", "--output", str(output), "--set", "ink=grey", "--animate", "brightness=0:2"]
-    assert main(["render", str(trained.folder), *arguments, "--animate", "time=2:5"]) == 0
+    arguments += ["--animate", "time=2:5", "--pictures", "png"]
+    assert main(["render", str(trained.folder), *arguments]) == 0
     about = json.loads(output.with_suffix(".json").read_text())
     assert about["controls"] == {"ink": "grey", "brightness": [0, 1, 2], "time": [2, 3.5, 5]}
     from PIL import Image

@@ -110,7 +110,7 @@ def fitted(asked: Demand, free: float) -> tuple[Demand, list[str]]:
     if found.mapping > room:
         found = replace(found, features=max(int(room / OBSERVATION_BYTES / asked.count), 0))
     needed = gigabytes((replace(asked, threads=1).memory) / FREE_SHARE)
-    if found.max_size < MIN_SIDE or found.features < MIN_FEATURES:
+    if found.max_size < min(MIN_SIDE, asked.max_size) or found.features < min(MIN_FEATURES, asked.features):
         raise LumigraphError(
             f"{asked.count:,} photographs of {asked.size[0]}x{asked.size[1]} pixels would need {needed} of memory, and "
             f"{gigabytes(free)} are free; give smaller or fewer photographs, or end other programs"
