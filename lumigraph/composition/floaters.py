@@ -35,7 +35,7 @@ SURFACE_SHARE, SURFACE_DEVIATIONS = 0.05, 2.0  # of the distance, and deviations
 
 @dataclass(frozen=True)
 class FloaterEvidence:
-    """FloaterEvidence that each Gaussian is a floater, each measure in [0, 1].
+    """Evidence that each Gaussian is a floater, each measure in [0, 1].
 
     isolated: distance to its neighbours in sizes of both, in robust deviations from the median
     in_front: share of cameras that see a surface clearly behind it, among those that it is not hidden from
@@ -50,7 +50,7 @@ class FloaterEvidence:
 
     @property
     def place(self) -> Float[Tensor, " gaussian"]:
-        """FloaterEvidence of the place: in front, near a camera, or seen by few, each of which suffices."""
+        """Evidence of the place: in front, near a camera, or seen by few, each of which suffices."""
         return 1 - (1 - self.in_front) * (1 - self.near) * (1 - FEW_WEIGHT * self.few)
 
     @property
@@ -72,7 +72,7 @@ def floaters(
 
 @torch.no_grad()
 def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> FloaterEvidence:
-    """FloaterEvidence on each Gaussian of a cloud.
+    """Evidence on each Gaussian of a cloud.
 
     cameras: of the photographs, in the cloud's frame; None without photographs
     """
@@ -101,7 +101,7 @@ def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> Floa
 
 
 def isolation(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
-    """FloaterEvidence of isolation: the logarithm of `gaps`, in robust deviations, from 0 at 0.5 to 1 at 3."""
+    """Evidence of isolation: the logarithm of `gaps`, in robust deviations, from 0 at 0.5 to 1 at 3."""
     if len(gaussians) <= ISOLATION_NEIGHBOURS:
         return torch.zeros(len(gaussians), device=gaussians.means.device)
     logs = gaps(gaussians).log()

@@ -21,7 +21,9 @@ Grey = Float[Tensor, "height width"]
 
 @dataclass(frozen=True)
 class FineDetail:
-    """sharpness: amplitude of a rendering's fine detail, as a share of its photograph's
+    """Fine detail of a rendering, measured.
+
+    sharpness: amplitude of a rendering's fine detail, as a share of its photograph's
     shift_gain: PSNR in dB that shifts of up to 2 pixels add, each square of 15 pixels by its own
     """
 
