@@ -181,7 +181,7 @@ def test_edges_have_two_faces_and_vertices_one_fan():
 
 
 def is_manifold(faces: np.ndarray) -> bool:
-    """Whether no edge has more than two faces, and the edges across from each vertex are one chain."""
+    """True if no edge has more than two faces, and the edges across from each vertex are one chain."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     if (np.unique(edges, axis=0, return_counts=True)[1] > 2).any():
         return False

@@ -29,7 +29,7 @@ pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* 
 
 @pytest.fixture
 def cloud_viewer(tmp_path):
-    """Of 200 Gaussians, one alone before a camera; what it is told to save it notes."""
+    """Viewer of 200 Gaussians, one alone before a camera, and a list of what it saves."""
     cloud = some_cloud(200, degree=0)
     cloud.means[0] = 0.6 * tiny.scene().cameras.position[0]
     cloud.log_scales[0] = -4.0
