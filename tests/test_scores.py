@@ -203,9 +203,11 @@ def test_the_training_panel_shows_what_there_is():
     assert (
         measure_of([{"psnr": 20.0, "loss": 1.0}]) == measure_of([]) == "psnr" and measure_of([{"loss": 1.0}]) == "loss"
     )
-    assert describe(3, {"psnr": 20.0, "seconds": 61.0}) == "step 3 · 20.00 dB · 1:01 trained"
-    assert describe(3, {"loss": 0.25, "seconds": 61.0}) == "step 3 · loss 0.25 · 1:01 trained"
-    assert describe(3, {"seconds": 61.0}) == "step 3 · 1:01 trained"
+    last = {"step": 3, "seconds": 61.0}
+    assert describe([{"step": 2, "psnr": 10.0}, last | {"psnr": 20.0}]) == "step 3 · PSNR 20.00 dB · 1:01 trained"
+    assert describe([last | {"psnr": 20.0}, last | {"psnr": 22.0}]) == "step 3 · PSNR 21.00 dB · 1:01 trained"
+    assert describe([last | {"loss": 0.25}]) == "step 3 · loss 0.25 · 1:01 trained"
+    assert describe([last]) == "step 3 · 1:01 trained"
 
 
 def test_a_run_without_any_figure_has_a_report(tmp_path):

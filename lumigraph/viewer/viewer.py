@@ -17,6 +17,7 @@ from ..camera import Camera
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
 from ..system.progress import clock, short
+from ..training.verdict import last_psnr
 from .address import Address
 from .scenery import Scenery
 from .serving import quiet, start_server
@@ -28,7 +29,7 @@ UPDATE_SECONDS = 1.0  # seconds between updates
 CURVE_POINTS = 200  # of the curve
 INK = "#5686d6"
 Measure = Literal["psnr", "loss"]
-TITLES: dict[Measure, str] = {"psnr": "PSNR of training batches", "loss": "Loss of training batches"}
+TITLES: dict[Measure, str] = {"psnr": "PSNR of training photographs", "loss": "Loss of training batches"}
 
 
 class TrainingPanel:
@@ -37,17 +38,16 @@ class TrainingPanel:
     def __init__(self, server: Any, turns: Turns, rows: list[dict[str, Any]]):
         self._gui, self._turns = server.gui, turns
         self._measure = measure_of(rows)
-        self._rows = [(row["seconds"], row[self._measure]) for row in rows if self._measure in row]
-        self._next, self._last = 0.0, ""
+        self._rows, self._next = list(rows), 0.0
         begins = turns.training or not rows
-        self._status = self._gui.add_markdown("About to begin" if begins else describe(rows[-1]["step"], rows[-1]))
+        self._status = self._gui.add_markdown("About to begin" if begins else describe(rows))
         self._plot = self._gui.add_uplot(
-            curve(self._rows),
+            curve(self._points),
             series(self._measure),
             title=TITLES[self._measure],
             scales={"x": {"time": False}},
             aspect=1.6,
-            visible=len(self._rows) > 1,
+            visible=len(self._points) > 1,
         )
         self._button = self._gui.add_button("Pause", visible=turns.training)
         self._button.on_click(lambda _: self._toggle())
@@ -59,23 +59,25 @@ class TrainingPanel:
         if not self._rows and self._measure != (measure := measure_of([row])):
             self._measure = measure
             self._plot.title, self._plot.series = TITLES[measure], series(measure)
-        if self._measure in row:
-            self._rows.append((row["seconds"], row[self._measure]))
-        self._last = describe(step, row)
+        self._rows.append({"step": step} | row)
         if (now := time.perf_counter()) >= self._next:
             self._next = now + UPDATE_SECONDS
-            self._status.content = f"{100 * progress:.0f} % · {self._last}"
+            self._status.content = f"{100 * progress:.0f} % · {describe(self._rows)}"
             self._draw()
 
     def end(self) -> None:
         """Show that training is over."""
         self._button.visible = False
-        self._status.content = f"Done · {self._last}" if self._last else "Done"
+        self._status.content = f"Done · {describe(self._rows)}" if self._rows else "Done"
         self._draw()
 
+    @property
+    def _points(self) -> list[tuple[float, float]]:
+        return [(row["seconds"], row[self._measure]) for row in self._rows if self._measure in row]
+
     def _draw(self) -> None:
-        self._plot.data = curve(self._rows)
-        self._plot.visible = len(self._rows) > 1
+        self._plot.data = curve(self._points)
+        self._plot.visible = len(self._points) > 1
 
     def _toggle(self) -> None:
         self._turns.paused = self._turns.training and not self._turns.paused
@@ -92,9 +94,11 @@ def series(measure: Measure) -> tuple[dict[str, Any], dict[str, Any]]:
     return {"label": "seconds"}, {"label": "dB" if measure == "psnr" else "loss", "stroke": INK, "width": 2}
 
 
-def describe(step: int, row: dict[str, Any]) -> str:
-    quality = f"{row['psnr']:.2f} dB" if "psnr" in row else f"loss {short(row['loss'])}" if "loss" in row else ""
-    return " · ".join(part for part in (f"step {step}", quality, f"{clock(row['seconds'])} trained") if part)
+def describe(rows: list[dict[str, Any]]) -> str:
+    """Step, PSNR of training photographs or loss, and time. rows: of metrics.jsonl up to this step"""
+    row, psnr = rows[-1], last_psnr(rows)
+    quality = f"PSNR {psnr:.2f} dB" if psnr is not None else f"loss {short(row['loss'])}" if "loss" in row else ""
+    return " · ".join(part for part in (f"step {row['step']}", quality, f"{clock(row['seconds'])} trained") if part)
 
 
 def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
