@@ -12,7 +12,7 @@ from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph.components.clouds.dense_points import Points
-from lumigraph.components.training.regularizers import camera_between
+from lumigraph.components.training.regularizers import camera_between, places_between
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.methods.gaussian_splatting.few_views import (
     FewViewNumbers,
@@ -101,6 +101,14 @@ def test_few_views_have_plain_colours_and_a_term_of_depth():
     assert float(terms["depth"]) > 0
     terms["depth"].backward()
     assert method.cloud.means.grad.any()
+
+
+def test_places_between_lie_on_the_way_to_near_cameras():
+    stands = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [9, 9, 9]])
+    found = places_between(torch.zeros(64, 3), stands, chance())
+    assert (found.count_nonzero(dim=1) <= 1).all() and (found <= stands[1:4].amax(0)).all()  # never to the fifth
+    assert (found.amax(0) > 0.5 * stands[1:4].amax(0)).all()  # each of the three is chosen
+    assert torch.equal(places_between(stands[:1], stands[:1], chance()), stands[:1])  # a single camera has none
 
 
 def test_a_camera_between_stands_near_two_of_them():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -25,7 +25,7 @@ from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
 from ..fields.hash_field import CPU_TABLE, TINY_TABLE
-from ..training.regularizers import depth_loss, distortion_loss, scale_gradients
+from ..training.regularizers import depth_loss, distortion_loss, places_between, scale_gradients
 from ..training.row_optimizers import LazyAdam
 from ..training.schedules import falling
 from .occupancy_sampler import NGP_SCHEDULE, GridSchedule, OccupancyNumbers, OccupancySampler, StepNumbers, rows_of
@@ -61,6 +61,7 @@ class ProposalSampler(Sampler):
     """Samples where a proposal grid finds density.
 
     surface, surface_from: points on surfaces, and the camera position that each was found from
+    stands:                those positions, each once
     progress:              share of the budget spent
     """
 
@@ -129,9 +130,13 @@ class ProposalSampler(Sampler):
         return terms
 
     def _depth_error(self, density_at: Density, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """`elsewhere` of some rays with known depth, and the proposal loss of these."""
+        """`depth_loss` of some rays with known depth, and the proposal loss of these.
+
+        They begin between two cameras: air that is clear along the rays of photographs alone may be fog from beside.
+        """
         chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
-        origins, ways = self.surface_from[chosen], self.surface[chosen] - self.surface_from[chosen]
+        origins = places_between(self.surface_from[chosen], self.stands, generator)
+        ways = self.surface[chosen] - origins
         distance = ways.norm(dim=-1)
         rays = Rays(origins, ways / distance[:, None], torch.zeros_like(distance))
         proposals = self.proposal.sample(rays, torch.rand(DEPTH_RAYS, 2, generator=generator).to(distance))
@@ -139,6 +144,10 @@ class ProposalSampler(Sampler):
         (density,) = scale_gradients(samples.t, density_at(samples.along(rays)[0]))
         weights = weights_of(samples, density)
         return depth_loss(samples, weights, distance, DEPTH_MARGIN), proposal_loss(proposals, weights)
+
+    @cached_property
+    def stands(self) -> Float[Tensor, "camera 3"]:
+        return self.surface_from.unique(dim=0)
 
     # Training
 

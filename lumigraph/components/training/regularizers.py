@@ -115,6 +115,18 @@ def camera_between(cameras: Camera, generator: torch.Generator) -> Camera:
     return replace(cameras[torch.tensor([first])], pose=pose.to(cameras.pose), image_index=None)
 
 
+def places_between(
+    places: Float[Tensor, "point 3"], stands: Float[Tensor, "camera 3"], generator: torch.Generator
+) -> Float[Tensor, "point 3"]:
+    """Places anywhere between each of the given ones and one of the cameras nearest to it."""
+    near = torch.cdist(places, stands).argsort(1)[:, 1 : NEAREST_VIEWS + 1]
+    if not near.shape[1]:
+        return places
+    chosen = torch.randint(near.shape[1], (len(places), 1), generator=generator).to(near.device)
+    share = torch.rand(len(places), 1, generator=generator).to(places.device)
+    return torch.lerp(places, stands[near.gather(1, chosen)[:, 0]], share)
+
+
 def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch.Generator) -> Rays:
     """Rays of one square patch of each camera, row by row: side * side of them.
 
