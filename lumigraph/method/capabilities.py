@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -17,7 +17,6 @@ from ..gaussians import Gaussians
 from .field import Colours, Densities, Directions, Points
 
 
-@runtime_checkable
 class HasDensity(Protocol):
     """Knows how dense space is."""
 
@@ -25,7 +24,6 @@ class HasDensity(Protocol):
         """Density per scene unit at points of the scene."""
 
 
-@runtime_checkable
 class HasField(Protocol):
     """Knows density and colour at points, as baking, conversion and composition ask for them."""
 
@@ -33,7 +31,6 @@ class HasField(Protocol):
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
 
 
-@runtime_checkable
 class FromField(Protocol):
     """Can begin as what another method holds, instead of from photographs."""
 
@@ -43,7 +40,6 @@ class FromField(Protocol):
         from then on continues there. Raises LumigraphError, in one sentence, where it cannot be taken over."""
 
 
-@runtime_checkable
 class HasOctree(Protocol):
     """Is an octree of density and harmonics, for browsers and files."""
 
@@ -52,7 +48,6 @@ class HasOctree(Protocol):
         none yet, and where it does not fit into memory, with the depth that does."""
 
 
-@runtime_checkable
 class HasAtlas(Protocol):
     """Is an atlas of diffuse colours and features, for browsers and files."""
 
@@ -60,7 +55,6 @@ class HasAtlas(Protocol):
         """The scene as an atlas, in the scene's frame. Raises LumigraphError while there is none yet."""
 
 
-@runtime_checkable
 class HasDistance(Protocol):
     """Knows how far surfaces are."""
 
@@ -68,7 +62,6 @@ class HasDistance(Protocol):
         """Signed distance to the nearest surface in scene units, negative inside."""
 
 
-@runtime_checkable
 class HasGaussians(Protocol):
     """Is a cloud of Gaussians."""
 
@@ -76,14 +69,12 @@ class HasGaussians(Protocol):
         """The scene as a cloud, in the scene's frame."""
 
 
-@runtime_checkable
 class RefinesPoses(Protocol):
     """Can learn where photographs were taken from, besides the scene."""
 
     poses: nn.Module | None  # a `PoseRefinement`; None where it was not asked to
 
 
-@runtime_checkable
 class HasVisibility(Protocol):
     """Knows which places its photographs saw."""
 
@@ -91,21 +82,18 @@ class HasVisibility(Protocol):
         """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
 
 
-@runtime_checkable
 class HasExposure(Protocol):
     """Knows the exposures of its photographs."""
 
     usual_exposure: float | None  # log2 of their median; None where it is not known
 
 
-@runtime_checkable
 class HasAppearance(Protocol):
     """Renders in the light of one appearance code, which it accepts as evidence."""
 
     shown_in: Any  # the `Appearance`; of no numbers where none was learnt
 
 
-@runtime_checkable
 class CanPrune(Protocol):
     """Is a cloud of Gaussians that can lose some and go on learning."""
 
@@ -113,7 +101,6 @@ class CanPrune(Protocol):
         """Leave those of `gaussians()` that a mask picks, and of the optimizers' states what belongs to them."""
 
 
-@runtime_checkable
 class HasMesh(Protocol):
     """Is a mesh, or makes one better than `export mesh` would."""
 
@@ -121,7 +108,6 @@ class HasMesh(Protocol):
         """The scene as triangles, in the scene's frame."""
 
 
-@runtime_checkable
 class HasLooks(Protocol):
     """Marches along rays."""
 
@@ -129,7 +115,6 @@ class HasLooks(Protocol):
         """Density and colour along rays, one entry for each pass, the one that is composited last."""
 
 
-@runtime_checkable
 class CanCompress(Protocol):
     """Says how it may be stored in fewer bytes."""
 
@@ -145,7 +130,6 @@ class CanCompress(Protocol):
         the rows that there are now."""
 
 
-@runtime_checkable
 class CanDraw(Protocol):
     """Knows what objects of a category are like, so that it can make one up."""
 
