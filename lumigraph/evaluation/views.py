@@ -1,8 +1,7 @@
 """Evaluate a trained method on held-out views, under a stated protocol.
 
-Halves: a method with a code for each photograph is given the left half of a held-out one and compared on the right. The
-code of a photograph outside the training set is unknown, and one fitted to all of it would include the answer
-(Martin-Brualla et al. 2021, section 5). Raw photographs are compared as light without noise (Mildenhall 2022, 5.1).
+A method with a code for each photograph is given the left half of a held-out one and compared on the right (`halves`).
+Raw photographs are compared as light without noise (Mildenhall 2022, section 5.1).
 """
 
 from __future__ import annotations
@@ -32,13 +31,12 @@ from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
+from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
 CLEAN_LAYER = "clean"  # the layer of photographs in their own light without passers-by
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is no time of the view
-LEFT_HALVES = "each photograph's code is found on its left half, and its right half is compared"
-RIGHT_HALVES = "right halves are compared; nothing is told of left ones"
 LIGHT_LAYER = "radiance"  # the layer that holds it, 1 for white
 LIGHT_PROTOCOL = (
     "sRGB of light without noise, clipped at white; each rendering's linear light is aligned with it by a factor and "
@@ -160,9 +158,9 @@ def evaluate(
     keep:  receives each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
     right_halves: compare those alone also where a method is given nothing of left ones
-    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
-    photograph's mask rules out do not count, nor does a photograph that it rules out altogether. A method that
-    photographs can be given to is judged by halves. Raises LumigraphError if the split has no view.
+    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says, and codes from
+    there. Pixels that the photograph's mask rules out do not count, nor does a photograph that it rules out altogether.
+    A method that photographs can be given to is judged by halves. Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
@@ -186,7 +184,7 @@ def evaluate(
         if shot.mask is not None and not shot.mask[:, columns].any():
             continue
         photograph = shot.before(scene.frame.background)
-        told = method.given(left_half(shot)) if by_halves else method
+        told = method.given(left_half(replace(shot, camera=camera))) if by_halves else method
         begin = time.perf_counter()
         seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
@@ -293,26 +291,6 @@ def mean_known(values: Iterable[float | None]) -> float | None:
     """The mean of those that are known; None if none is."""
     found = [value for value in values if value is not None]
     return mean(found) if found else None
-
-
-def judged_by_halves(method: Method) -> bool:
-    """True if a method of Scenes accepts single photographs as evidence, and no control already selects a photograph's
-    appearance."""
-    takes = issubclass(method.learns_from, Scene) and Photograph in method.takes
-    return takes and not any(control.of_photographs and control.name in method.settings for control in method.controls)
-
-
-def left_half(photograph: Photograph) -> Photograph:
-    """The same photograph, of which only pixels left of the middle are to be trusted."""
-    mask = photograph.mask
-    trusted = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
-    trusted[:, right_half(photograph)] = False
-    return replace(photograph, mask=trusted)
-
-
-def right_half(photograph: Photograph) -> slice:
-    """The columns from the middle on."""
-    return slice(photograph.rgb.shape[1] // 2, None)
 
 
 def in_light(seen: Rendering, truth: Picture) -> tuple[Picture, Picture]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera import Camera
 from ..camera.rays import Look, Rays
 from ..datasets.mesh import Mesh
+from ..datasets.scene import Photograph
 from ..errors import LumigraphError
 from ..exchange.baked import Atlas, Octree
 from ..exchange.packing import Stored
@@ -73,6 +75,10 @@ class RefinesPoses(Protocol):
     """Can learn where photographs were taken from, besides the scene."""
 
     poses: nn.Module | None  # a `PoseRefinement`; None where it was not asked to
+
+    def pose_error(self, photograph: Photograph, poses: nn.Module, generator: torch.Generator) -> Tensor:
+        """Mean squared error of colours at a photograph's trusted pixels, or at some of them, seen from where `poses`
+        (a `PoseRefinement`) move its camera; differentiable in these. RayMethods have it."""
 
 
 class HasVisibility(Protocol):

@@ -19,7 +19,7 @@ from ...geometry import evenly
 from ...method import Part
 from ...method.controls import Control, Value
 from ..clouds.flat_view import FlatView, flat_view
-from ..fields.appearance import AVERAGE, drawn
+from ..fields.appearance import AVERAGE
 
 MAX_PHOTOGRAPHS = 32  # photographs, each beside its neighbour
 MAX_SIDE = 200  # pixels along their longer side
@@ -185,7 +185,7 @@ class Exposure(Part):
     @torch.no_grad()
     def adapted(self, method: Any, evidence: Photograph) -> Exposure:
         """The part with the gain of a photograph, found from its trusted pixels."""
-        batch = drawn(evidence, GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
+        batch = evidence.sample_rays(GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
         method.settings.pop("exposed_as", None)
         adapted = copy.copy(self)
         if not len(batch):

@@ -17,7 +17,7 @@ from ...camera.rays import Rendering
 from ...color.blending import over
 from ...components.clouds.dense_points import compile_sweep, seen_points
 from ...components.fields.teacher import teacher_of
-from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.pose_refinement import PoseNumbers, PoseRefinement, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
 from ...gaussians import Gaussians
@@ -271,11 +271,27 @@ class GaussianSplatting(Method):
 
     def render(self, camera: Camera) -> Rendering:
         camera = camera.to(self.device)
-        seen, background = self.rasterized(camera), self.background[0]
+        return self.shown(self.rasterized(camera), camera)
+
+    def shown(self, seen: Rendering, camera: Camera) -> Rendering:
+        """A rendering over black in the appearance of the settings, before the background."""
+        background = self.background[0]
         for part in self.additions:
             rgb, background = part.shown(self, seen, camera, background)
             seen = replace(seen, rgb=rgb)
         return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
+
+    def pose_error(
+        self, photograph: Photograph, poses: PoseRefinement, generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """Mean squared error of colours at the trusted pixels of a photograph, seen from where `poses` move its camera;
+        see `RefinesPoses`."""
+        photograph = photograph.to(self.device)
+        cloud, camera = seen_from(poses, self.filtered(), photograph.camera)
+        picture = splat(cloud, view_of(camera, self.near_plane))
+        seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
+        error = (seen.rgb - photograph.before(self.background[0])).square()
+        return error.mean() if photograph.mask is None else error[photograph.mask].mean()
 
     # Compression
 
