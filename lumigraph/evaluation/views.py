@@ -37,6 +37,7 @@ from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
 CLEAN_LAYER = "clean"  # the layer of photographs in their own light without passers-by
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is no time of the view
+CAPTURED_POSES = "as captured"
 LIGHT_LAYER = "radiance"  # the layer that holds it, 1 for white
 LIGHT_PROTOCOL = (
     "sRGB of light without noise, clipped at white; each rendering's linear light is aligned with it by a factor and "
@@ -262,7 +263,7 @@ def protocol(
         "of": len(scene.splits[split]),
         "resolution": sizes[0] if len(sizes) == 1 else sizes,
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
-        "poses": "as the method refined them" if refined else "as captured",
+        "poses": "as the method refined them" if refined else CAPTURED_POSES,
         "controls": dict(method.settings),
         "halves": LEFT_HALVES if judged_by_halves(method) else RIGHT_HALVES if right_halves else None,
         "masked": any(scene.images.mask(i) is not None for i in compared),
