@@ -61,11 +61,12 @@ class ShapesEvaluation:
     shapes: list[ShapeScore]
     protocol: dict[str, Any]
     shown: dict[str, list[Float[Tensor, "height width 3"]]]
+    members: tuple[ShapesEvaluation, ...] = ()  # of a collection, whose means are averaged
 
     @property
     def scores(self) -> list[Score]:
-        """Means over the shapes that have each."""
-        every = [score for shape in self.shapes for score in shape.scores]
+        """Means over the shapes, or members, that have each."""
+        every = [score for each in self.members or self.shapes for score in each.scores]
         by_name = {score.name: [other.value for other in every if other.name == score.name] for score in every}
         return [
             Score(name, sum(values) / len(values), "", next(x.better for x in every if x.name == name))

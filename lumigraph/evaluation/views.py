@@ -7,7 +7,7 @@ Raw photographs are compared as light without noise (Mildenhall 2022, section 5.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -64,33 +64,46 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All views of a split, and how they were compared. compile_seconds: spent ahead of the first view."""
+    """All views of a split, and how they were compared.
+
+    compile_seconds: spent ahead of the first view
+    members: of a collection, whose means are averaged, so that each counts the same however many views it has
+    """
 
     views: list[ViewScore]
     protocol: dict[str, Any]
     compile_seconds: float
     shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
     poses: tuple[Score, ...] = ()  # how far refined poses are from true ones, where these are known
+    members: tuple[Evaluation, ...] = ()
+
+    @property
+    def _averaged(self) -> Sequence[Evaluation | ViewScore]:
+        return self.members or self.views
 
     @property
     def psnr(self) -> float:
-        return mean(view.psnr for view in self.views)
+        return mean(each.psnr for each in self._averaged)
 
     @property
     def ssim(self) -> float:
-        return mean(view.ssim for view in self.views)
+        return mean(each.ssim for each in self._averaged)
 
     @property
     def lpips(self) -> float | None:
         """Mean LPIPS over the views; None if it was not measured."""
-        return mean_known(view.lpips for view in self.views)
+        return mean_known(each.lpips for each in self._averaged)
+
+    @property
+    def clean_psnr(self) -> float | None:
+        """Mean PSNR against photographs without passers-by; None where these are not known."""
+        return mean_known(each.clean_psnr for each in self._averaged)
 
     @property
     def detail(self) -> FineDetail | None:
         """Mean detail over the views; None if no photograph has fine detail."""
-        sharp, gain = (
-            mean_known(getattr(v.detail, name, None) for v in self.views) for name in FineDetail.__annotations__
-        )
+        found = [each.detail for each in self._averaged]
+        sharp, gain = (mean_known(getattr(x, name, None) for x in found) for name in FineDetail.__annotations__)
         return None if sharp is None or gain is None else FineDetail(sharp, gain)
 
     @property
@@ -101,11 +114,15 @@ class Evaluation:
     def by_resolution(self) -> dict[str, Evaluation]:
         """The views of each size alone, sizes in the order in which they come."""
         sizes = dict.fromkeys(view.resolution for view in self.views)
-        return {size: replace(self, views=[view for view in self.views if view.resolution == size]) for size in sizes}
+        return {size: self._of_size(size) for size in sizes}
+
+    def _of_size(self, size: str) -> Evaluation:
+        views = [view for view in self.views if view.resolution == size]
+        members = tuple(part for member in self.members if (part := member._of_size(size)).views)
+        return replace(self, views=views, members=members)
 
     def means(self) -> dict[str, Any]:
-        clean = mean_known(view.clean_psnr for view in self.views)
-        known = {} if clean is None else {"clean_psnr": clean}
+        known = {} if self.clean_psnr is None else {"clean_psnr": self.clean_psnr}
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
 
     @property
