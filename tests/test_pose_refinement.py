@@ -17,6 +17,7 @@ from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
 from lumigraph.capture.oddities import about_fold
+from lumigraph.components.clouds.moved_cloud import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
 from lumigraph.components.training.schedules import BEGINS, ENDS, INITIAL_BANDS, band_weights
@@ -28,7 +29,6 @@ from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
 from lumigraph.method.capabilities import RefinesPoses, can
 from lumigraph.methods.gaussian_splatting.initialization import random_cloud
-from lumigraph.methods.gaussian_splatting.poses import seen_from
 from lumigraph.run import build
 from lumigraph.training.verdict import cameras_moved
 

@@ -20,12 +20,15 @@ from torch import Tensor, nn
 from ..camera import Camera
 from ..camera.crop import Crop
 from ..camera.rays import Look, Rays, Rendering, Samples
-from ..datasets.scene import Frame
+from ..color.blending import over
+from ..components.clouds.moved_cloud import seen_from
+from ..components.training.pose_refinement import PoseRefinement
+from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined, splatting
 from ..geometry import Similarity
 from ..method import Method, RayMethod
-from ..method.capabilities import HasDensity, HasGaussians, HasLooks, can
+from ..method.capabilities import ColourError, HasDensity, HasGaussians, HasLooks, can
 from ..method.controls import Control, Value
 from ..volume import composite, packed
 from .placed import Placed
@@ -162,10 +165,11 @@ def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: 
 
 
 class PickedCloud(Method):
-    """A cloud as it is: it renders, and does not learn."""
+    """A cloud as it is: it renders, and does not learn. refined: whether it was learnt with poses"""
 
-    def __init__(self, frame: Frame, gaussians: Gaussians):
+    def __init__(self, frame: Frame, gaussians: Gaussians, refined: bool = False):
         super().__init__(frame, None)
+        self.poses = True if refined else None
         self._antialiased = gaussians.antialiased
         self._names = [field.name for field in fields(gaussians) if field.name != "antialiased"]
         for name in self._names:
@@ -178,8 +182,22 @@ class PickedCloud(Method):
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
-        near = NEAR_PLANE_SCALE * self.frame.near
-        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
+        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, self.near_plane)
+
+    @property
+    def near_plane(self) -> float:
+        return NEAR_PLANE_SCALE * self.frame.near
+
+    def colour_error(self, photograph: Photograph) -> ColourError:
+        """Error of a photograph's colours as a function of its pose, over all of its trusted pixels."""
+        photograph, cloud, background = photograph.to(self.device), self.gaussians(), self.background[0]
+
+        def error(poses: PoseRefinement, generator: torch.Generator) -> Float[Tensor, ""]:
+            moved, camera = seen_from(poses, cloud, photograph.camera)
+            seen = splatting.splat(moved, splatting.view_of(camera, self.near_plane))
+            return photograph.error(over(seen.rgb, seen.opacity, background), background)
+
+        return error
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("Gaussians that were picked from a cloud do not learn; resume the run they came from")

@@ -7,9 +7,9 @@ would be scored as wrong.
 
 from __future__ import annotations
 
-import copy
+import contextlib
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 
 import torch
 
@@ -25,6 +25,7 @@ from .halves import judged_by_halves, left_half
 
 STEPS = 100  # down the error of the left half, the scene frozen
 LEARNING_RATE = 5e-3  # radians by which the first step moves the picture
+MIN_ALIGNED = 3  # photographs that errors of poses are measured on
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 PROTOCOL = (
     "as the method refined them; held-out ones moved along by the similarity that aligns training poses before and "
@@ -43,14 +44,12 @@ class HeldOutPoses:
     """
 
     def __init__(self, method: Method, scene: Scene):
-        learnt, self.scene, self.method = scene.splits["train"], scene, method
-        given = scene.cameras[learnt].to("cpu")
-        self.moved_along = scene.cameras.transformed(aligning(given, method.refined(given)).matrix)
-        self.learnt = set(learnt.tolist())
-
-    @cached_property
-    def frozen(self) -> Method:
-        return copy.deepcopy(self.method).requires_grad_(False)
+        train = scene.splits["train"]
+        given = scene.cameras[train].to("cpu")
+        refined = method.refined(given)
+        self.scene, self.method = scene, method
+        self.moved_along = scene.cameras.transformed(aligning(given, refined).matrix)
+        self.learnt = set() if refined is given else set(train.tolist())  # blocks know no poses in the common frame
 
     def camera(self, index: int) -> Camera:
         if index in self.learnt:
@@ -59,17 +58,30 @@ class HeldOutPoses:
         shot = left_half(replace(self.scene.photograph(index), camera=begin))
         if shot.mask is None or not shot.mask.any():
             return begin
-        method = needs(self.frozen.given(shot) if judged_by_halves(self.frozen) else self.frozen, RefinesPoses)
-        poses = PoseRefinement(len(self.scene), LEARNING_RATE).to(method.device)
+        poses = PoseRefinement(len(self.scene), LEARNING_RATE).to(self.method.device)
         poses.choose_axes(begin, self.scene.frame)
         (optimizer,), generator = poses.optimizers(), torch.Generator().manual_seed(index)
-        with torch.enable_grad():
+        method = self.method.given(shot) if judged_by_halves(self.method) else self.method
+        with frozen(method), torch.enable_grad():
+            error = needs(method, RefinesPoses).colour_error(shot)
             for step in range(STEPS):
                 optimizer.param_groups[0]["lr"] = poses.rate(step / STEPS)
-                error = method.pose_error(shot, poses, generator)
-                (poses.twist.grad,) = torch.autograd.grad(error, [poses.twist])
+                (poses.twist.grad,) = torch.autograd.grad(error(poses, generator), [poses.twist])
                 optimizer.step()
         return poses.refined(begin)
+
+
+@contextlib.contextmanager
+def frozen(method: Method) -> Iterator[None]:
+    """A method none of whose parameters gets a gradient meanwhile."""
+    learnt = [parameter for parameter in method.parameters() if parameter.requires_grad]
+    try:
+        for parameter in learnt:
+            parameter.requires_grad_(False)
+        yield
+    finally:
+        for parameter in learnt:
+            parameter.requires_grad_(True)
 
 
 def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
@@ -79,11 +91,14 @@ def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
 
 def pose_scores(method: Method, scene: Scene) -> list[Score]:
     """Errors of rotation (degrees) and position (percent of the box of interest) against true poses, aligned; medians
-    over training photographs. Empty where the true poses are unknown."""
-    if TRUE_POSE not in scene.about:
-        return []
+    over training photographs. Empty where the true poses are unknown, or the refined ones of blocks, and for so few
+    photographs that any alignment would fit them."""
     learnt = scene.splits["train"]
     cameras = scene.cameras[learnt].to("cpu")
+    if TRUE_POSE not in scene.about or len(learnt) < MIN_ALIGNED:
+        return []
+    if can(method, RefinesPoses) and method.refined(cameras) is cameras:
+        return []
     to_scene = Similarity.of(scene.frame.source_from_scene).inverse
     truth = replace(cameras, pose=scene.about[TRUE_POSE][learnt]).transformed(to_scene.matrix)
     turned, shifted = moves(method.refined(cameras), truth, scene.frame).median

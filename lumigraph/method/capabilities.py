@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import torch
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera import Camera
-from ..camera.rays import Look, Rays
+from ..camera.rays import Look, Rays, Rendering
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Photograph
 from ..errors import LumigraphError
@@ -71,14 +72,18 @@ class HasGaussians(Protocol):
         """The scene as a cloud, in the scene's frame."""
 
 
+# The mean squared error of colours at a photograph's trusted pixels, or at random ones of them, seen from where a
+# `PoseRefinement` moves its camera; differentiable in this.
+ColourError = Callable[[Any, torch.Generator], Tensor]
+
+
 class RefinesPoses(Protocol):
     """Can learn where photographs were taken from, besides the scene."""
 
-    poses: nn.Module | None  # a `PoseRefinement`; None where it was not asked to
+    poses: nn.Module | bool | None  # a `PoseRefinement`; True where the parts have them; None where none was asked for
 
-    def pose_error(self, photograph: Photograph, poses: nn.Module, generator: torch.Generator) -> Tensor:
-        """Mean squared error of colours at a photograph's trusted pixels, or at some of them, seen from where `poses`
-        (a `PoseRefinement`) move its camera; differentiable in these. RayMethods have it."""
+    def colour_error(self, photograph: Photograph) -> ColourError:
+        """Error of a photograph's colours as a function of its pose. RayMethods have it."""
 
 
 class HasVisibility(Protocol):
@@ -121,6 +126,13 @@ class HasLooks(Protocol):
         """Density and colour along rays, one entry for each pass, the one that is composited last."""
 
 
+class RendersRays(Protocol):
+    """Renders one ray at a time."""
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        """Rendering of each ray before a background colour."""
+
+
 class CanCompress(Protocol):
     """Says how it may be stored in fewer bytes."""
 
@@ -159,6 +171,7 @@ LACKING = {
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
     CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of hyp-nerf",
     CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
+    RendersRays: "renders whole pictures, so single rays have no colour",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }
 

@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..budget import BY_RAY, Efforts
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Batch, Photograph, Scene
 from ..volume import composite
-from .capabilities import HasLooks, needs
+from .capabilities import ColourError, HasLooks, needs
 from .method import Method
 
 POSE_RAYS = 1024  # of a photograph, from which the error of a pose is measured
@@ -65,12 +65,15 @@ class RayMethod(Method):
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
 
-    def pose_error(self, photograph: Photograph, poses: nn.Module, generator: torch.Generator) -> Float[Tensor, ""]:
-        """Mean squared error of colours at random trusted pixels of a photograph, seen from where `poses` move its
-        camera; see `RefinesPoses`."""
-        batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)
-        seen = self.render_rays(poses(batch.rays), self.background)
-        return (seen.rgb - batch.before(self.background)).square().mean()
+    def colour_error(self, photograph: Photograph) -> ColourError:
+        """Error of a photograph's colours as a function of its pose, over random trusted pixels; see `RefinesPoses`."""
+
+        def error(poses: Any, generator: torch.Generator) -> Float[Tensor, ""]:
+            batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)
+            seen = self.render_rays(poses(batch.rays), self.background)
+            return (seen.rgb - batch.before(self.background)).square().mean()
+
+        return error
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

@@ -16,6 +16,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...components.clouds.dense_points import compile_sweep, seen_points
+from ...components.clouds.moved_cloud import seen_from
 from ...components.fields.teacher import teacher_of
 from ...components.training.pose_refinement import PoseNumbers, PoseRefinement, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
@@ -23,6 +24,7 @@ from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, betwee
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
+from ...method.capabilities import ColourError
 from .adaptive import AdaptiveDensity, AdaptiveNumbers
 from .addition import Addition, Step
 from .appearance import AppearanceNumbers, SplatAppearance
@@ -33,7 +35,6 @@ from .initialization import Initialization, cloud_of, initial_cloud, random_clou
 from .interval_schedule import intervals
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
-from .poses import seen_from
 from .robust_mask import RobustMask, RobustNumbers
 from .tidying import Tidying
 
@@ -281,17 +282,17 @@ class GaussianSplatting(Method):
             seen = replace(seen, rgb=rgb)
         return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
 
-    def pose_error(
-        self, photograph: Photograph, poses: PoseRefinement, generator: torch.Generator
-    ) -> Float[Tensor, ""]:
-        """Mean squared error of colours at the trusted pixels of a photograph, seen from where `poses` move its camera;
-        see `RefinesPoses`."""
-        photograph = photograph.to(self.device)
-        cloud, camera = seen_from(poses, self.filtered(), photograph.camera)
-        picture = splat(cloud, view_of(camera, self.near_plane))
-        seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
-        error = (seen.rgb - photograph.before(self.background[0])).square()
-        return error.mean() if photograph.mask is None else error[photograph.mask].mean()
+    def colour_error(self, photograph: Photograph) -> ColourError:
+        """Error of a photograph's colours as a function of its pose, over all of its trusted pixels."""
+        photograph, cloud = photograph.to(self.device), self.filtered()
+
+        def error(poses: PoseRefinement, generator: torch.Generator) -> Float[Tensor, ""]:
+            moved, camera = seen_from(poses, cloud, photograph.camera)
+            picture = splat(moved, view_of(camera, self.near_plane))
+            seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
+            return photograph.error(seen.rgb, self.background[0])
+
+        return error
 
     # Compression
 
