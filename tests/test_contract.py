@@ -199,7 +199,7 @@ def fall(losses: list[float]) -> bool:
 
 def test_it_learns(taught, monkeypatch):
     """Its loss falls, where it has one, and it shows held-out photographs better than one that has learnt nothing."""
-    monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph, of methods that refine poses; 100 otherwise
+    monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph, of methods that refine poses; 200 otherwise
     losses = [row["loss"] for row in taught.straight.metrics() if "loss" in row]
     if losses and not fall(losses):  # as yet
         run = begin(taught.name, taught.data, taught.straight.folder.with_name("later"), taught.device)

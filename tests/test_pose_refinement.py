@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from PIL import Image
 
 from lumigraph import methods
@@ -27,8 +28,8 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation import held_out_poses as held_out_module
-from lumigraph.evaluation.halves import left_half
-from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
+from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.held_out_poses import HeldOutPoses, colour_error, held_out_poses, pose_scores
 from lumigraph.files.ranges import changed, holds
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
@@ -36,6 +37,8 @@ from lumigraph.method.capabilities import RefinesPoses, can
 from lumigraph.methods.gaussian_splatting.initialization import random_cloud
 from lumigraph.run import build
 from lumigraph.training.verdict import cameras_moved
+
+pytestmark = budget("methods", 10)
 
 CPU = torch.device("cpu")
 SMALL = {"nerf": {"position_frequencies": 3, "bfloat16": False}, "mip-nerf": {"bfloat16": False}, "instant-ngp": {}}
@@ -237,9 +240,10 @@ def axis_angle(rotation: torch.Tensor) -> torch.Tensor:
 HELD_OUT = 4
 
 
-def misplaced(**config):
+def misplaced(background=(1.0, 1.0, 1.0), **config):
     """A cloud, and its own pictures, one of which is said to be taken from 1.5 degrees and 1 % away; its true pose."""
     scene = tiny.made(8, 32, 40.0)
+    scene = replace(scene, frame=replace(scene.frame, background=background))
     kind = methods.find("gaussian-splatting")
     config = changed(kind.smallest(), refine_cameras=True, sh_degree=0, **config)
     method = build(kind, scene.frame, config, CPU, 0).eval()
@@ -308,15 +312,21 @@ def test_a_pose_is_found_by_colours_alone():
     assert torch.equal(cameras[0].pose, cameras[1].pose)
 
 
-def test_a_dark_photograph_is_found_in_its_own_light():
-    """Its colours are found on the left half first; in the average of the others its pose would be wrong."""
-    method, said, true = misplaced(appearance="yes")
-    with torch.no_grad():
-        method.appearance.codes.codes[said.splits["train"], 0] = 1e-3  # learnt
+def test_a_dark_photograph_is_found_in_any_light():
+    """A third as bright as the average of the others, before black. Plain errors would move its camera off."""
+    method, said, true = misplaced(appearance="yes", background=(0.0, 0.0, 0.0))
     dark = with_picture(said, lambda picture: picture // 3)
-    camera, average = (HeldOutPoses(one, dark).camera(HELD_OUT) for one in (method, method.given(appearance="average")))
     off = distance(said.cameras[HELD_OUT], true)
-    assert distance(camera, true) < 0.25 * off < 0.5 * distance(average, true)
+    assert judged_by_halves(method)
+    assert distance(HeldOutPoses(method, dark).camera(HELD_OUT), true) < 0.25 * off
+    assert distance(HeldOutPoses(method.given(appearance="average"), dark).camera(HELD_OUT), true) > off
+
+
+def test_colours_are_compared_up_to_light(generator):
+    seen = torch.rand(100, 3, generator=generator)
+    light = seen * torch.tensor([0.3, 0.5, 0.2]) + torch.tensor([0.1, 0.0, 0.3])
+    assert colour_error(seen, light, lit=True) < 1e-12 < 0.01 < colour_error(seen, light)
+    assert colour_error(seen, 1 - seen, lit=True) == pytest.approx(float(seen.var(0, unbiased=False).mean()))
 
 
 def test_codes_are_found_from_refined_cameras(monkeypatch):
@@ -337,8 +347,6 @@ def test_codes_are_found_from_refined_cameras(monkeypatch):
     found = HeldOutPoses(method, scene).camera(0)
     evaluate(method, scene, views=1)
     assert torch.equal(seen[-1], found.pose)
-    moved = aligning(scene.cameras[scene.splits["train"]], method.refined(scene.cameras[scene.splits["train"]]))
-    torch.testing.assert_close(seen[-2], scene.cameras[0].transformed(moved.matrix).pose)
 
 
 @pytest.mark.parametrize("name", [x for x in methods.available() if holds(methods.find(x).Config(), "refine_cameras")])
@@ -351,8 +359,8 @@ def test_every_method_that_refines_cameras_is_evaluated_with_its_poses(name):
     )
     assert held_out_poses(plain, scene) is None and held_out_poses(method, scene) is not None
     poses = PoseRefinement(len(scene))
-    error = method.colour_error(left_half(scene.photograph(0)))(poses, torch.Generator().manual_seed(0))
-    (gradient,) = torch.autograd.grad(error, [poses.twist])
+    pairs = method.colour_pairs(left_half(scene.photograph(0)))
+    (gradient,) = torch.autograd.grad(colour_error(*pairs(poses, torch.Generator().manual_seed(0))), [poses.twist])
     assert gradient[0].isfinite().all() and gradient[0].any() and not gradient[1:].any()
 
 

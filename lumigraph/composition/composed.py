@@ -22,13 +22,12 @@ from ..camera.crop import Crop
 from ..camera.rays import Look, Rays, Rendering, Samples
 from ..color.blending import over
 from ..components.clouds.moved_cloud import seen_from
-from ..components.training.pose_refinement import PoseRefinement
 from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined, splatting
 from ..geometry import Similarity
 from ..method import Method, RayMethod
-from ..method.capabilities import ColourError, HasDensity, HasGaussians, HasLooks, can
+from ..method.capabilities import ColourPairs, HasDensity, HasGaussians, HasLooks, can
 from ..method.controls import Control, Value
 from ..volume import composite, packed
 from .placed import Placed
@@ -188,16 +187,17 @@ class PickedCloud(Method):
     def near_plane(self) -> float:
         return NEAR_PLANE_SCALE * self.frame.near
 
-    def colour_error(self, photograph: Photograph) -> ColourError:
-        """Error of a photograph's colours as a function of its pose, over all of its trusted pixels."""
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
         photograph, cloud, background = photograph.to(self.device), self.gaussians(), self.background[0]
+        target = photograph.trusted(photograph.before(background))
 
-        def error(poses: PoseRefinement, generator: torch.Generator) -> Float[Tensor, ""]:
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
             moved, camera = seen_from(poses, cloud, photograph.camera)
             seen = splatting.splat(moved, splatting.view_of(camera, self.near_plane))
-            return photograph.error(over(seen.rgb, seen.opacity, background), background)
+            return photograph.trusted(over(seen.rgb, seen.opacity, background)), target
 
-        return error
+        return pairs
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("Gaussians that were picked from a cloud do not learn; resume the run they came from")

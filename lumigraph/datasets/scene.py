@@ -162,10 +162,9 @@ class Photograph:
         """The colours with a background behind what is not opaque."""
         return before(self.rgb, self.alpha, background)
 
-    def error(self, rgb: Float[Tensor, "height width 3"], background: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-        """Mean squared error of a picture at trusted pixels. background: of the picture"""
-        error = (rgb - self.before(background)).square()
-        return error.mean() if self.mask is None else error[self.mask].mean()
+    def trusted(self, picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "pixel 3"]:
+        """Colours of a picture of the same size at trusted pixels."""
+        return picture.flatten(0, 1) if self.mask is None else picture[self.mask]
 
     def sample_rays(self, count: int, generator: torch.Generator) -> Batch:
         """Random trusted pixels, without repetition; all where there are fewer; maybe none."""

@@ -25,7 +25,7 @@ from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined
 from ..method import Method
-from ..method.capabilities import ColourError
+from ..method.capabilities import ColourPairs
 from ..method.controls import Control, Value
 from ..method.ray_method import POSE_RAYS
 from .alignment import EXPOSURE, Asked, exposed
@@ -103,23 +103,23 @@ class InBlocks(Method):
             weights = nn.functional.one_hot(weights.argmax(), len(weights)).to(weights)
         return shares(weights)
 
-    def colour_error(self, photograph: Photograph) -> ColourError:
-        """Error of a photograph's colours as a function of its pose, over random trusted pixels, of blocks mixed by the
-        camera's distance."""
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at random trusted pixels, of blocks mixed by the camera's
+        distance; see `RefinesPoses`."""
         weights = self.weights(photograph.camera.to(self.device))
         chosen = (weights >= MIN_WEIGHT).nonzero()[:, 0]
         parts, share = [self.blocks[i] for i in chosen.tolist()], shares(weights[chosen]).tolist()
 
-        def error(poses: Any, generator: torch.Generator) -> Float[Tensor, ""]:
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
             batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)
             seen = [part.rendered_rays(poses(batch.rays)) for part in parts]
             rgb, opacity = (
                 torch.stack([w * getattr(x, name) for w, x in zip(share, seen, strict=True)]).sum(0)
                 for name in ("rgb", "opacity")
             )
-            return (over(rgb, opacity, self.background) - batch.before(self.background)).square().mean()
+            return over(rgb, opacity, self.background), batch.before(self.background)
 
-        return error
+        return pairs
 
     def _by_pixel(
         self, camera: Camera, chosen: Tensor, weights: Float[Tensor, " chosen"], seen: Sequence[Rendering]

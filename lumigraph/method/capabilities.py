@@ -72,9 +72,9 @@ class HasGaussians(Protocol):
         """The scene as a cloud, in the scene's frame."""
 
 
-# The mean squared error of colours at a photograph's trusted pixels, or at random ones of them, seen from where a
-# `PoseRefinement` moves its camera; differentiable in this.
-ColourError = Callable[[Any, torch.Generator], Tensor]
+# Colours at a photograph's trusted pixels, or at random ones of them, seen from where a `PoseRefinement` moves its
+# camera, and those of the photograph; differentiable in the pose.
+ColourPairs = Callable[[Any, torch.Generator], tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]]
 
 
 class RefinesPoses(Protocol):
@@ -82,8 +82,8 @@ class RefinesPoses(Protocol):
 
     poses: nn.Module | bool | None  # a `PoseRefinement`; True where the parts have them; None where none was asked for
 
-    def colour_error(self, photograph: Photograph) -> ColourError:
-        """Error of a photograph's colours as a function of its pose. RayMethods have it."""
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose, beside the photograph's. RayMethods have it."""
 
 
 class HasVisibility(Protocol):

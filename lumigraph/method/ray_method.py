@@ -14,10 +14,10 @@ from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Batch, Photograph, Scene
 from ..volume import composite
-from .capabilities import ColourError, HasLooks, needs
+from .capabilities import ColourPairs, HasLooks, needs
 from .method import Method
 
-POSE_RAYS = 1024  # of a photograph, from which the error of a pose is measured
+POSE_RAYS = 512  # of a photograph, from which the error of a pose is measured
 
 
 class RayMethod(Method):
@@ -65,15 +65,14 @@ class RayMethod(Method):
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
 
-    def colour_error(self, photograph: Photograph) -> ColourError:
-        """Error of a photograph's colours as a function of its pose, over random trusted pixels; see `RefinesPoses`."""
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at random trusted pixels; see `RefinesPoses`."""
 
-        def error(poses: Any, generator: torch.Generator) -> Float[Tensor, ""]:
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
             batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)
-            seen = self.render_rays(poses(batch.rays), self.background)
-            return (seen.rgb - batch.before(self.background)).square().mean()
+            return self.render_rays(poses(batch.rays), self.background).rgb, batch.before(self.background)
 
-        return error
+        return pairs
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

@@ -18,13 +18,13 @@ from ...color.blending import over
 from ...components.clouds.dense_points import compile_sweep, seen_points
 from ...components.clouds.moved_cloud import seen_from
 from ...components.fields.teacher import teacher_of
-from ...components.training.pose_refinement import PoseNumbers, PoseRefinement, poses_for
+from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
-from ...method.capabilities import ColourError
+from ...method.capabilities import ColourPairs
 from .adaptive import AdaptiveDensity, AdaptiveNumbers
 from .addition import Addition, Step
 from .appearance import AppearanceNumbers, SplatAppearance
@@ -282,17 +282,18 @@ class GaussianSplatting(Method):
             seen = replace(seen, rgb=rgb)
         return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
 
-    def colour_error(self, photograph: Photograph) -> ColourError:
-        """Error of a photograph's colours as a function of its pose, over all of its trusted pixels."""
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
         photograph, cloud = photograph.to(self.device), self.filtered()
+        target = photograph.trusted(photograph.before(self.background[0]))
 
-        def error(poses: PoseRefinement, generator: torch.Generator) -> Float[Tensor, ""]:
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
             moved, camera = seen_from(poses, cloud, photograph.camera)
             picture = splat(moved, view_of(camera, self.near_plane))
             seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
-            return photograph.error(seen.rgb, self.background[0])
+            return photograph.trusted(seen.rgb), target
 
-        return error
+        return pairs
 
     # Compression
 
