@@ -142,10 +142,10 @@ class Lit(Here):
         if arguments[0] == "eval":
             self.evaluations.append((log.stem, "--right-halves" in arguments))
             path = Path(arguments[1]) / "eval.json"
-            found = json.loads(path.read_text())
             if any(log.stem.endswith(f"seed{seed}") for seed in self.lit):
+                found = json.loads(path.read_text())
                 found["protocol"]["halves"] = LEFT_HALVES
-            path.write_text(json.dumps(found))
+                path.write_text(json.dumps(found))
         return code
 
 

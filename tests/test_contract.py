@@ -67,7 +67,8 @@ OWN = [name for name in NAMES if name.replace("-", "_") in METHODS]
 # Of lenses: the house's, not those of other tests; a batch of several kinds is of no kind of its own.
 KINDS = sorted(name for name, kind in Lens.kinds.items() if kind.__module__ == Lens.__module__ and name != "mixed")
 DOCS = Path(__file__).parent.parent / "docs" / "methods"
-# A few steps leave a scene half transparent: what counts as solid there, and how well cameras must agree on it.
+# A few steps leave a scene half transparent: what counts as solid there, and how well cameras must agree on it. Tests
+# with the constants that are shipped are in test_solid_exports.
 HALF_SOLID, HALF_AGREED = 0.5, 0.3
 
 pytestmark = [
