@@ -141,11 +141,12 @@ def test_geometry_does_not_depend_on_the_light(options):
 
 
 def test_the_light_of_a_photograph_is_found_on_its_left_half(taught):
-    """The right halves of held-out photographs, whose brightness the average cannot know, come out better."""
+    """The right halves of held-out photographs, whose brightness the average cannot know, come out better: by 1.85 dB
+    with this seed, by 0.84, 2.08, 1.92 and 1.79 dB with the next four."""
     method, scene = taught
     assert judged_by_halves(method) and not judged_by_halves(method.given(appearance="average"))
     average, halves = (evaluate(x, scene) for x in (method.given(appearance="average"), method))
-    assert halves.psnr > average.psnr + 0.9
+    assert halves.psnr > average.psnr + 1
     assert "left half" in halves.protocol["halves"] and average.protocol["halves"] is None
     assert halves.compared == "right halves of 3 test views"
     alone = evaluate(method.given(appearance="average"), scene, right_halves=True)
