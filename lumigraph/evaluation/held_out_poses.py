@@ -68,8 +68,8 @@ class HeldOutPoses:
         with frozen(self.method), torch.enable_grad():
             for step in range(STEPS):
                 optimizer.param_groups[0]["lr"] = poses.rate(step / STEPS)
-                error = colour_error(*pairs(poses, generator), lit)
-                (poses.twist.grad,) = torch.autograd.grad(error, [poses.twist])
+                seen, target = pairs(poses, generator)
+                (poses.twist.grad,) = torch.autograd.grad(colour_error(seen, target, lit), [poses.twist])
                 optimizer.step()
         return poses.refined(begin)
 

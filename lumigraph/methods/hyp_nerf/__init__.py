@@ -131,6 +131,7 @@ class HypNeRF(RayMethod):
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
     learning_rate = exponential_decay
+    up: Tensor
     efforts: ClassVar[Efforts] = {"draft": Effort(50, 2000), "good": Effort(300, 10_000), "best": Effort(1500, 50_000)}
 
     def __init__(self, frame: Frame, config: Any = None):
