@@ -17,7 +17,8 @@ import tyro
 from tyro.conf import Positional
 
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation.views import LIGHT_LAYER, in_light, judged_by_halves, left_half
+from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import LIGHT_LAYER, in_light
 from lumigraph.figures import Row, colour_depth, contact_sheet, depth_range
 from lumigraph.geometry import evenly
 from lumigraph.run import Run

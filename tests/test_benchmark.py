@@ -9,6 +9,7 @@ import signal
 import statistics
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from lumigraph.benchmark.conduct import Patience, conduct, draw_charts, launch, 
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
+from lumigraph.evaluation.halves import LEFT_HALVES, RIGHT_HALVES
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 20)
@@ -126,6 +128,62 @@ def test_a_cell_that_fails_is_a_row_that_says_why(cells, output, tmp_path):
         assert [row["failed"] for row in rows(output)] == [None, None, None, "it did not like the weather"]
     page = (output / "results.md").read_text()
     assert "| failed: it did not like the weather |" in page and f"| {rows(output)[0]['psnr']:.2f} |" in page
+
+
+class Lit(Here):
+    """The same, where the methods of some seeds find a code of each photograph on its left half."""
+
+    def __init__(self, *seeds: int):
+        super().__init__()
+        self.lit, self.evaluations = seeds, []
+
+    def __call__(self, arguments: Sequence[str], log: Path) -> int:
+        code = super().__call__(arguments, log)
+        if arguments[0] == "eval":
+            self.evaluations.append((log.stem, "--right-halves" in arguments))
+            path = Path(arguments[1]) / "eval.json"
+            if any(log.stem.endswith(f"seed{seed}") for seed in self.lit):
+                found = json.loads(path.read_text())
+                found["protocol"]["halves"] = LEFT_HALVES
+                path.write_text(json.dumps(found))
+        return code
+
+
+def test_all_methods_of_a_scene_are_compared_on_the_same_pixels(ball_folder, tmp_path):
+    """One that is judged by halves makes all of its scene be, also those of earlier commands; other scenes stay."""
+    early, plain, lit, late = (cell(ball_folder, seed=seed) for seed in range(4))
+    other = replace(early, scene="other", source=str(shutil.copytree(ball_folder, tmp_path / "other")))
+    output, here = tmp_path / "out", Lit(2)
+    assert conduct([other, early], SETTINGS, output, launch=here) == 0
+    assert conduct([plain, lit, late], SETTINGS, output, launch=here) == 0
+    expected = [
+        (other, False),
+        (early, False),
+        (plain, False),
+        (lit, False),
+        (late, True),
+        (early, True),
+        (plain, True),
+    ]
+    assert here.evaluations == [(one.name, halves) for one, halves in expected]
+    said = {row["run"]: row["protocol"]["halves"] for row in rows(output)}
+    assert said == {
+        f"runs/{one.name}": how
+        for one, how in (
+            (other, None),
+            (early, RIGHT_HALVES),
+            (plain, RIGHT_HALVES),
+            (lit, LEFT_HALVES),
+            (late, RIGHT_HALVES),
+        )
+    }
+    whole, halves = (row["psnr"] for row in rows(output)[:2])  # the same run, on other pixels
+    assert whole != halves
+    page = (output / "results.md").read_text()
+    assert "| halves | poses |" in page and "| right, codes from left | as captured |" in page
+    assert page.count("| whole | as captured |") == 2 and page.count("| right | as captured |") == 3
+    again = Lit(2)
+    assert conduct([other, early, plain, lit, late], SETTINGS, output, launch=again) == 0 and again.seen == []
 
 
 def test_a_damaged_run_stops_nothing(cells, output):

@@ -21,7 +21,7 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.views import judged_by_halves, left_half
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance

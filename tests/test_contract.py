@@ -67,7 +67,8 @@ OWN = [name for name in NAMES if name.replace("-", "_") in METHODS]
 # Of lenses: the house's, not those of other tests; a batch of several kinds is of no kind of its own.
 KINDS = sorted(name for name, kind in Lens.kinds.items() if kind.__module__ == Lens.__module__ and name != "mixed")
 DOCS = Path(__file__).parent.parent / "docs" / "methods"
-# A few steps leave a scene half transparent: what counts as solid there, and how well cameras must agree on it.
+# A few steps leave a scene half transparent: what counts as solid there, and how well cameras must agree on it. Tests
+# with the constants that are shipped are in test_solid_exports.
 HALF_SOLID, HALF_AGREED = 0.5, 0.3
 
 pytestmark = [
@@ -199,7 +200,7 @@ def fall(losses: list[float]) -> bool:
 
 def test_it_learns(taught, monkeypatch):
     """Its loss falls, where it has one, and it shows held-out photographs better than one that has learnt nothing."""
-    monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph, of methods that refine poses; 100 otherwise
+    monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph, of methods that refine poses; 200 otherwise
     losses = [row["loss"] for row in taught.straight.metrics() if "loss" in row]
     if losses and not fall(losses):  # as yet
         run = begin(taught.name, taught.data, taught.straight.folder.with_name("later"), taught.device)

@@ -40,7 +40,9 @@ def folder(tmp_path_factory):
 
 @pytest.mark.parametrize("data", [tiny.scene(), tiny_shapes.shapes(), tiny_collection.collection()])
 def test_all_kinds_keep_the_protocol(data):
-    assert isinstance(data, Dataset) and data.kind in ("photographs", "shapes", "a collection")
+    members = [name for name in (*vars(Dataset), *Dataset.__annotations__) if not name.startswith("_")]
+    assert "preview" in members and "kind" in members and all(hasattr(data, name) for name in members)
+    assert data.kind in ("photographs", "shapes", "a collection")
     assert set(data.splits) == {"train", "test"} and max(map(max, data.splits.values())) < len(data.names)
     camera = data.preview()
     assert len(camera) == 1 and abs(float(camera.position.norm()) - 2.8) < 0.5

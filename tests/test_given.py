@@ -17,12 +17,14 @@ from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.components.training.photometric import gain_between, spread_of_exposure
+from lumigraph.components.clouds.flat_view import FlatView
+from lumigraph.components.fields.development import decoded, encoded
+from lumigraph.components.training.photometric import brighter, gain_between, spread_of_exposure
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.views import judged_by_halves, left_half
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.export.film import animated
 from lumigraph.files.ranges import changed
 from lumigraph.method.controls import Control, moment
@@ -31,6 +33,7 @@ from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, build
 from lumigraph.synthetic.scenes import swing
 from lumigraph.training import fit
+from lumigraph.volume import composite
 
 SMALL = changed(
     Config(),
@@ -242,24 +245,27 @@ class QuickGains(InstantNGP):
         return [*others, gains]
 
 
-def test_gains_are_learnt_and_an_exposure_multiplies_as_they_do():
-    """Half as bright, in the photographs' own encoded colours, is one stop."""
+def test_gains_are_learnt_and_an_exposure_multiplies_light():
+    """Gains are of encoded colours, as photographs have them; a stop doubles the light."""
     scene = two_exposures()
     config = changed(SMALL, learning_rate=2e-2, samples_per_step=1024, steps_per_diagonal=24, exposure_correction="yes")
     method = build(QuickGains, scene.frame, config, torch.device("cpu"), 0)
     assert [control.name for control in method.controls] == ["exposure", "exposed_as"]
     fit(method, scene, steps=80, show=False)
     log_gain = method.exposure.log_gain.detach()
-    stops = log_gain.mean(-1) / math.log(2)
-    apart = stops[:6] - stops[6:]
+    doublings = log_gain.mean(-1) / math.log(2)
+    apart = doublings[:6] - doublings[6:]
     assert float(apart.mean()) == pytest.approx(1, abs=0.25) and apart.min() > 0.5
     camera = scene.cameras[0]
-    plain, darker, bright, dark, average = (
+    plain, bright, dark, average = (
         method.given(**given).render(camera).rgb
-        for given in ({}, {"exposure": -1}, {"exposed_as": 0}, {"exposed_as": "6"}, {"exposed_as": "average"})
+        for given in ({}, {"exposed_as": 0}, {"exposed_as": "6"}, {"exposed_as": "average"})
     )
     assert torch.equal(plain, method.render(camera).rgb)
-    assert torch.allclose(darker, plain / 2, atol=1e-6)
+    rays = camera.rays(camera.pixels())
+    points = rays.at(torch.full_like(rays.radius, tiny.DISTANCE - 0.6))
+    light, darker = (decoded(x.field(points, rays.directions)[1]) for x in (method, method.given(exposure=-1)))
+    torch.testing.assert_close(darker, light / 2)
     assert torch.allclose(dark, plain * log_gain[6].exp(), atol=1e-6)
     assert float(dark.mean() / bright.mean()) == pytest.approx(0.5, abs=0.12)
     assert torch.allclose(average, plain * log_gain.mean(0).exp(), atol=1e-6)
@@ -281,7 +287,7 @@ def test_exposures_are_told_apart_where_they_differ(generator):
     assert ngp(scene, exposure_correction="no").exposure is None
     stops = torch.tensor([0.0, 1.0]).repeat_interleave(6)
     assert spread_of_exposure(scene) == 0
-    assert spread_of_exposure(replace(scene, about={"exposure": 2**stops})) == pytest.approx(stops.std() / 2.2)
+    assert spread_of_exposure(replace(scene, about={"exposure": 2**stops})) == pytest.approx(stops.std())
     developed = {"exposure": 2**stops, "brightness": 2**-stops}
     assert spread_of_exposure(replace(scene, about=developed)) == pytest.approx(0, abs=1e-6)
 
@@ -306,11 +312,40 @@ def test_a_photographs_gain_is_found(generator):
 def test_the_background_is_not_exposed():
     scene = tiny.scene()  # before white
     method = ngp(scene, exposure_correction="yes")
-    camera = scene.cameras[0]
-    plain, brighter = (m.render(camera) for m in (method, method.given(exposure=1)))
-    behind = (1 - plain.opacity)[..., None]
-    assert torch.equal(plain.depth, brighter.depth)
-    assert torch.allclose(brighter.rgb - behind, 2 * (plain.rgb - behind), atol=1e-5)
+    rays = scene.cameras[0].rays(scene.cameras[0].pixels())
+    told = method.given(exposure=1)
+    with torch.no_grad():
+        (plain,), (look,) = (x.looks(rays) for x in (method, told))
+        seen, expected = (
+            told.render_rays(rays, method.background),
+            composite(plain.samples, plain.density, look.rgb, method.background),
+        )
+    torch.testing.assert_close(decoded(look.rgb), 2 * decoded(plain.rgb))
+    torch.testing.assert_close(seen.rgb, expected.rgb)
+    torch.testing.assert_close(seen.depth, expected.depth)
+
+
+def test_stops_are_of_light(generator):
+    """Photographs whose light differs by a factor of two, encoded as sRGB, are found to differ by one stop."""
+    rgb = 0.2 + 0.3 * torch.rand(64, 64, 3, generator=generator)
+    pose, intrinsics = torch.eye(4)[:3], torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]])
+    one, other = (FlatView(pose, intrinsics, encoded(light * decoded(rgb)), torch.ones(64, 64)) for light in (1.0, 2.0))
+    points = torch.cat([torch.rand(500, 2, generator=generator) - 0.5, torch.full((500, 1), 1.5)], -1)
+    torch.testing.assert_close(brighter(points, other, one), torch.ones(3), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["instant-ngp", "plenoxels", "rawnerf"])
+def test_an_exposure_is_the_same_control_in_all_methods(name):
+    """A stop doubles the light of every colour of the field. Block-NeRF's, which is learnt, counts the same stops."""
+    kind = methods.find(name)
+    method = build(kind, tiny.scene().frame, kind.smallest(), torch.device("cpu"), 0).eval()
+    (control,) = [x for x in method.controls if x.name == "exposure"]
+    assert (control.unit, control.default, control.about) == ("stops", 0.0, "Each stop doubles the light.")
+    points = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    directions = torch.nn.functional.normalize(points, dim=-1)
+    light, less = (decoded(x.field(points, directions)[1]) for x in (method, method.given(exposure=-1)))
+    assert light.max() < 1 and light.min() > 0
+    torch.testing.assert_close(less, light / 2, atol=1e-6, rtol=1e-4)
 
 
 def test_methods_without_corrections_offer_nothing_and_leave_cameras():

@@ -210,6 +210,63 @@ def room_arrows(sources: dict[str, str]) -> dict[str, set[str]]:
     return inner_arrows(named, {module for module in named if any(m.startswith(module + ".") for m in named)})
 
 
+def value_protocols(source: str) -> set[str]:
+    """Names of the protocols of a source file that have values beside functions: annotations or properties."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ClassDef) and any(ast.unparse(base).startswith("Protocol") for base in node.bases):
+            properties = [x for x in node.body if isinstance(x, ast.FunctionDef) and x.decorator_list]
+            if properties or any(isinstance(x, ast.AnnAssign) for x in node.body):
+                found.add(node.name)
+    return found
+
+
+def asked_by_isinstance(source: str, names: set[str]) -> set[str]:
+    """The names among these that a source file gives to `isinstance` or `issubclass`."""
+    calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call) and len(node.args) == 2]
+    kinds = [x.args[1] for x in calls if isinstance(x.func, ast.Name) and x.func.id in ("isinstance", "issubclass")]
+    return {x.id if isinstance(x, ast.Name) else x.attr for kind in kinds for x in ast.walk(kind)
+            if isinstance(x, ast.Name | ast.Attribute)} & names  # fmt: skip
+
+
+def test_no_protocol_with_values_is_asked_by_isinstance():
+    """From Python 3.12 on, `isinstance` looks for a protocol's values by `inspect.getattr_static`, which does not see
+    an `nn.Module`'s submodules and parameters."""
+    sources = [path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")]
+    names = set().union(*map(value_protocols, sources))
+    assert {"RefinesPoses", "HasExposure", "HasAppearance", "Dataset", "Lesson"} <= names
+    places = [path for folder in ("lumigraph", "tests", "benchmarks") for path in (ROOT / folder).rglob("*.py")]
+    found = {path.name: asked for path in places if (asked := asked_by_isinstance(path.read_text("utf-8"), names))}
+    assert not found, f"{found}: `capabilities.can` sees submodules too"
+
+
+def test_a_protocol_with_values_is_noticed():
+    source = """
+class Plain(Protocol):
+    def go(self): ...
+class Valued(Protocol[T]):
+    poses: int
+class Lazy(Protocol):
+    @property
+    def poses(self): ...
+class Data:
+    poses: int
+"""
+    assert value_protocols(source) == {"Valued", "Lazy"}
+    names = {"Valued", "Lazy"}
+    assert asked_by_isinstance("isinstance(x, (int, m.Valued)) or issubclass(y, Lazy | None)", names) == names
+    assert asked_by_isinstance("can(x, Valued); isinstance(Lazy, type)", names) == set()
+
+
+def test_capabilities_refuse_isinstance():
+    from lumigraph.method import capabilities
+
+    assert len(capabilities.LACKING) > 10
+    for capability in capabilities.LACKING:
+        with pytest.raises(TypeError, match="runtime_checkable"):
+            isinstance(object(), capability)
+
+
 KERNEL = {  # what each file of a kernel's folder defines
     "__init__.py": {
         "FACTS": "its unit, its outputs, its differentiable inputs, its typical case",

@@ -163,10 +163,22 @@ def test_parts_of_photographs_and_cameras_around():
     rays, picture = patch(photograph, tiny.scene().frame, torch.Generator().manual_seed(0))
     assert picture.shape == (24, 24, 3) and len(rays) == 24 * 24
     torch.testing.assert_close(rays.directions, photograph.camera.rays(photograph.camera.pixels()).directions)
-    for camera in around(photograph.camera, tiny.scene().frame, 3):
+    for camera in around(photograph.camera, tiny.scene().frame, 3, torch.tensor([0.0, 0.0, 1.0])):
         assert float(camera.position.norm()) == pytest.approx(float(photograph.camera.position.norm()), rel=1e-5)
         pixel, visible = camera.project(torch.zeros(1, 3))
         assert visible.all() and torch.allclose(pixel, camera.size / 2, atol=1e-3)
+
+
+def test_cameras_stand_around_the_up_of_the_collection():
+    """Members in a frame whose up is +y, as many files have it."""
+    turn = torch.tensor([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z to y
+    scene = replace(tiny.scene(), cameras=tiny.scene().cameras.transformed(turn))
+    method = hyp_nerf()
+    method.begin(Collection.of({"a": scene, "b": scene}, "lying"))
+    torch.testing.assert_close(method.up, torch.tensor([0.0, 1.0, 0.0]), atol=0.05, rtol=0)
+    for camera in around(scene.cameras[0], scene.frame, 4, method.up):
+        assert 0.3 < float(camera.position[0] @ method.up) / float(camera.position.norm()) < 0.75
+        assert float(camera.pose[0, :, 1] @ method.up) < -0.6 and abs(float(camera.pose[0, :, 0] @ method.up)) < 1e-5
 
 
 def test_more_members_than_codes_and_places_without_bounds_are_refused():

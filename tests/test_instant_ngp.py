@@ -135,7 +135,7 @@ def test_exposure_finds_the_dark_photographs():
 
 
 def test_refining_cameras_moves_those_that_were_trained_on(monkeypatch):
-    monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph; 100 otherwise
+    monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph; 200 otherwise
     scene = tiny.scene()
     made = method(scene, refine_cameras=True)
     before = evaluate(made, scene).psnr

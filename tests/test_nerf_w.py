@@ -16,7 +16,7 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.views import judged_by_halves, left_half
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.method.controls import Control
@@ -141,15 +141,16 @@ def test_geometry_does_not_depend_on_the_light(options):
 
 
 def test_the_light_of_a_photograph_is_found_on_its_left_half(taught):
-    """The right halves of held-out photographs, whose brightness the average cannot know, come out better."""
+    """The right halves of held-out photographs, whose brightness the average cannot know, come out better: by 1.85 dB
+    with this seed, by 0.84, 2.08, 1.92 and 1.79 dB with the next four."""
     method, scene = taught
     assert judged_by_halves(method) and not judged_by_halves(method.given(appearance="average"))
     average, halves = (evaluate(x, scene) for x in (method.given(appearance="average"), method))
-    assert halves.psnr > average.psnr + 0.9
+    assert halves.psnr > average.psnr + 1
     assert "left half" in halves.protocol["halves"] and average.protocol["halves"] is None
     assert halves.compared == "right halves of 3 test views"
     alone = evaluate(method.given(appearance="average"), scene, right_halves=True)
-    assert alone.compared == halves.compared and "nothing is told" in alone.protocol["halves"]
+    assert alone.compared == halves.compared and "no code is found" in alone.protocol["halves"]
     assert alone.psnr != average.psnr and halves.psnr > alone.psnr + 1
     shot = scene.photograph(0)
     found, again = (method.given(left_half(shot)) for _ in range(2))

@@ -10,6 +10,7 @@ import tiny
 import torch
 from budgets import budget
 
+from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
 from lumigraph.datasets.scene import Frame
@@ -146,9 +147,20 @@ def test_the_noun_holds_what_the_leaves_hold():
 # Baking
 
 
+def colour_error(ball: PlenOctrees, camera: Camera) -> float:
+    """Mean absolute error of the ball's colours inside its silhouette, at the depth that is rendered."""
+    seen, rays = ball.render(camera), camera.rays(camera.pixels())
+    across = rays.origins - (rays.origins * rays.directions).sum(-1, keepdim=True) * rays.directions
+    within = across.norm(dim=-1) < 0.35
+    depth = seen.depth.flatten()
+    assert depth[within].isfinite().all()
+    expected = Ball().field(rays.at(depth)[within], rays.directions[within])[1]
+    return float((seen.rgb.view(-1, 3)[within] - expected).abs().mean())
+
+
 def test_a_ball_looks_baked_as_it_does_itself(ball):
-    """Seen from a camera that took part: its silhouette within a cell, its colours within what bands of two hold and
-    what shows through leaves that it only half fills."""
+    """Seen from a camera that took part: its silhouette within a cell. From all of them: its colours within what bands
+    of two hold and what shows through leaves that it only half fills."""
     assert ball.baked and ball.teacher_sampler is None and len(ball.leaves) > 100
     camera = tiny.scene().cameras[1]
     seen, rays = ball.render(camera), camera.rays(camera.pixels())
@@ -156,12 +168,8 @@ def test_a_ball_looks_baked_as_it_does_itself(ball):
     within = across.norm(dim=-1)
     opacity = seen.opacity.flatten()
     assert (opacity[within < 0.4] > 0.95).all() and (opacity[within > 0.65] < 0.01).all()
-    depth = seen.depth.flatten()[within < 0.35]
-    points = (rays.origins + seen.depth.flatten()[:, None] * rays.directions)[within < 0.35]
-    expected = Ball().field(points, rays.directions[within < 0.35])[1]
-    assert depth.isfinite().all()
-    # measured: 0.043 from this camera, 0.028 to 0.047 from all twelve
-    assert (seen.rgb.view(-1, 3)[within < 0.35] - expected).abs().mean() < 0.045
+    errors = [colour_error(ball, tiny.scene().cameras[i]) for i in range(len(tiny.scene()))]
+    assert max(errors) < 0.05 and sum(errors) / len(errors) < 0.04, errors  # measured: 0.028 to 0.047, mean 0.036
     nearest = -(rays.origins * rays.directions).sum(-1) - (0.25 - within**2).clamp_min(0).sqrt()
     surface = rays.origins + nearest[:, None] * rays.directions
     exact = torch.where((within < 0.5)[:, None], Ball().field(0.999 * surface, rays.directions)[1], ball.background)

@@ -76,6 +76,22 @@ def test_exposures_are_known_and_what_they_lack_is_learnt(night, begun):
         method.log_scale.data.zero_()
 
 
+def test_the_background_is_exposed_with_what_is_before_it(night):
+    """Before a colour other than black a photograph that shows nothing else measures it by its exposure, and
+    development shows it as it is; behind alpha it is put in afterwards."""
+    frame = replace(night.frame, background=(0.2, 0.5, 0.8))
+    method = RawNeRF(frame, replace(RawNeRF.smallest(), epsilon=1e-3))
+    method.begin(replace(night, frame=frame))
+    batch = batch_of(night, [0.1] * len(night), [0] * len(night), list(range(len(night))))
+    behind = method.light_behind(batch)
+    per_second = behind / method.exposure[:, None]
+    assert method.exposure.min() < 0.1
+    torch.testing.assert_close(per_second, per_second[:1].expand(len(night), 3))
+    torch.testing.assert_close(method.linear(per_second)[:1], decoded(torch.tensor([[0.2, 0.5, 0.8]])))
+    photographs = replace(batch, alpha=torch.zeros(len(night)), extra={})
+    torch.testing.assert_close(method.light_behind(photographs), decoded(method.background))
+
+
 def test_unknown_exposures_become_gains(night):
     blind = replace(night, about={k: v for k, v in night.about.items() if k not in ("exposure", "brightness")})
     method = RawNeRF(night.frame, RawNeRF.smallest())

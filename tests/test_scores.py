@@ -6,7 +6,9 @@ import dataclasses
 import functools
 import json
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import tiny
 import tiny_collection
@@ -20,10 +22,14 @@ from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes
 from lumigraph.evaluation.report import write_report
+from lumigraph.evaluation.run import joined_shapes
+from lumigraph.evaluation.shapes import ShapeScore, ShapesEvaluation
 from lumigraph.metrics import Score, chamfer_distance, intersection_over_union, named, normal_consistency, scores_of
 from lumigraph.run import Run, build
 from lumigraph.training import fit
@@ -141,6 +147,28 @@ def test_a_member_of_a_collection_is_told_of_before_it_is_compared():
     assert names == [f"amber/ball_{i}" for i in (0, 4, 8)] == [view.name for view in told.views]
     assert told.psnr > alone.psnr + 1 and told.protocol["members"] == 1
     assert evaluate_collection(method, data, "train", views=1).protocol["views"] == 3
+
+
+def test_members_count_the_same_however_many_views_they_have():
+    """A member of one view beside one of three: the mean is of members, by resolution as well."""
+    method, ball = tiny.method(), tiny.scene()
+    fewer = replace(ball, splits=ball.splits | {"test": ball.splits["test"][:1]})
+    blank = replace(ball, images=ImageStore.from_arrays([np.zeros((tiny.SIZE, tiny.SIZE, 4), np.uint8)] * len(ball)))
+    members = {"a": ball, "b": fewer, "c": blank}
+    of_each = [evaluate(method, members[name]) for name in "bc"]
+    data = replace(Collection.of(members, "balls"), splits={"test": torch.tensor([1, 2])})
+    found = evaluate_collection(method, data)
+    assert len(found.views) == 4 and abs(of_each[0].psnr - of_each[1].psnr) > 1
+    for name in ("psnr", "ssim"):
+        mean = (getattr(of_each[0], name) + getattr(of_each[1], name)) / 2
+        assert getattr(found, name) == pytest.approx(mean)
+        assert found.to_json()[name] == found.by_resolution["24x24"].means()[name] == pytest.approx(mean)
+    assert found.protocol["psnr"] == "per view, averaged by member, then over all"
+    some = [ShapeScore(str(i), 0.1, 0.1, 0.1, iou, None) for i, iou in enumerate((0.9, 0.7, 0.2))]
+    parts = {
+        name: ShapesEvaluation(x, {"shapes": len(x), "of": 4}, {}) for name, x in (("a", some[:2]), ("b", some[2:]))
+    }
+    assert named(joined_shapes(parts, {"members": 2}).scores, "IoU").value == pytest.approx((0.8 + 0.2) / 2)
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.views import judged_by_halves, left_half
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.methods.gaussian_splatting import GaussianSplatting
 from lumigraph.methods.gaussian_splatting.appearance import (

@@ -137,13 +137,16 @@ def reduced(source: str, downscale: int | None) -> int | None:
     return None if request is not None and is_category(request) else downscale
 
 
-def evaluation(cell: Cell, folder: Path, settings: CellSettings) -> list[str]:
-    """Arguments of `lumigraph` that evaluate the cell; empty if that is done."""
-    if evaluated(folder, settings):
+def evaluation(folder: Path, settings: CellSettings, halves: bool = False) -> list[str]:
+    """Arguments of `lumigraph` that evaluate a cell; empty if that is done.
+
+    halves: compare right halves alone, because another method of the scene is judged by them
+    """
+    if evaluated(folder, settings, halves):
         return []
     weights = ["--lpips", *map(str, settings.lpips)] if settings.lpips else []
     told = {"--views": settings.eval_views, "--device": settings.device}
-    return ["eval", str(folder), "--save-images", *options(told), *weights]
+    return ["eval", str(folder), "--save-images", *(["--right-halves"] if halves else []), *options(told), *weights]
 
 
 def options(told: dict[str, Any]) -> list[str]:
@@ -160,8 +163,8 @@ def trained(folder: Path) -> bool:
     return run.has_state and Budget.from_json(run.settings.budget).progress(run.state.step, run.state.seconds) >= 1
 
 
-def evaluated(folder: Path, settings: CellSettings) -> bool:
-    """True if a run's latest state was evaluated with these settings."""
+def evaluated(folder: Path, settings: CellSettings, halves: bool = False) -> bool:
+    """True if a run's latest state was evaluated with these settings, with `halves` on right halves of photographs."""
     run = Run(folder)
     result = run.evaluation()
     if result is None or result["steps"] != run.state.step:
@@ -172,7 +175,7 @@ def evaluated(folder: Path, settings: CellSettings) -> bool:
     if "views" not in protocol:
         return protocol.get("shapes") == wanted
     kept = (folder / "eval").is_dir() and (result["lpips"] is not None or not settings.lpips)
-    return kept and protocol["views"] == wanted
+    return kept and protocol["views"] == wanted and (bool(protocol.get("halves")) or not halves)
 
 
 @dataclass(frozen=True)
@@ -267,18 +270,21 @@ def row_of(cell: Cell, output: Path, settings: CellSettings, failure: str | None
     if failure:
         return row
     run = Run(folder)
-    result = run.evaluation() or {}
     figure = published(cell.method, cell.scene) if cell.views is None and settings.scales == 1 else None
-    row |= {name: result[name] for name in MEASURED if name in result}
-    row |= {
+    return row | {
         "train_views": run.settings.splits.get("train", 0) // settings.scales,
         "model_bytes": run.model_bytes,
         "published": figure and asdict(figure),
+        **scored(run, settings),
     }
+
+
+def scored(run: Run, settings: CellSettings) -> Row:
+    """Columns of a row that its evaluation gives."""
+    result = run.evaluation() or {}
+    row = {name: result[name] for name in (*MEASURED, "by_resolution") if name in result}
     if (views := result.get("views")) and "members" not in result["protocol"]:
         row["shown"] = views[len(views) // 2 // settings.scales]  # at full size
-    if "by_resolution" in result:
-        row["by_resolution"] = result["by_resolution"]
     return row
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,8 @@ from ..metrics import scores_of
 from ..run import Run
 from ..system.progress import clock, counting
 from ..system.signals import Interrupt, start
-from .cell import SHEET, Cell, CellSettings, Row, claim, evaluation, read_rows, row_of, training
-from .table import markdown, over_time, over_views, places, resolution
+from .cell import SHEET, Cell, CellSettings, Row, claim, evaluation, read_rows, row_of, scored, training
+from .table import markdown, over_time, over_views, places, resolution, together
 
 Launch = Callable[[Sequence[str], Path], int]
 STOP_CODES = (130, 143)  # after Ctrl-C and SIGTERM
@@ -95,12 +96,13 @@ def carry_on(
     """All cells, one after the other, in a folder that is ours alone."""
     rows, patience = read_rows(output), Patience()
     for number, cell in enumerate(cells, 1):
-        todo = [one for one in cells[number - 1 :] if unfinished(one, output, settings)]
+        halved = by_halves(rows)
+        todo = [one for one in cells[number - 1 :] if unfinished(one, output, settings, halved)]
         if cell in todo:
             tell(f"{number} of {len(cells)}: {cell.title}; {patience.left(todo)}")
         begin = time.monotonic()
         with counting(cell.title):
-            code, failure = carry_out(cell, output, settings, launch)
+            code, failure = carry_out(cell, output, settings, halved, launch)
         if code in STOP_CODES:
             return code
         if cell in todo and not failure:
@@ -108,21 +110,32 @@ def carry_on(
         if failure:
             tell(f"{cell.title} failed: {failure}")
         rows[f"runs/{cell.name}"] = row_of(cell, output, settings, failure)
-        found = list(rows.values())
-        files.write_json(output / "results.json", {"settings": settings.to_json(), "cells": found}, "benchmark")
-        files.write_bytes(output / "results.md", markdown(found, draw_charts(found, output)).encode(), "benchmark")
+        write(rows, output, settings)
+    code = compare_alike(rows, output, settings, tell, launch)
+    write(rows, output, settings)
+    if code:
+        return code
     found = list(rows.values())
     pictures = draw_charts(found, output) + draw_views(found, output)
     files.write_bytes(output / "results.md", markdown(found, pictures).encode(), "benchmark")
     return 0
 
 
-def carry_out(cell: Cell, output: Path, settings: CellSettings, launch: Launch) -> tuple[int, str | None]:
+def write(rows: dict[str, Row], output: Path, settings: CellSettings) -> None:
+    """Write results.json, and results.md with the charts."""
+    found = list(rows.values())
+    files.write_json(output / "results.json", {"settings": settings.to_json(), "cells": found}, "benchmark")
+    files.write_bytes(output / "results.md", markdown(found, draw_charts(found, output)).encode(), "benchmark")
+
+
+def carry_out(
+    cell: Cell, output: Path, settings: CellSettings, halved: set[str], launch: Launch
+) -> tuple[int, str | None]:
     """Train and evaluate a cell as far as that is not done. Returns the last exit code, and why it failed if it did."""
     folder, log = output / "runs" / cell.name, log_of(cell, output)
-    for task in (training, evaluation):
+    for task in tasks(cell, folder, settings, halved):
         try:
-            command = task(cell, folder, settings)
+            command = task()
         except LumigraphError as fault:
             return 2, str(fault)
         code = launch(command, log) if command else 0
@@ -131,14 +144,46 @@ def carry_out(cell: Cell, output: Path, settings: CellSettings, launch: Launch) 
     return 0, None
 
 
+def tasks(cell: Cell, folder: Path, settings: CellSettings, halved: set[str]) -> list[Callable[[], list[str]]]:
+    """Functions that give the commands of a cell: its training, then its evaluation."""
+    halves = (cell.collection or cell.scene) in halved
+    return [partial(training, cell, folder, settings), partial(evaluation, folder, settings, halves)]
+
+
+def by_halves(rows: dict[str, Row]) -> set[str]:
+    """Scenes and collections of which some cell was judged by halves of photographs."""
+    return {together(row) for row in rows.values() if not row["failed"] and row["protocol"].get("halves")}
+
+
+def compare_alike(
+    rows: dict[str, Row], output: Path, settings: CellSettings, tell: Callable[[str], object], launch: Launch
+) -> int:
+    """Evaluate cells again whose scenes are judged by halves since, earlier commands' among them, so that all methods
+    of a scene are compared on the same pixels. Changes the rows. Returns the signal's exit code if one stopped it,
+    otherwise 0."""
+    halved = by_halves(rows)
+    for name, row in rows.items():
+        if row["failed"] or together(row) not in halved or row["protocol"].get("halves") or "shapes" in row["protocol"]:
+            continue
+        tell(f"{name} once more, on right halves, as other methods of {together(row)}")
+        log = output / f"{name}.log"
+        try:
+            code = launch(evaluation(output / name, settings, True), log)
+            if code in STOP_CODES:
+                return code
+            row |= {"failed": reason(log, code)} if code else scored(Run(output / name), settings)
+        except LumigraphError as fault:
+            row["failed"] = str(fault)
+    return 0
+
+
 def log_of(cell: Cell, output: Path) -> Path:
     return output / "runs" / f"{cell.name}.log"
 
 
-def unfinished(cell: Cell, output: Path, settings: CellSettings) -> bool:
-    folder = output / "runs" / cell.name
+def unfinished(cell: Cell, output: Path, settings: CellSettings, halved: set[str]) -> bool:
     try:
-        return bool(training(cell, folder, settings) or evaluation(cell, folder, settings))
+        return any(task() for task in tasks(cell, output / "runs" / cell.name, settings, halved))
     except LumigraphError:  # a damaged run, which the cell's row will tell
         return True
 

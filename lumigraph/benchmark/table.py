@@ -10,6 +10,8 @@ from typing import Any
 
 from .. import methods
 from ..budget import Budget
+from ..evaluation.halves import LEFT_HALVES
+from ..evaluation.views import CAPTURED_POSES
 from ..figures.charts import COLOURS, Series
 from ..metrics import named, scores_of
 from .cell import FEW_VIEW_FIGURES, MEMBERS, Row, duration
@@ -27,7 +29,9 @@ def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
         full_table(rows),
         "PSNR in dB and SSIM are means over held-out views, larger is better; LPIPS (AlexNet), smaller is better. "
         "Of shapes, IoU and normal consistency are better when larger, chamfer-L1 (tenths of the longest side) when "
-        "smaller. Training is without compiling, which happens on first use. Memory is the training process's peak, "
+        "smaller. Where a method of a scene finds codes of photographs on their left halves, all methods of that scene "
+        "are compared on right halves; poses that were refined are found on left halves of held-out photographs. "
+        "Training is without compiling, which happens on first use. Memory is the training process's peak, "
         "on a GPU that of its tensors. Published figures follow their own protocols and are no figures of ours.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -68,6 +72,7 @@ def short_table(rows: Sequence[Row]) -> str:
         "views": lambda group: str(group[0]["train_views"]),
         "trained for": lambda group: trained_for(group[0]),
         **{name: partial(mean_score, name) for name in score_names(rows)},
+        **{name: partial(shared, value) for name, value in PROTOCOL.items()},
         "s/view": lambda group: spread([row.get("seconds_per_view") for row in group[:1]], ".2g"),
         "memory": lambda group: size(max(row["peak_memory"] for row in group)),
         "model": lambda group: size(max(row["model_bytes"] for row in group)),
@@ -95,10 +100,32 @@ FIGURES: dict[str, Callable[[Row], str]] = {
 }
 
 
+def halves(row: Row) -> str:
+    """Pixels of photographs that are compared."""
+    if "views" not in row["protocol"]:
+        return NONE
+    how = row["protocol"].get("halves")
+    return "whole" if not how else "right, codes from left" if how == LEFT_HALVES else "right"
+
+
+def poses(row: Row) -> str:
+    """Origin of the cameras that photographs are compared from."""
+    how = row["protocol"].get("poses")
+    return NONE if not how else "as captured" if how == CAPTURED_POSES else "refined"
+
+
+PROTOCOL: dict[str, Callable[[Row], str]] = {"halves": halves, "poses": poses}
+
+
+def shared(value: Callable[[Row], str], group: list[Row]) -> str:
+    """Value that rows share; all of them where they differ."""
+    return " / ".join(dict.fromkeys(map(value, group)))
+
+
 def full_table(rows: Sequence[Row]) -> str:
     """One line for each cell. One that failed says why where its protocol would stand."""
     names = score_names([row for row in rows if not row["failed"]])
-    columns: dict[str, Callable[[Row], str]] = {name: partial(score_in, name) for name in names} | FIGURES
+    columns: dict[str, Callable[[Row], str]] = {name: partial(score_in, name) for name in names} | FIGURES | PROTOCOL
     lines = []
     for row in in_order(rows):
         figures = [NONE if row["failed"] else value(row) for value in columns.values()]

@@ -20,12 +20,14 @@ from torch import Tensor, nn
 from ..camera import Camera
 from ..camera.crop import Crop
 from ..camera.rays import Look, Rays, Rendering, Samples
-from ..datasets.scene import Frame
+from ..color.blending import over
+from ..components.clouds.moved_cloud import seen_from
+from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined, splatting
 from ..geometry import Similarity
 from ..method import Method, RayMethod
-from ..method.capabilities import HasDensity, HasGaussians, HasLooks, can
+from ..method.capabilities import ColourPairs, HasDensity, HasGaussians, HasLooks, can
 from ..method.controls import Control, Value
 from ..volume import composite, packed
 from .placed import Placed
@@ -162,10 +164,11 @@ def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: 
 
 
 class PickedCloud(Method):
-    """A cloud as it is: it renders, and does not learn."""
+    """A cloud as it is: it renders, and does not learn. refined: whether it was learnt with poses"""
 
-    def __init__(self, frame: Frame, gaussians: Gaussians):
+    def __init__(self, frame: Frame, gaussians: Gaussians, refined: bool = False):
         super().__init__(frame, None)
+        self.poses = True if refined else None
         self._antialiased = gaussians.antialiased
         self._names = [field.name for field in fields(gaussians) if field.name != "antialiased"]
         for name in self._names:
@@ -178,8 +181,23 @@ class PickedCloud(Method):
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
-        near = NEAR_PLANE_SCALE * self.frame.near
-        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
+        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, self.near_plane)
+
+    @property
+    def near_plane(self) -> float:
+        return NEAR_PLANE_SCALE * self.frame.near
+
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
+        photograph, cloud, background = photograph.to(self.device), self.gaussians(), self.background[0]
+        target = photograph.trusted(photograph.before(background))
+
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
+            moved, camera = seen_from(poses, cloud, photograph.camera)
+            seen = splatting.splat(moved, splatting.view_of(camera, self.near_plane))
+            return photograph.trusted(over(seen.rgb, seen.opacity, background)), target
+
+        return pairs
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("Gaussians that were picked from a cloud do not learn; resume the run they came from")

@@ -18,7 +18,7 @@ from ..gaussians import Gaussians
 from ..gaussians.cloud import cleaned
 from ..geometry import Similarity
 from ..method import Method
-from ..method.capabilities import HasDensity, HasGaussians, HasLooks, needs
+from ..method.capabilities import HasDensity, HasGaussians, HasLooks, RendersRays, needs
 from ..method.controls import Value
 
 MAX_REACH = 64.0
@@ -76,6 +76,12 @@ class Placed:
         there = rays.at(seen.depth.reshape(-1).nan_to_num(0, 0, 0))
         opacity = seen.opacity * self._holds(there).view(seen.opacity.shape)
         return Rendering(rgb, seen.depth * self.place.scale, opacity)
+
+    def rendered_rays(self, rays: Rays) -> Rendering:
+        """Rendering of rays of the picture by a RayMethod, over black and without its crop."""
+        background = torch.zeros(1, 3, device=rays.origins.device)
+        seen = needs(self.method, RendersRays).render_rays(self._inward(rays, 0.0), background)
+        return replace(seen, depth=seen.depth * self.place.scale)
 
     def given(self, controls: dict[str, Value]) -> Placed:
         """The same part, told those of the controls that its method has and a composition shows."""

@@ -45,7 +45,7 @@ class Collection:
     def of(members: Mapping[str, Dataset | Callable[[], Dataset]], source: str = "") -> Collection:
         """Build from datasets, or functions that open them, by name; hold out every 8th, starting with the first."""
         names = sorted(members, key=natural)
-        ready = {name: x for name, x in members.items() if isinstance(x, Dataset)}
+        ready = {name: x for name, x in members.items() if not callable(x)}
         openers = {name: opener_of(members[name]) for name in names}
         return Collection(openers, splits_of(len(names)), source, ready)
 
@@ -135,4 +135,4 @@ def skipped(name: str, fault: str) -> str:
 
 
 def opener_of(member: Dataset | Callable[[], Dataset]) -> Callable[[], Dataset]:
-    return (lambda: member) if isinstance(member, Dataset) else member
+    return member if callable(member) else (lambda: member)

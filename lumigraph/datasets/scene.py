@@ -162,6 +162,19 @@ class Photograph:
         """The colours with a background behind what is not opaque."""
         return before(self.rgb, self.alpha, background)
 
+    def trusted(self, picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "pixel 3"]:
+        """Colours of a picture of the same size at trusted pixels."""
+        return picture.flatten(0, 1) if self.mask is None else picture[self.mask]
+
+    def sample_rays(self, count: int, generator: torch.Generator) -> Batch:
+        """Random trusted pixels, without repetition; all where there are fewer; maybe none."""
+        trusted = torch.ones(len(self), dtype=torch.bool) if self.mask is None else self.mask.flatten()
+        there = trusted.nonzero()[:, 0]
+        chosen = there[torch.randperm(len(there), generator=generator)[:count]]
+        rays = self.camera.rays(self.camera.pixels()[chosen])
+        alpha = None if self.alpha is None else self.alpha.flatten()[chosen]
+        return Batch(rays, self.rgb.flatten(0, 1)[chosen], alpha)
+
     def to(self, device: torch.device | str) -> Photograph:
         rgb, alpha, mask = (None if x is None else x.to(device) for x in (self.rgb, self.alpha, self.mask))
         assert rgb is not None

@@ -60,12 +60,12 @@ def evaluate_on(
 
     keep: receives each view's name and rendering, where views are compared
     most: so many views or shapes at most, evenly spread; None means all
-    right_halves: of a Scene, compare those alone, whatever the method
+    right_halves: of photographs, compare those alone, whatever the method
     """
     if isinstance(data, Shapes):
         return evaluate_shapes(method, data, split, most)
     if isinstance(data, Collection):
-        return evaluate_collection(method, data, split, keep, most, lpips)
+        return evaluate_collection(method, data, split, keep, most, lpips, right_halves)
     assert isinstance(data, Scene)
     return evaluate(method, data, split, keep, most, lpips, right_halves)
 
@@ -132,6 +132,7 @@ def evaluate_collection(
     keep: Keep = lambda name, rendering: None,
     views: int | None = None,
     lpips: Lpips | None = None,
+    right_halves: bool = False,
 ) -> Evaluation | ShapesEvaluation:
     """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
 
@@ -147,7 +148,7 @@ def evaluate_collection(
             def keep_of(view: str, seen: Rendering, name: str = name) -> object:
                 return keep(f"{name}/{view}", seen)
 
-            scenes[name] = evaluate(told, member, "test", keep_of, views, lpips)
+            scenes[name] = evaluate(told, member, "test", keep_of, views, lpips, right_halves)
         elif isinstance(member, Shapes):
             shapes[name] = evaluate_shapes(told, member, "test", views)
     if scenes and shapes:
@@ -156,18 +157,23 @@ def evaluate_collection(
     return joined_views(scenes, members) if scenes else joined_shapes(shapes, members)
 
 
-def joined_views(parts: dict[str, Evaluation], members: dict[str, Any]) -> Evaluation:
+def joined_views(parts: dict[str, Evaluation], about_members: dict[str, Any]) -> Evaluation:
     views = [replace(view, name=f"{name}/{view.name}") for name, part in parts.items() for view in part.views]
     shown = {f"{name}/{view}": seen for name, part in parts.items() for view, seen in list(part.shown.items())[:2]}
     sizes = list(dict.fromkeys(view.resolution for view in views))
     counts = {key: sum(part.protocol[key] for part in parts.values()) for key in ("views", "of")}
-    about = next(iter(parts.values())).protocol | members | counts
-    about["resolution"] = sizes[0] if len(sizes) == 1 else sizes
-    return Evaluation(views, about, sum(part.compile_seconds for part in parts.values()), shown)
+    about = next(iter(parts.values())).protocol | about_members | counts
+    about |= {
+        "resolution": sizes[0] if len(sizes) == 1 else sizes,
+        "psnr": "per view, averaged by member, then over all",
+    }
+    seconds = sum(part.compile_seconds for part in parts.values())
+    return Evaluation(views, about, seconds, shown, members=tuple(parts.values()))
 
 
 def joined_shapes(parts: dict[str, ShapesEvaluation], members: dict[str, Any]) -> ShapesEvaluation:
     shapes = [replace(shape, name=f"{name}/{shape.name}") for name, part in parts.items() for shape in part.shapes]
     shown = {f"{name}/{shape}": seen for name, part in parts.items() for shape, seen in list(part.shown.items())[:2]}
     counts = {key: sum(part.protocol[key] for part in parts.values()) for key in ("shapes", "of")}
-    return ShapesEvaluation(shapes, next(iter(parts.values())).protocol | members | counts, shown)
+    about = next(iter(parts.values())).protocol | members | counts
+    return ShapesEvaluation(shapes, about, shown, tuple(parts.values()))

@@ -21,7 +21,7 @@ from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find
 from ..figures import Row, contact_sheet
 from ..geometry import evenly
 from ..method import Method
-from ..method.capabilities import HasDistance, HasMesh, can
+from ..method.capabilities import HasDistance, HasMesh, can, needs
 from ..metrics import Score, chamfer_distance, intersection_over_union, normal_consistency
 from ..system.progress import track
 from .views import reveal
@@ -61,11 +61,12 @@ class ShapesEvaluation:
     shapes: list[ShapeScore]
     protocol: dict[str, Any]
     shown: dict[str, list[Float[Tensor, "height width 3"]]]
+    members: tuple[ShapesEvaluation, ...] = ()  # of a collection, whose means are averaged
 
     @property
     def scores(self) -> list[Score]:
-        """Means over the shapes that have each."""
-        every = [score for shape in self.shapes for score in shape.scores]
+        """Means over the shapes, or members, that have each."""
+        every = [score for each in self.members or self.shapes for score in each.scores]
         by_name = {score.name: [other.value for other in every if other.name == score.name] for score in every}
         return [
             Score(name, sum(values) / len(values), "", next(x.better for x in every if x.name == name))
@@ -155,8 +156,8 @@ def compare_shapes(true: Shape, learnt: Shape, method: Method, points: int) -> S
 def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     """The surface that a method holds: its own mesh, the zero level of its distance, or what `export mesh` makes of it.
     Raises LumigraphError where there is none."""
-    if isinstance(method, HasMesh):
-        return method.mesh()
+    if can(method, HasMesh):
+        return needs(method, HasMesh).mesh()
     box = CropBox(*frame.bounds)
     cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):

@@ -1,14 +1,13 @@
 """Evaluate a trained method on held-out views, under a stated protocol.
 
-Halves: a method with a code for each photograph is given the left half of a held-out one and compared on the right. The
-code of a photograph outside the training set is unknown, and one fitted to all of it would include the answer
-(Martin-Brualla et al. 2021, section 5). Raw photographs are compared as light without noise (Mildenhall 2022, 5.1).
+A method with a code for each photograph is given the left half of a held-out one and compared on the right (`halves`).
+Raw photographs are compared as light without noise (Mildenhall 2022, section 5.1).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,13 +31,13 @@ from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
+from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
 CLEAN_LAYER = "clean"  # the layer of photographs in their own light without passers-by
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is no time of the view
-LEFT_HALVES = "each photograph's code is found on its left half, and its right half is compared"
-RIGHT_HALVES = "right halves are compared; nothing is told of left ones"
+CAPTURED_POSES = "as captured"
 LIGHT_LAYER = "radiance"  # the layer that holds it, 1 for white
 LIGHT_PROTOCOL = (
     "sRGB of light without noise, clipped at white; each rendering's linear light is aligned with it by a factor and "
@@ -65,33 +64,46 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All views of a split, and how they were compared. compile_seconds: spent ahead of the first view."""
+    """All views of a split, and how they were compared.
+
+    compile_seconds: spent ahead of the first view
+    members: of a collection, whose means are averaged, so that each counts the same however many views it has
+    """
 
     views: list[ViewScore]
     protocol: dict[str, Any]
     compile_seconds: float
     shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
     poses: tuple[Score, ...] = ()  # how far refined poses are from true ones, where these are known
+    members: tuple[Evaluation, ...] = ()
+
+    @property
+    def _averaged(self) -> Sequence[Evaluation | ViewScore]:
+        return self.members or self.views
 
     @property
     def psnr(self) -> float:
-        return mean(view.psnr for view in self.views)
+        return mean(each.psnr for each in self._averaged)
 
     @property
     def ssim(self) -> float:
-        return mean(view.ssim for view in self.views)
+        return mean(each.ssim for each in self._averaged)
 
     @property
     def lpips(self) -> float | None:
         """Mean LPIPS over the views; None if it was not measured."""
-        return mean_known(view.lpips for view in self.views)
+        return mean_known(each.lpips for each in self._averaged)
+
+    @property
+    def clean_psnr(self) -> float | None:
+        """Mean PSNR against photographs without passers-by; None where these are not known."""
+        return mean_known(each.clean_psnr for each in self._averaged)
 
     @property
     def detail(self) -> FineDetail | None:
         """Mean detail over the views; None if no photograph has fine detail."""
-        sharp, gain = (
-            mean_known(getattr(v.detail, name, None) for v in self.views) for name in FineDetail.__annotations__
-        )
+        found = [each.detail for each in self._averaged]
+        sharp, gain = (mean_known(getattr(x, name, None) for x in found) for name in FineDetail.__annotations__)
         return None if sharp is None or gain is None else FineDetail(sharp, gain)
 
     @property
@@ -102,11 +114,15 @@ class Evaluation:
     def by_resolution(self) -> dict[str, Evaluation]:
         """The views of each size alone, sizes in the order in which they come."""
         sizes = dict.fromkeys(view.resolution for view in self.views)
-        return {size: replace(self, views=[view for view in self.views if view.resolution == size]) for size in sizes}
+        return {size: self._of_size(size) for size in sizes}
+
+    def _of_size(self, size: str) -> Evaluation:
+        views = [view for view in self.views if view.resolution == size]
+        members = tuple(part for member in self.members if (part := member._of_size(size)).views)
+        return replace(self, views=views, members=members)
 
     def means(self) -> dict[str, Any]:
-        clean = mean_known(view.clean_psnr for view in self.views)
-        known = {} if clean is None else {"clean_psnr": clean}
+        known = {} if self.clean_psnr is None else {"clean_psnr": self.clean_psnr}
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
 
     @property
@@ -160,9 +176,9 @@ def evaluate(
     keep:  receives each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
     right_halves: compare those alone also where a method is given nothing of left ones
-    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
-    photograph's mask rules out do not count, nor does a photograph that it rules out altogether. A method that
-    photographs can be given to is judged by halves. Raises LumigraphError if the split has no view.
+    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says, and codes from
+    there. Pixels that the photograph's mask rules out do not count, nor does a photograph that it rules out altogether.
+    A method that photographs can be given to is judged by halves. Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
@@ -186,7 +202,7 @@ def evaluate(
         if shot.mask is not None and not shot.mask[:, columns].any():
             continue
         photograph = shot.before(scene.frame.background)
-        told = method.given(left_half(shot)) if by_halves else method
+        told = method.given(left_half(replace(shot, camera=camera))) if by_halves else method
         begin = time.perf_counter()
         seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
@@ -264,7 +280,7 @@ def protocol(
         "of": len(scene.splits[split]),
         "resolution": sizes[0] if len(sizes) == 1 else sizes,
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
-        "poses": "as the method refined them" if refined else "as captured",
+        "poses": "as the method refined them" if refined else CAPTURED_POSES,
         "controls": dict(method.settings),
         "halves": LEFT_HALVES if judged_by_halves(method) else RIGHT_HALVES if right_halves else None,
         "masked": any(scene.images.mask(i) is not None for i in compared),
@@ -293,26 +309,6 @@ def mean_known(values: Iterable[float | None]) -> float | None:
     """The mean of those that are known; None if none is."""
     found = [value for value in values if value is not None]
     return mean(found) if found else None
-
-
-def judged_by_halves(method: Method) -> bool:
-    """True if a method of Scenes accepts single photographs as evidence, and no control already selects a photograph's
-    appearance."""
-    takes = issubclass(method.learns_from, Scene) and Photograph in method.takes
-    return takes and not any(control.of_photographs and control.name in method.settings for control in method.controls)
-
-
-def left_half(photograph: Photograph) -> Photograph:
-    """The same photograph, of which only pixels left of the middle are to be trusted."""
-    mask = photograph.mask
-    trusted = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
-    trusted[:, right_half(photograph)] = False
-    return replace(photograph, mask=trusted)
-
-
-def right_half(photograph: Photograph) -> slice:
-    """The columns from the middle on."""
-    return slice(photograph.rgb.shape[1] // 2, None)
 
 
 def in_light(seen: Rendering, truth: Picture) -> tuple[Picture, Picture]:

@@ -16,7 +16,7 @@ from ..components.fields.appearance import Appearance, Patches
 from ..composition import Placed
 from ..datasets.scene import Batch, Photograph
 from ..geometry import evenly
-from ..method.capabilities import HasAppearance, HasExposure, can, needs
+from ..method.capabilities import HasAppearance, HasExposure, RefinesPoses, can, needs
 from ..method.controls import Control
 from ..system.progress import track
 from .block_cache import Nearby
@@ -170,12 +170,14 @@ class Asked:
     """Controls and exposures of many parts, each of which is asked once.
 
     photographs: whether each finds its own appearance in a photograph
+    refined:     whether any was learnt with poses
     controls:    that any of them has, the first of each name, but for exposure and those that name photographs
     usual:       log2 of the exposure that is usual among them, the median of theirs; None where none of them knows
     exposures:   the least and the most that any learnt from, log2 of them; None where none has a choice
     """
 
     photographs: bool
+    refined: bool
     controls: tuple[Control, ...]
     usual: float | None
     exposures: tuple[float, float] | None
@@ -183,10 +185,11 @@ class Asked:
     @classmethod
     def of(cls, parts: Iterable[Placed]) -> Asked:
         """One part after the other is asked, and none is held."""
-        photographs, controls = True, dict[str, Control]()
+        photographs, refined, controls = True, False, dict[str, Control]()
         usual, ranges = list[float](), list[tuple[float, float]]()
         for part in parts:
             photographs &= Photograph in part.method.takes
+            refined |= can(part.method, RefinesPoses)
             for control in part.method.controls:
                 if not control.of_photographs and control.name != EXPOSURE:
                     controls.setdefault(control.name, control)
@@ -196,6 +199,7 @@ class Asked:
                 ranges.append(reach)
         return cls(
             photographs,
+            refined,
             tuple(controls.values()),
             median(usual) if usual else None,
             (min(least for least, _ in ranges), max(most for _, most in ranges)) if ranges else None,

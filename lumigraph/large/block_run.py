@@ -24,12 +24,13 @@ from ..camera import Camera
 from ..capture import Before, CapturePart, open_dataset
 from ..components.fields.appearance import Appearance
 from ..composition import PickedCloud, Placed
+from ..datasets.alignment import aligning
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import natural
 from ..geometry import Similarity
 from ..method import Method
-from ..method.capabilities import HasGaussians, can
+from ..method.capabilities import HasGaussians, RefinesPoses, can
 from ..run.checkpoint import State
 from ..run.folder import Run
 from ..run.opened import Trained
@@ -124,17 +125,23 @@ class BlockRun(Trained):
             parts = [self.placed(block, device) for block in self.blocks]
             level = self.centres
             level[:, 2] = level[:, 2].mean()  # so that cells stand upright
-            return PickedCloud(self.frame, merged(parts, level)).to(device)
+            refined = any(can(part.method, RefinesPoses) for part in parts)
+            return PickedCloud(self.frame, merged(parts, level), refined).to(device)
         nearby = Nearby(lambda i: self.placed(self.blocks[i], device), len(self.blocks))
         return InBlocks(self.frame, nearby, self.centres, self.radii, exposures=exposures).to(device)
 
     def placed(self, block: Block, device: torch.device | str = "cpu") -> Placed:
-        """A block in its place, in the light that all are shown in where they have been aligned."""
+        """A block in its place, in the light that all are shown in where they have been aligned. What was learnt with
+        poses has a frame of its own, which training photographs align with the given one."""
         run = self.runs[block.name]
-        method = run.method(device)
+        method = run.method(device).requires_grad_(False)
         if code := self.plan.appearance.get(block.name):
             method = method.given(Appearance(torch.tensor(code, device=device)))
-        return Placed(method, self.frame.to_source.inverse @ run.frame.to_source)
+        place = self.frame.to_source.inverse @ run.frame.to_source
+        if can(method, RefinesPoses):
+            given = run.cameras()["train"]
+            place = place @ aligning(method.refined(given), given)
+        return Placed(method, place)
 
     @cached_property
     def _photographs(self) -> dict[tuple[str, str], tuple[str, str]]:

@@ -19,12 +19,15 @@ from torch import Tensor, nn
 
 from ..camera import Camera
 from ..camera.rays import Rendering
+from ..color.blending import over
 from ..composition import Placed
 from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined
 from ..method import Method
+from ..method.capabilities import ColourPairs
 from ..method.controls import Control, Value
+from ..method.ray_method import POSE_RAYS
 from .alignment import EXPOSURE, Asked, exposed
 from .block_cache import Nearby
 from .weights import PREVIEW_SIDE, UNSEEN_WEIGHT, Mixing, inverse_distance, saw, seeing, shares
@@ -67,6 +70,7 @@ class InBlocks(Method):
         parts = Nearby.of(parts)
         self.asked = Asked.of(parts)
         self.usual = self.asked.usual
+        self.poses = True if self.asked.refined else None
         self.register_buffer("centres", centres.float(), persistent=False)
         self.register_buffer("radii", radii.float(), persistent=False)
         self.exposures = exposures
@@ -98,6 +102,24 @@ class InBlocks(Method):
         if c.by == "nearest":
             weights = nn.functional.one_hot(weights.argmax(), len(weights)).to(weights)
         return shares(weights)
+
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at random trusted pixels, of blocks mixed by the camera's
+        distance; see `RefinesPoses`."""
+        weights = self.weights(photograph.camera.to(self.device))
+        chosen = (weights >= MIN_WEIGHT).nonzero()[:, 0]
+        parts, share = [self.blocks[i] for i in chosen.tolist()], shares(weights[chosen]).tolist()
+
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
+            batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)
+            seen = [part.rendered_rays(poses(batch.rays)) for part in parts]
+            rgb, opacity = (
+                torch.stack([w * getattr(x, name) for w, x in zip(share, seen, strict=True)]).sum(0)
+                for name in ("rgb", "opacity")
+            )
+            return over(rgb, opacity, self.background), batch.before(self.background)
+
+        return pairs
 
     def _by_pixel(
         self, camera: Camera, chosen: Tensor, weights: Float[Tensor, " chosen"], seen: Sequence[Rendering]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, Protocol
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera import Camera
-from ..camera.rays import Look, Rays
+from ..camera.rays import Look, Rays, Rendering
 from ..datasets.mesh import Mesh
+from ..datasets.scene import Photograph
 from ..errors import LumigraphError
 from ..exchange.baked import Atlas, Octree
 from ..exchange.packing import Stored
@@ -17,7 +20,6 @@ from ..gaussians import Gaussians
 from .field import Colours, Densities, Directions, Points
 
 
-@runtime_checkable
 class HasDensity(Protocol):
     """Knows how dense space is."""
 
@@ -25,7 +27,6 @@ class HasDensity(Protocol):
         """Density per scene unit at points of the scene."""
 
 
-@runtime_checkable
 class HasField(Protocol):
     """Knows density and colour at points, as baking, conversion and composition ask for them."""
 
@@ -33,7 +34,6 @@ class HasField(Protocol):
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
 
 
-@runtime_checkable
 class FromField(Protocol):
     """Can begin as what another method holds, instead of from photographs."""
 
@@ -43,7 +43,6 @@ class FromField(Protocol):
         from then on continues there. Raises LumigraphError, in one sentence, where it cannot be taken over."""
 
 
-@runtime_checkable
 class HasOctree(Protocol):
     """Is an octree of density and harmonics, for browsers and files."""
 
@@ -52,7 +51,6 @@ class HasOctree(Protocol):
         none yet, and where it does not fit into memory, with the depth that does."""
 
 
-@runtime_checkable
 class HasAtlas(Protocol):
     """Is an atlas of diffuse colours and features, for browsers and files."""
 
@@ -60,7 +58,6 @@ class HasAtlas(Protocol):
         """The scene as an atlas, in the scene's frame. Raises LumigraphError while there is none yet."""
 
 
-@runtime_checkable
 class HasDistance(Protocol):
     """Knows how far surfaces are."""
 
@@ -68,7 +65,6 @@ class HasDistance(Protocol):
         """Signed distance to the nearest surface in scene units, negative inside."""
 
 
-@runtime_checkable
 class HasGaussians(Protocol):
     """Is a cloud of Gaussians."""
 
@@ -76,14 +72,20 @@ class HasGaussians(Protocol):
         """The scene as a cloud, in the scene's frame."""
 
 
-@runtime_checkable
+# Colours at a photograph's trusted pixels, or at random ones of them, seen from where a `PoseRefinement` moves its
+# camera, and those of the photograph; differentiable in the pose.
+ColourPairs = Callable[[Any, torch.Generator], tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]]
+
+
 class RefinesPoses(Protocol):
     """Can learn where photographs were taken from, besides the scene."""
 
-    poses: nn.Module | None  # a `PoseRefinement`; None where it was not asked to
+    poses: nn.Module | bool | None  # a `PoseRefinement`; True where the parts have them; None where none was asked for
+
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose, beside the photograph's. RayMethods have it."""
 
 
-@runtime_checkable
 class HasVisibility(Protocol):
     """Knows which places its photographs saw."""
 
@@ -91,21 +93,18 @@ class HasVisibility(Protocol):
         """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
 
 
-@runtime_checkable
 class HasExposure(Protocol):
     """Knows the exposures of its photographs."""
 
     usual_exposure: float | None  # log2 of their median; None where it is not known
 
 
-@runtime_checkable
 class HasAppearance(Protocol):
     """Renders in the light of one appearance code, which it accepts as evidence."""
 
     shown_in: Any  # the `Appearance`; of no numbers where none was learnt
 
 
-@runtime_checkable
 class CanPrune(Protocol):
     """Is a cloud of Gaussians that can lose some and go on learning."""
 
@@ -113,7 +112,6 @@ class CanPrune(Protocol):
         """Leave those of `gaussians()` that a mask picks, and of the optimizers' states what belongs to them."""
 
 
-@runtime_checkable
 class HasMesh(Protocol):
     """Is a mesh, or makes one better than `export mesh` would."""
 
@@ -121,7 +119,6 @@ class HasMesh(Protocol):
         """The scene as triangles, in the scene's frame."""
 
 
-@runtime_checkable
 class HasLooks(Protocol):
     """Marches along rays."""
 
@@ -129,7 +126,13 @@ class HasLooks(Protocol):
         """Density and colour along rays, one entry for each pass, the one that is composited last."""
 
 
-@runtime_checkable
+class RendersRays(Protocol):
+    """Renders one ray at a time."""
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        """Rendering of each ray before a background colour."""
+
+
 class CanCompress(Protocol):
     """Says how it may be stored in fewer bytes."""
 
@@ -145,7 +148,6 @@ class CanCompress(Protocol):
         the rows that there are now."""
 
 
-@runtime_checkable
 class CanDraw(Protocol):
     """Knows what objects of a category are like, so that it can make one up."""
 
@@ -169,6 +171,7 @@ LACKING = {
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
     CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of hyp-nerf",
     CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
+    RendersRays: "renders whole pictures, so single rays have no colour",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }
 

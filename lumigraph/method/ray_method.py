@@ -12,10 +12,12 @@ from torch import Tensor
 from ..budget import BY_RAY, Efforts
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
-from ..datasets.scene import Batch, Scene
+from ..datasets.scene import Batch, Photograph, Scene
 from ..volume import composite
-from .capabilities import HasLooks, needs
+from .capabilities import ColourPairs, HasLooks, needs
 from .method import Method
+
+POSE_RAYS = 512  # of a photograph, from which the error of a pose is measured
 
 
 class RayMethod(Method):
@@ -62,6 +64,15 @@ class RayMethod(Method):
         """Rendering of each ray before a background colour: the last look, composited."""
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
+
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at random trusted pixels; see `RefinesPoses`."""
+
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
+            batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)
+            return self.render_rays(poses(batch.rays), self.background).rgb, batch.before(self.background)
+
+        return pairs
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

@@ -201,12 +201,21 @@ class RawNeRF(FieldMethod):
         alpha = (self.log_scale[self.group] * self.free[:, None]).exp()
         return (self.exposure[:, None] * alpha)[rays.image_index]
 
+    def light_behind(self, batch: Batch) -> Float[Tensor, "#ray 3"]:
+        """Light of the background in a batch's photographs, in the camera's colours: what development shows as the
+        background, exposed as each photograph is. Behind alpha it is put in afterwards and has no exposure."""
+        shown = decoded(self.background)
+        if batch.alpha is not None and not batch.extra.keys() & {"mosaic", "raw"}:
+            return shown
+        light = torch.linalg.solve(self.srgb_from_camera, shown.T).T / (self.brightness * self.gains)
+        return light * self.scale(batch.rays)
+
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error relative to what is shown (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
         measured, known = self.measured(batch)
         (samples,), terms = self.learn(batch.rays, self.random(step))
         seen = self.light_and_spread(samples.look(self.network))
-        shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * decoded(self.background)
+        shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * self.light_behind(batch)
         shown = torch.where(measured >= 1, shown.clamp(max=1), shown)  # a full sensor says: at least so much
         error = (shown - measured) / (shown.detach() + self.config.epsilon)
         first, second = seen.extra["moments"].unbind(-1)

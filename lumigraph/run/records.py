@@ -47,6 +47,7 @@ class Protocol:
     background: list[float] | None = None
     masked: bool = False
     halves: str | None = None
+    poses: str | None = None
 
     def __post_init__(self) -> None:
         if self.views is None and self.shapes is None:

@@ -195,9 +195,10 @@ class AppearanceCodes(PhotographCodes):
                     f"{len(start)}; give it one that was aligned with this block"
                 )
             return evidence.code.to(start)
-        size = evidence.size if isinstance(evidence, Patches) else 1
-        batch = evidence.batch if isinstance(evidence, Patches) else drawn(evidence, self.pixels, method.random(0))
-        batch = batch.to(start.device)
+        if isinstance(evidence, Patches):
+            batch, size = evidence.batch.to(start.device), evidence.size
+        else:
+            batch, size = evidence.sample_rays(self.pixels, method.random(0)).to(start.device), 1
         if not len(batch):
             return start
         background, rest = method.background, method.shown_code[:, len(start) :]
@@ -212,16 +213,6 @@ class AppearanceCodes(PhotographCodes):
             return residual.view(-1, size, 3).mean(1).square().sum(-1).mean()
 
         return self.fitted(start, error)
-
-
-def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Batch:
-    """Random trusted pixels of a photograph, without repetition; all where there are fewer; maybe none."""
-    trusted = torch.ones(len(photograph), dtype=torch.bool) if photograph.mask is None else photograph.mask.flatten()
-    there = trusted.nonzero()[:, 0]
-    chosen = there[torch.randperm(len(there), generator=generator)[:count]]
-    rays = photograph.camera.rays(photograph.camera.pixels()[chosen])
-    alpha = None if photograph.alpha is None else photograph.alpha.flatten()[chosen]
-    return Batch(rays, photograph.rgb.flatten(0, 1)[chosen], alpha)
 
 
 class SkyField(Part):

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...method.capabilities import HasLooks
+from ...method import Method
+from ...method.capabilities import HasLooks, needs
 from ...volume import weights_of
 
 RAYS = 8192  # at once
@@ -17,7 +18,7 @@ RAYS = 8192  # at once
 
 @torch.no_grad()
 def importance(
-    method: HasLooks,
+    method: Method,
     camera: Camera,
     lookup: Callable[[Float[Tensor, "sample 3"]], Float[Tensor, "sample value"]],
     tables: list[Tensor],
@@ -32,7 +33,7 @@ def importance(
     totals = [torch.zeros_like(table) for table in tables]
     for i in range(0, len(rays), RAYS):
         some = rays[i : i + RAYS]
-        look = method.looks(some)[-1]
+        look = needs(method, HasLooks).looks(some)[-1]
         points, _ = look.samples.along(some)
         weights = weights_of(look.samples, look.density)
         with torch.enable_grad():

@@ -19,7 +19,8 @@ from ...geometry import evenly
 from ...method import Part
 from ...method.controls import Control, Value
 from ..clouds.flat_view import FlatView, flat_view
-from ..fields.appearance import AVERAGE, drawn
+from ..fields.appearance import AVERAGE
+from ..fields.development import decoded, encoded
 
 MAX_PHOTOGRAPHS = 32  # photographs, each beside its neighbour
 MAX_SIDE = 200  # pixels along their longer side
@@ -27,14 +28,13 @@ POINTS = 1 << 14  # places at most
 MIN_SHARED = 30  # places that two photographs must share to be compared
 MIN_COLOUR, MAX_COLOUR = 0.05, 0.95  # colours between which a ratio says something
 MAX_ANGLE = 20.0  # degrees between the directions from which two photographs see a place; shading differs beyond
-MAX_SCATTER = 0.5  # stops by which ratios of one pair deviate (median); beyond, occlusion and not light explains them
-ENCODED = 2.2  # stops of light to one of sRGB-encoded colours
+MAX_SCATTER = 1.1  # stops by which ratios of one pair deviate (median); beyond, occlusion and not light explains them
 
 
 @torch.no_grad()
 def spread_of_light(scene: Scene) -> float | None:
-    """Difference of neighbouring photographs' exposure and colour at the same places, in stops: the root mean square
-    over photographs and channels of the median log2 ratio. None where the scene has no points to compare.
+    """Difference of neighbouring photographs' exposure and colour at the same places, in stops of linear light: the
+    root mean square over photographs and channels of the median log2 ratio. None where there are no points to compare.
 
     Neighbours see about the same side of things and the same things before others, so that what is left is the light
     and the camera's reading of it. Of a sparse capture even neighbours may not: pairs with directions more than
@@ -51,9 +51,8 @@ def spread_of_light(scene: Scene) -> float | None:
 
 
 def spread_of_exposure(scene: Scene) -> float:
-    """The same, and where no points tell, what photographs say of their exposures (`Scene.about`): their deviation, in
-    stops of encoded colours. 0 where nothing is known. Those developed from raw files are as bright as `brightness`
-    made them."""
+    """The same, and without points the deviation of the exposures that photographs state (`Scene.about`), in stops. 0
+    where nothing is known. Those developed from raw files are as bright as `brightness` made them."""
     measured = spread_of_light(scene)
     if measured is not None:
         return measured
@@ -62,7 +61,7 @@ def spread_of_exposure(scene: Scene) -> float:
         return 0.0
     stops = (exposure * scene.about.get("brightness", torch.tensor(1.0))).log2()[scene.splits["train"]]
     known = stops[stops.isfinite()]
-    return float(known.std()) / ENCODED if len(known) > 1 else 0.0
+    return float(known.std()) if len(known) > 1 else 0.0
 
 
 def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
@@ -75,8 +74,8 @@ def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
 
 
 def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, " 3"] | None:
-    """Stops by which one picture shows points brighter than another, for each channel; None if they share too few, or
-    differ by more than light and exposure."""
+    """Stops of linear light by which one picture shows points brighter than another, for each channel; None if they
+    share too few, or differ by more than light and exposure."""
     colours, known = [], torch.ones(len(points), dtype=torch.bool)
     for view in (one, other):
         seen, row, column, _ = view.sees(points)
@@ -87,14 +86,15 @@ def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -
         return None
     towards = [normalize(points[known] - view.pose[:, 3], dim=-1) for view in (one, other)]
     angle = (towards[0] * towards[1]).sum(-1).clamp(-1, 1).acos().rad2deg()
-    ratios = (colours[0][known] / colours[1][known]).log2()
+    one_light, other_light = (decoded(rgb[known]) for rgb in colours)
+    ratios = (one_light / other_light).log2()
     stops = ratios.median(0).values
     scatter = (ratios - stops).abs().median(0).values
     return stops if float(angle.median()) < MAX_ANGLE and float(scatter.mean()) < MAX_SCATTER else None
 
 
 Setting = Literal["auto", "yes", "no"]
-MIN_SPREAD = 0.15  # stops between neighbouring photographs, beyond which they are of different exposure
+MIN_SPREAD = 0.33  # stops between neighbouring photographs, beyond which they are of different exposure
 MAX_STOPS = 4.0  # that exposure can be turned up or down
 RATE_SCALE = 0.05  # of the method's learning rate
 GAIN_PIXELS = 4096  # pixels of a photograph from which its gain is found
@@ -104,8 +104,8 @@ SCENE = "scene"  # beside photographs and their average: a gain of 1
 class Exposure(Part):
     """A gain per photograph and colour channel, 1 at first; photographs that were not trained on keep it.
 
-    A gain multiplies sRGB-encoded colours, as a photograph has them: photograph = gain x scene. So a stop doubles
-    them in this space, and not linear light.
+    A gain multiplies sRGB-encoded colours, as a photograph has them: photograph = gain x scene. The control `exposure`
+    multiplies linear light, as in all methods.
 
     differ: whether photographs are of different exposure; nothing is learnt where they are not
     found:  gain of a photograph that was given as evidence
@@ -155,7 +155,7 @@ class Exposure(Part):
         stops = (-MAX_STOPS, MAX_STOPS)
         about = "The photograph, by number or name, whose brightness and tint are shown; or the average of all."
         return (
-            Control("exposure", 0.0, stops, unit="stops", about="Each stop doubles the scene's colours."),
+            Control("exposure", 0.0, stops, unit="stops", about="Each stop doubles the light."),
             Control("exposed_as", SCENE, choices=(SCENE, AVERAGE, *photographs), about=about, of_photographs=True),
         )
 
@@ -165,13 +165,16 @@ class Exposure(Part):
         return (Photograph,) if bool(self.differ) else ()
 
     def recoloured(self, method: Any, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Colours with the gain of the settings, or of a photograph given as evidence."""
+        """Colours with the gain of the settings, or of a photograph given as evidence, then with the exposure."""
         if self.found is not None and "exposed_as" not in method.settings:
             rgb = rgb * self.found
-        return rgb * self.gain(method.settings) if method.settings and bool(self.differ) else rgb
+        if not method.settings or not bool(self.differ):
+            return rgb
+        rgb, stops = rgb * self.gain(method.settings), float(method.settings.get("exposure", 0.0))
+        return encoded(2**stops * decoded(rgb)) if stops else rgb
 
     def gain(self, told: dict[str, Value]) -> Float[Tensor, " 3"]:
-        """The factor on colours that settings ask for: 1 without any."""
+        """Factor on colours of the photograph that settings choose: 1 without any."""
         whose = told.get("exposed_as", SCENE)
         if whose == SCENE:
             log_gain = torch.zeros_like(self.log_gain[0])
@@ -180,12 +183,12 @@ class Exposure(Part):
             log_gain = learnt.sum(0) / max(len(learnt), 1)
         else:
             log_gain = self.log_gain[int(whose)]
-        return log_gain.exp() * 2 ** float(told.get("exposure", 0.0))
+        return log_gain.exp()
 
     @torch.no_grad()
     def adapted(self, method: Any, evidence: Photograph) -> Exposure:
         """The part with the gain of a photograph, found from its trusted pixels."""
-        batch = drawn(evidence, GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
+        batch = evidence.sample_rays(GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
         method.settings.pop("exposed_as", None)
         adapted = copy.copy(self)
         if not len(batch):

@@ -16,6 +16,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...components.clouds.dense_points import compile_sweep, seen_points
+from ...components.clouds.moved_cloud import seen_from
 from ...components.fields.teacher import teacher_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
@@ -23,6 +24,7 @@ from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, betwee
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
+from ...method.capabilities import ColourPairs
 from .adaptive import AdaptiveDensity, AdaptiveNumbers
 from .addition import Addition, Step
 from .appearance import AppearanceNumbers, SplatAppearance
@@ -33,7 +35,6 @@ from .initialization import Initialization, cloud_of, initial_cloud, random_clou
 from .interval_schedule import intervals
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
-from .poses import seen_from
 from .robust_mask import RobustMask, RobustNumbers
 from .tidying import Tidying
 
@@ -271,11 +272,28 @@ class GaussianSplatting(Method):
 
     def render(self, camera: Camera) -> Rendering:
         camera = camera.to(self.device)
-        seen, background = self.rasterized(camera), self.background[0]
+        return self.shown(self.rasterized(camera), camera)
+
+    def shown(self, seen: Rendering, camera: Camera) -> Rendering:
+        """A rendering over black in the appearance of the settings, before the background."""
+        background = self.background[0]
         for part in self.additions:
             rgb, background = part.shown(self, seen, camera, background)
             seen = replace(seen, rgb=rgb)
         return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
+
+    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
+        """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
+        photograph, cloud = photograph.to(self.device), self.filtered()
+        target = photograph.trusted(photograph.before(self.background[0]))
+
+        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
+            moved, camera = seen_from(poses, cloud, photograph.camera)
+            picture = splat(moved, view_of(camera, self.near_plane))
+            seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
+            return photograph.trusted(seen.rgb), target
+
+        return pairs
 
     # Compression
 

@@ -27,7 +27,7 @@ from .addition import Addition, Step
 from .cloud import CloudAdam
 from .interval_schedule import short_schedule_lr_scale
 
-MIN_SPREAD = 0.3  # stops between neighbouring photographs, beyond which each has an appearance
+MIN_SPREAD = 0.66  # stops between neighbouring photographs, beyond which each has an appearance
 FULL_SCHEDULE_PASSES = 400  # steps for each photograph, from which on the learning rate is not scaled
 MAX_LR_SCALE = 6.0  # of the learning rate, in short runs
 

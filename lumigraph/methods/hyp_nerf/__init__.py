@@ -14,6 +14,7 @@ from torch import Tensor
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
+from ...capture.up import common_up
 from ...components.fields.appearance import fitted
 from ...components.fields.hash_field import HashNumbers
 from ...components.fields.kept_photographs import Kept, chance, photographed, rays_through
@@ -26,7 +27,7 @@ from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
 from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ...geometry import look_at
+from ...geometry import look_at, turning
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
@@ -130,6 +131,7 @@ class HypNeRF(RayMethod):
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
     learning_rate = exponential_decay
+    up: Tensor
     efforts: ClassVar[Efforts] = {"draft": Effort(50, 2000), "good": Effort(300, 10_000), "best": Effort(1500, 50_000)}
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -144,6 +146,7 @@ class HypNeRF(RayMethod):
         self.codes = InstanceCodes(c.members, c.shape_code + c.colour_code)
         self.found = Kept(torch.empty(0, c.shape_code + c.colour_code))  # the code of a scene that was given, or drawn
         self.tuned = untuned(self.shape)
+        self.register_buffer("up", torch.tensor([0.0, 0.0, 1.0]))  # of the members, by the cameras of the first
         self.step_length = 2 * math.sqrt(3) / c.steps_per_diagonal
         self._cells: dict[int, OccupancyGrid] = {}  # of members, by number
         self._shown: tuple[HashInstance, OccupancyGrid] | None = None  # until a step changes it
@@ -183,6 +186,10 @@ class HypNeRF(RayMethod):
                 f"give --members {len(data)}"
             )
         self.codes.begin(data.splits["train"], self.config.code_deviation, self.random(1))
+        _, first = next(data.members())
+        scene = photographed(first, "hyp-nerf")
+        if (up := common_up(scene.cameras[scene.splits["train"]].to("cpu"))) is not None:
+            self.up.copy_(torch.from_numpy(up))
 
     def steps_per_pass(self, data: Collection) -> float:
         return len(data.splits["train"]) / self.config.members_per_step
@@ -429,7 +436,7 @@ class HypNeRF(RayMethod):
     def _denoised_views(self, instance: HashInstance, like: Camera, background: Float[Tensor, "1 3"]) -> Seen:
         """Renderings of a field from all around, denoised, as photographs of it (section 3.2)."""
         cells, views = self._filled(instance), list[Photograph]()
-        for camera in around(like, self.frame, self.config.denoise_views):
+        for camera in around(like, self.frame, self.config.denoise_views, self.up.cpu()):
             rays = camera.rays(camera.pixels()).to(self.device)
             width, height = camera.size[0].tolist()
             picture = self._seen(instance, cells, rays, background).rgb.view(height, width, 3)
@@ -484,12 +491,14 @@ def patch(
     return photograph.camera.rays(pixels), photograph.before(frame.background)[part].contiguous()
 
 
-def around(camera: Camera, frame: Frame, count: int) -> Iterator[Camera]:
-    """Cameras with the same lens, as far from the middle, all around it and now lower, now higher."""
+def around(camera: Camera, frame: Frame, count: int, up: Float[Tensor, " 3"]) -> Iterator[Camera]:
+    """Cameras with the same lens, as far from the middle, all around it and now lower, now higher. up: unit length"""
     middle = torch.tensor(frame.bounds).mean(0)
     distance = (camera.position - middle).norm()
+    turn = turning(torch.tensor([0.0, 0.0, 1.0]), up).float()
     for number in range(count):
         azimuth, height = torch.tensor(2 * math.pi * number / count), torch.tensor(ELEVATIONS[number % len(ELEVATIONS)])
-        outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()])[None]
-        pose = look_at(middle + distance * outward, -outward, torch.tensor([0.0, 0.0, 1.0]))
+        outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()])
+        outward = (turn @ outward)[None]
+        pose = look_at(middle + distance * outward, -outward, up)
         yield replace(camera, pose=pose)

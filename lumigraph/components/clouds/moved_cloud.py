@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ...camera import Camera
-from ...components.training.pose_refinement import PoseRefinement
 from ...gaussians import Gaussians
 from ...geometry import multiply, rotated
+from ..training.pose_refinement import PoseRefinement
 
 
 def seen_from(poses: PoseRefinement, cloud: Gaussians, camera: Camera) -> tuple[Gaussians, Camera]:
