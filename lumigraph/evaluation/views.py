@@ -32,6 +32,7 @@ from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
+from ..system.work import at_work
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
@@ -146,6 +147,7 @@ class Evaluation:
         return contact_sheet(title, ["photograph", "rendering", f"{ERROR_GAIN}x error", "depth"], rows)
 
 
+@at_work()
 def evaluate(
     method: Method,
     scene: Scene,

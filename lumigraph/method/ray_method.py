@@ -13,6 +13,7 @@ from ..budget import BY_RAY, Efforts
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Batch, Scene
+from ..system.work import at_work
 from ..volume import composite
 from .capabilities import HasLooks, needs
 from .method import Method
@@ -63,6 +64,7 @@ class RayMethod(Method):
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
 
+    @at_work()
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
         width, height = camera.size[0].tolist()
