@@ -209,21 +209,8 @@ def test_floaters_of_a_run_are_a_finding(cloud_run):
 def test_a_run_without_its_cameras_is_left_as_it_is(cloud_run, tmp_path, capsys):
     run = shutil.copytree(cloud_run.folder, tmp_path / "run")
     (run / "cameras.json").write_text("{}")
-    assert (
-        cli.main(
-            [
-                "clean",
-                str(run),
-                "--strength",
-                "0",
-                "--box",
-                *"-1 -1 -1 1 1 0".split(),
-                "--output",
-                str(tmp_path / "new"),
-            ]
-        )
-        == 2
-    )
+    said = ["clean", str(run), "--strength", "0", "--box", *"-1 -1 -1 1 1 0".split()]
+    assert cli.main([*said, "--output", str(tmp_path / "new")]) == 2
     assert "cameras.json" in capsys.readouterr().err and not (tmp_path / "new").exists()
 
 

@@ -18,11 +18,13 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from balls import RED, Splatted
 from budgets import budget
 from torch import nn
 from viewer_client import Client
 
 import lumigraph.methods
+import lumigraph.viewer.viewer as viewer_module
 from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main

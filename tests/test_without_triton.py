@@ -18,23 +18,21 @@ sys.modules["triton"] = None  # what an import of it then raises is what it rais
 import torch
 from lumigraph import kernels
 from lumigraph.errors import LumigraphError
-from lumigraph.kernels import operations, using
+from lumigraph.kernels import using
 x = torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)
 assert kernels.spherical_harmonics(x, 2).shape == (5, 4)
-for name in operations():
-    try:
-        with using("gpu"):
-            kernels.spherical_harmonics(x, 2)
-    except LumigraphError as fault:
-        print(fault)
+try:
+    with using("gpu"):
+        kernels.spherical_harmonics(x, 2)
+except LumigraphError as fault:
+    print(fault)
 """
 
 
 def test_the_package_works_and_gpu_kernels_say_what_is_missing():
     done = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    told = set(done.stdout.splitlines())
-    (sentence,) = told
+    (sentence,) = done.stdout.splitlines()
     assert sentence.startswith("The GPU kernel spherical_harmonics needs Triton, which is not installed")
 
 
