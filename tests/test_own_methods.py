@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -21,7 +18,6 @@ from lumigraph.run import Run
 pytestmark = budget("runs", 8)
 
 SOURCE = (Path(__file__).parent / "methods" / "voxel_grid.py").read_text()
-HERE = Path(__file__).parent
 
 
 @pytest.fixture(autouse=True)
@@ -42,26 +38,25 @@ def own(tmp_path) -> Path:
     return file
 
 
-def lumigraph(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """A command in a process of its own, which knows only what is installed."""
-    environment = {**os.environ, "PYTHONPATH": str(HERE.parent)}
-    command = [sys.executable, "-m", "lumigraph", *map(str, words)]
-    return subprocess.run(command, env=environment, cwd=cwd, capture_output=True, text=True)
+def command(capsys, *words: object) -> tuple[int, str]:
+    """A command as in a process of its own, which knows only what is installed; its exit code and what it prints."""
+    methods._registered.clear()
+    capsys.readouterr()
+    code = main([str(word) for word in words])
+    return code, "".join(capsys.readouterr())
 
 
-def test_a_file_is_trained_by_the_command_and_its_run_opens_again(own, ball_folder, tmp_path):
-    told = ["--steps", 3, "--output", "run", "--device", "cpu", "--cells", 6]
-    done = lumigraph("--method-file", own, "train", "my-grid", ball_folder, *told, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "run/config.json").read_text())["method_file"] == str(own)
-    opened = lumigraph("eval", "run", "--views", 1, cwd=tmp_path)  # the user has loaded this file before
-    assert opened.returncode == 0, opened.stderr
-    own.write_text(own.read_text() + "\nprint('changed')\n")
-    refused = lumigraph("eval", "run", "--views", 1, cwd=tmp_path)
-    assert refused.returncode == 2 and f"give --method-file {own} if you trust it" in refused.stderr
-    assert "changed" not in refused.stdout
-    again = lumigraph("eval", "run", "--views", 1, f"--method-file={own}", "--overwrite", cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
+def test_a_file_is_trained_by_the_command_and_its_run_opens_again(own, ball_folder, tmp_path, capsys):
+    run = tmp_path / "run"
+    told = ["--steps", 3, "--output", run, "--device", "cpu", "--cells", 6]
+    assert command(capsys, "--method-file", own, "train", "my-grid", ball_folder, *told)[0] == 0
+    assert json.loads((run / "config.json").read_text())["method_file"] == str(own)
+    assert command(capsys, "eval", run, "--views", 1)[0] == 0  # the user has loaded this file before
+    own.write_text(own.read_text() + "\nprint('it ran')\n")
+    code, said = command(capsys, "eval", run, "--views", 1)
+    assert code == 2 and f"give --method-file {own} if you trust it" in said and "it ran" not in said
+    code, said = command(capsys, "eval", run, "--views", 1, f"--method-file={own}", "--overwrite")
+    assert code == 0 and "it ran" in said
 
 
 def test_a_run_from_elsewhere_runs_nothing(own, tmp_path):

@@ -56,12 +56,16 @@ def outcome(call: Callable[[], object]) -> str:
 def write_tum(folder: Path) -> Path:
     folder.mkdir()
     for i, pose in enumerate(tiny.poses(4)):
-        Image.fromarray(tiny.picture(pose)[..., :3]).save(folder / f"{i}.png")
+        Image.fromarray(tiny.picture(pose)[..., :3]).resize((32, 24)).save(folder / f"{i}.png")
     rows = [f"{i} {i} 0 0 0 0 0 1" for i in range(4)]
     (folder / "rgb.txt").write_text("\n".join(f"{i} {i}.png" for i in range(4)))
     (folder / "groundtruth.txt").write_text("\n".join(rows))
     (folder / "camera.txt").write_text("32 32 12 12")
     return folder
+
+
+def write_blender(folder: Path) -> Path:
+    return tiny.write_blender(folder, 4)
 
 
 def write_seven(folder: Path) -> Path:
@@ -75,7 +79,7 @@ def write_seven(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("make", [zeros, os.mkfifo], ids=["device", "pipe"])
-@pytest.mark.parametrize("write", [tiny.write_blender, write_tum, write_seven])
+@pytest.mark.parametrize("write", [write_blender, write_tum, write_seven])
 def test_no_capture_waits_for_a_file_that_never_ends(tmp_path, write, make):
     folder = write(tmp_path / "capture")
     assert outcome(lambda: open_scene(folder)) == ""

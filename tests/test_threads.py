@@ -117,6 +117,7 @@ def test_a_busy_machine_is_told(monkeypatch):
 
 
 def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
+    threads.WATCH.stop()  # of earlier tests
     monkeypatch.setattr(threads, "POLL_SECONDS", 0.0)
     monkeypatch.setattr(threads, "SLEEP_POLLS", 3)
     shares, log, over = iter([0.0, 0.1, 0.9, 0.0, 0.9, 0.9, 0.0, 0.5]), [], threading.Event()
@@ -174,7 +175,7 @@ def test_python_works_as_the_command_line_does(watch, monkeypatch, way, ball_run
     """Every way enters the same watch and settles memory, so that steps take equally long."""
     settled = list[str]()
     monkeypatch.setattr(work, "settle_memory", lambda: settled.append(way))
-    method, scene = tiny.method(), tiny.scene()
+    method, scene = tiny.method().eval(), tiny.scene()
     seen = list[bool]()
     monkeypatch.setattr(type(method), "render_rays", noting(type(method).render_rays, seen, watch))
     monkeypatch.setattr(type(method), "batch", noting(type(method).batch, seen, watch))

@@ -330,6 +330,8 @@ def taken_back(folder: Path, useless: Callable[[], bool]) -> Iterator[None]:
                 files.remove(preview)
             for name in ("config.json", "cameras.json", "metrics.jsonl", LOCK_FILE):
                 files.remove(folder / name)
+            if [path.name for path in folder.glob("*") if path.name not in ("previews", "checkpoints")] == [MARKS_FILE]:
+                files.remove(folder / MARKS_FILE)
             for place in (folder / "previews", folder / "checkpoints", folder):
                 with contextlib.suppress(OSError):  # somebody else's files are in it
                     place.rmdir()

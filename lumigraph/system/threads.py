@@ -133,7 +133,7 @@ class Contention:
         pairs = [(before, now[name]) for name, before in self._before.items() if name in now]
         self._before = now
         ran, waited = (sum(after[i] - before[i] for before, after in pairs) for i in (0, 1))
-        return waited / max(ran + waited, MIN_RUNNING_SHARE * POLL_SECONDS * 1e9)
+        return waited / max(ran + waited, MIN_RUNNING_SHARE * POLL_SECONDS * 1e9, 1)
 
     @staticmethod
     def _now() -> dict[str, list[int]]:
