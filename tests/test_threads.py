@@ -143,7 +143,7 @@ def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
 @pytest.fixture
 def watch(monkeypatch):
     """A watch of one's own, in an environment in which threads may be watched."""
-    made = threads.Watch()
+    made = threads.ContentionWatch()
     monkeypatch.setattr(threads, "WATCH", made)
     monkeypatch.setenv("GOMP_SPINCOUNT", str(threads.SPIN_COUNT))
     monkeypatch.delenv(OPT_OUT, raising=False)
@@ -196,7 +196,7 @@ def test_python_works_as_the_command_line_does(watch, monkeypatch, way, ball_run
     assert not watch.running and not settled
 
 
-def noting(function, seen: list[bool], watch: threads.Watch):
+def noting(function, seen: list[bool], watch: threads.ContentionWatch):
     """A function that notes whether the watch is on while it runs."""
 
     def noted(*told, **more):

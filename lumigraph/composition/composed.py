@@ -62,6 +62,9 @@ def cropped(method: Method, crop: Crop) -> Method:
 class Composed(Method):
     """Base of compositions: parts at places, not trainable. count: of parts, those of compositions among them"""
 
+    count: int
+    rays_per_chunk: int
+
     def __init__(self, frame: Frame, parts: Sequence[Placed]):
         super().__init__(frame, None)
         self.pieces = tuple(parts)

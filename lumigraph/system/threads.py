@@ -70,7 +70,7 @@ def considerate() -> Iterator[None]:
         WATCH.leave()
 
 
-class Watch:
+class ContentionWatch:
     """A thread that makes way for other programs while anybody works, and a little longer: work comes in short pieces,
     such as pictures."""
 
@@ -118,7 +118,7 @@ class Watch:
         return contention()
 
 
-WATCH = Watch()
+WATCH = ContentionWatch()
 
 
 class Contention:
