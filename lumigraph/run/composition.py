@@ -87,6 +87,8 @@ class Composition(Opened):
     count:     of its parts, those of its compositions counted as often as they are named
     """
 
+    count: int
+
     def __init__(self, path: Path | str, open_part: Callable[[Path, Nesting], Opened], within: Nesting | None = None):
         self.path, within = Path(path), within or Nesting()
         here = self.path.resolve()
