@@ -18,6 +18,7 @@ import pytest
 import tiny
 import torch
 from budgets import budget
+from PIL import Image
 from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
@@ -351,6 +352,23 @@ def test_the_command_goes_on_and_refuses_other_settings(street, run, tmp_path, c
     told[told.index("--steps") + 1] = 8
     assert train(*told) == 2
     assert "another budget; choose another --output" in capsys.readouterr().err
+
+
+def test_a_run_in_blocks_resumes_by_its_own_plan(street, run, tmp_path, capsys):
+    planned(street, tmp_path / "big")
+    assert main(["resume", str(tmp_path / "big"), "--steps", "9"]) == 2
+    assert "goes on as it began, so --steps is not for it" in capsys.readouterr().err
+    (tmp_path / "big/blocks/2/task.json").unlink()  # as after a kill while the plan was written
+    assert main(["resume", str(tmp_path / "big")]) == 0
+    assert all(Run(tmp_path / f"big/blocks/{name}").state.step == STEPS for name in "012")
+
+
+def test_photographs_that_changed_are_noticed_in_blocks_too(street, run, tmp_path):
+    moved = shutil.copytree(street, tmp_path / "street")
+    picture = next(path for path in sorted(moved.rglob("*")) if path.suffix in (".png", ".jpg"))
+    Image.fromarray(255 - np.array(Image.open(picture))).save(picture)
+    with pytest.warns(LumigraphWarning, match=f"1 photograph of .* changed since .*{picture.name}"):
+        BlockRun(run).dataset(str(moved))
 
 
 def test_one_block_is_learnt_again_and_the_others_stay(street, run, tmp_path, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -203,6 +204,14 @@ def test_floaters_of_a_run_are_a_finding(cloud_run):
     assert count >= 10 and finding.photograph == "" and finding.fault == "floaters"
     assert f"{count} of {len(gaussians)} Gaussians" in finding.evidence and "lumigraph clean" in finding.advice
     assert of_floaters(cloud_run, tiny.method(scene.frame), scene) == []
+
+
+def test_a_run_without_its_cameras_is_left_as_it_is(cloud_run, tmp_path, capsys):
+    run = shutil.copytree(cloud_run.folder, tmp_path / "run")
+    (run / "cameras.json").write_text("{}")
+    said = ["clean", str(run), "--strength", "0", "--box", *"-1 -1 -1 1 1 0".split()]
+    assert cli.main([*said, "--output", str(tmp_path / "new")]) == 2
+    assert "cameras.json" in capsys.readouterr().err and not (tmp_path / "new").exists()
 
 
 REFUSED = {

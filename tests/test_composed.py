@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -22,7 +23,7 @@ from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.method.capabilities import HasDensity, HasGaussians, HasLooks, can
 from lumigraph.method.controls import Control
-from lumigraph.run import open_any
+from lumigraph.run import open_any, opening
 from lumigraph.run.composition import (
     CompositionPart,
     place_from_json,
@@ -314,6 +315,39 @@ def test_a_circle_of_compositions_is_refused(folder):
     write_composition(folder / "outer.json", [CompositionPart("red.ply", HERE), CompositionPart("inner.json", HERE)])
     with pytest.raises(LumigraphError, match=r"outer\.json holds itself"):
         open_any(folder / "outer.json")
+
+
+def test_each_path_is_opened_once_however_often_it_is_named(folder, monkeypatch):
+    write_composition(folder / "many.json", [CompositionPart("red.ply", HERE)] * 400)
+    opened, read = list[Path](), opening.read_gaussians
+    monkeypatch.setattr(opening, "read_gaussians", lambda path: opened.append(path) or read(path))
+    many = open_any(folder / "many.json")
+    assert len(opened) == 1 and many.count == 400
+    monkeypatch.setattr("lumigraph.system.memory.free_memory", lambda: 1 << 20)
+    with pytest.raises(LumigraphError, match=r"many\.json with 400 parts would need .* GB of memory.*name fewer parts"):
+        many.method()
+
+
+def test_files_that_name_each_other_twice_end_in_a_sentence(folder):
+    for i in range(25):
+        part = CompositionPart(f"twice{i + 1}.json" if i < 24 else "red.ply", HERE)
+        write_composition(folder / f"twice{i}.json", [part, part])
+    with pytest.raises(LumigraphError, match=r"twice15\.json has 1,024 parts, and 1,000 are the most"):
+        open_any(folder / "twice0.json")
+    assert open_any(folder / "twice20.json").count == 32
+
+
+def test_a_long_chain_of_compositions_ends_in_a_sentence(folder):
+    for i in range(1500):
+        said = {"format": "lumigraph composition 1", "parts": [{"source": f"chain{i + 1}.json"}]}
+        (folder / f"chain{i}.json").write_text(json.dumps(said))
+    with pytest.raises(LumigraphError, match=r"chain32\.json lies inside 32 compositions"):
+        open_any(folder / "chain0.json")
+
+
+def test_many_parts_that_march_take_fewer_rays_at_a_time():
+    parts = [Placed(Marched(RED), HERE, leads=i == 0) for i in range(8)]
+    assert compose(WHITE, parts).rays_per_chunk == Marched(RED).rays_per_chunk // 8
 
 
 def test_the_command_writes_a_file_that_everything_opens(folder, tmp_path, monkeypatch, capsys):

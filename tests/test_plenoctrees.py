@@ -245,6 +245,13 @@ def test_a_part_teaches_the_leaves_that_rays_touch_and_no_other(ball):
         torch.testing.assert_close(sparse.to_dense(), dense)
 
 
+def test_an_octree_is_no_deeper_than_pixels():
+    made = method(octree_depth=10)
+    made.from_field(Ball(), tiny.scene().cameras)
+    assert made.leaves.tree.depth == 5  # 32 cells for 24 pixels
+    assert method(octree_depth=3)._baking(tiny.scene().cameras).depth == 3
+
+
 def test_captures_without_bounds_are_refused():
     with pytest.raises(LumigraphError, match="has no bounds"):
         PlenOctrees(Frame(reach=4.0), PlenOctrees.smallest())

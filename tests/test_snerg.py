@@ -225,6 +225,17 @@ def test_the_papers_network_is_baked_as_well():
     assert method.stage == ATLAS and not sum(x.numel() for x in method.network.parameters())
 
 
+@pytest.mark.parametrize("frame", [tiny.scene().frame, OPEN])
+def test_voxels_are_no_finer_than_half_a_pixel(frame):
+    """However many are asked for: a field that has learnt little is dense all over, and so would be the voxels."""
+    method = SNeRG(frame, changed(SNeRG.smallest(), resolution=1000))
+    fit(method, replace(tiny.scene(), frame=frame), steps=16, show=False, rehearsal=False)
+    assert method.stage > FIELD and int(method.voxels.size.max()) <= 2 * tiny.SIZE + method.voxels.block
+    again = SNeRG(frame, method.config)
+    again.load_state_dict({name: x for name, x in method.state_dict().items() if name == "longest_side"}, strict=False)
+    assert int(again.longest_side) == tiny.SIZE  # a resumed run bakes the same
+
+
 @pytest.mark.parametrize("whole", [True, False])
 def test_an_open_capture_is_baked_whole_or_within_its_box(whole):
     scene = replace(tiny.scene(), frame=OPEN)

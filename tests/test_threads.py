@@ -10,10 +10,15 @@ import time
 from pathlib import Path
 
 import pytest
+import tiny
 import torch
 
-from lumigraph.system import threads
+from lumigraph.commands.cli import main
+from lumigraph.evaluation import evaluate
+from lumigraph.system import threads, work
 from lumigraph.system.allocation import USER_SETTINGS
+from lumigraph.system.work import OPT_OUT
+from lumigraph.training import fit
 
 LOOP = """
 import lumigraph, torch, numpy
@@ -112,6 +117,7 @@ def test_a_busy_machine_is_told(monkeypatch):
 
 
 def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
+    threads.WATCH.stop()  # of earlier tests
     monkeypatch.setattr(threads, "POLL_SECONDS", 0.0)
     monkeypatch.setattr(threads, "SLEEP_POLLS", 3)
     shares, log, over = iter([0.0, 0.1, 0.9, 0.0, 0.9, 0.9, 0.0, 0.5]), [], threading.Event()
@@ -132,6 +138,72 @@ def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
     assert "crowd" not in [thread.name for thread in threading.enumerate()]  # Python that ended now would abort
     assert len(log) == 2  # at 0.9 until three looks later, and at 0.5
     assert all(leave.is_set() for leave in log)
+
+
+@pytest.fixture
+def watch(monkeypatch):
+    """A watch of one's own, in an environment in which threads may be watched."""
+    made = threads.ContentionWatch()
+    monkeypatch.setattr(threads, "WATCH", made)
+    monkeypatch.setenv("GOMP_SPINCOUNT", str(threads.SPIN_COUNT))
+    monkeypatch.delenv(OPT_OUT, raising=False)
+    yield made
+    made.stop()
+
+
+@pytest.mark.skipif(not threads.TASKS_FOLDER.exists(), reason="tells what threads wait for by /proc")
+def test_the_watch_outlives_short_work_and_ends_after_it(watch, monkeypatch):
+    monkeypatch.setattr(threads, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(threads, "LINGER_SECONDS", 0.3)
+    with threads.considerate():
+        first = watch._thread
+        with threads.considerate():
+            assert watch._thread is first and watch.running
+    with threads.considerate():
+        assert watch._thread is first
+        time.sleep(0.5)
+        assert watch.running  # as long as anybody works
+    first.join(10)
+    assert not watch.running
+    with threads.considerate():
+        assert watch.running and watch._thread is not first
+
+
+@pytest.mark.skipif(not threads.TASKS_FOLDER.exists(), reason="tells what threads wait for by /proc")
+@pytest.mark.parametrize("way", ["fit", "render", "evaluate", "cli"])
+def test_python_works_as_the_command_line_does(watch, monkeypatch, way, ball_run):
+    """Every way enters the same watch and settles memory, so that steps take equally long."""
+    settled = list[str]()
+    monkeypatch.setattr(work, "settle_memory", lambda: settled.append(way))
+    method, scene = tiny.method().eval(), tiny.scene()
+    seen = list[bool]()
+    monkeypatch.setattr(type(method), "render_rays", noting(type(method).render_rays, seen, watch))
+    monkeypatch.setattr(type(method), "batch", noting(type(method).batch, seen, watch))
+    if way == "fit":
+        fit(method, scene, steps=2, show=False, rehearsal=False)
+    elif way == "render":
+        method.render(scene.cameras[0])
+    elif way == "evaluate":
+        evaluate(method, scene, views=1)
+    else:
+        assert main(["eval", str(ball_run.folder), "--views", "1"]) == 2  # its photographs are in memory alone
+        assert main(["render", str(ball_run.folder), "--frames", "1", "--overwrite"]) == 0
+    assert seen and all(seen) and settled
+    watch.stop()
+    settled.clear()
+    monkeypatch.setenv(OPT_OUT, "1")
+    method.render(scene.cameras[0])
+    assert not watch.running and not settled
+
+
+def noting(function, seen: list[bool], watch: threads.ContentionWatch):
+    """A function that notes whether the watch is on while it runs."""
+
+    def noted(*told, **more):
+        seen.append(watch.running)
+        return function(*told, **more)
+
+    return noted
 
 
 @pytest.mark.skipif(not threads.TASKS_FOLDER.exists(), reason="tells what threads wait for by /proc")

@@ -18,11 +18,13 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from balls import RED, Splatted
 from budgets import budget
 from torch import nn
 from viewer_client import Client
 
 import lumigraph.methods
+import lumigraph.viewer.viewer as viewer_module
 from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
@@ -616,6 +618,21 @@ def test_twenty_clients_and_some_that_leave(learnt, tmp_path):
 def stopped(thread: threading.Thread) -> bool:
     thread.join(5)
     return not thread.is_alive()
+
+
+def test_what_was_kept_for_clients_goes_when_the_last_has_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(viewer_module, "FORGET_SECONDS", 0.1)
+    given_back = threading.Event()
+    monkeypatch.setattr("lumigraph.viewer.shared.give_back_memory", given_back.set)
+    cloud = Splatted(RED)
+    with Viewer(cloud, subject(tiny.scene(), tmp_path), choose_address(port=0)) as viewer:
+        one, other = Client(viewer.address.url), Client(viewer.address.url)
+        one.picture()
+        viewer._shared._picked = ("a crop", cloud.gaussians())
+        one.close()
+        assert not given_back.wait(0.5) and viewer._shared._picked is not None  # somebody is still there
+        other.close()
+        assert given_back.wait(10) and viewer._shared._picked is None
 
 
 def test_a_fault_in_rendering_is_told(learnt, tmp_path, capfd):

@@ -99,7 +99,17 @@ def test_another_page_is_refused(viewer, origin):
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example:{}", "localhost.evil.example:{}", "192.0.2.7:{}", "[::2]:{}", "", "127.0.0.1:{}@evil", "a:b"],
+    [
+        "evil.example:{}",
+        "localhost.evil.example:{}",
+        "192.0.2.7:{}",
+        "[::2]:{}",
+        "",
+        "127.0.0.1:{}@evil",
+        "a:b",
+        "evil@127.0.0.1:{}",
+        "a:b@localhost",
+    ],
 )
 def test_another_name_of_this_machine_is_refused(viewer, host):
     """As after DNS rebinding, where Origin and Host agree."""
@@ -196,6 +206,13 @@ def test_nonsense_is_not_understood(frame):
 
 def test_a_camera_is_understood():
     assert msgspec.msgpack.decode(understood(packed(camera()), lambda number: None)) == camera()
+
+
+def test_a_window_without_a_size_gets_a_picture(viewer, capfd):
+    client = Client(viewer.address.url, size=(0, 0))
+    assert client.picture(width=1).shape == (1, 1, 3)
+    client.close()
+    assert "ZeroDivisionError" not in capfd.readouterr().err
 
 
 def test_nonsense_harms_nobody(viewer, capfd):

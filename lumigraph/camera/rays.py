@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
+from PIL import Image
 from torch import Tensor
 
 from .loops import fill_midpoints
@@ -149,6 +151,14 @@ class Rendering:
         """The same pixels under other leading axes, e.g. (height, width)."""
         extra = {k: v.reshape(*shape, *v.shape[self.depth.ndim :]) for k, v in self.extra.items()}
         return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape), extra)
+
+    def _repr_png_(self) -> bytes | None:
+        """A notebook's view of a picture; None for rays."""
+        if self.depth.ndim != 2:
+            return None
+        held, pixels = io.BytesIO(), (self.rgb.detach().cpu().clamp(0, 1) * 255).round().byte()
+        Image.fromarray(pixels.numpy()).save(held, "PNG")
+        return held.getvalue()
 
     def cpu(self) -> Rendering:
         extra = {k: v.cpu() for k, v in self.extra.items()}

@@ -123,6 +123,7 @@ def assemble(
         layers,
         make_about(shots),
         torch.tensor([c.calibrated for c in chosen]),
+        [c.digest for c in chosen],
     )
 
 

@@ -12,8 +12,10 @@ import torch
 
 from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
+from ..files import exists, read_bytes, read_text
 from ..files.names import natural
 from ..system.library import pycolmap
+from ..system.memory import free_memory
 from .capture import Capture, Shot
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
@@ -95,9 +97,9 @@ def check_whole(place: Path) -> None:
     """
     for name, walk in (("images.bin", walk_images), ("frames.bin", walk_frames), ("rigs.bin", walk_rigs)):
         path = place / name
-        if not path.is_file():
+        if not exists(path):
             continue
-        data = path.read_bytes()
+        data = read_bytes(path, free_memory())
         try:
             if walk(data, path) > len(data):
                 raise ValueError("it ends early")
@@ -147,7 +149,7 @@ def check_turn(quaternion: Sequence[float], name: str, path: Path) -> None:
 
 def check_text(path: Path) -> None:
     """Look at the rotations of images.txt: a line for each image, which another of its details follows."""
-    lines = iter(path.read_text("utf-8", errors="replace").splitlines())
+    lines = iter(read_text(path).splitlines())
     for line in lines:
         words = line.split()
         if words and not words[0].startswith("#"):

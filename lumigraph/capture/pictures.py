@@ -30,6 +30,7 @@ from .numbers import (
     turned,
 )
 
+DIGEST_SAMPLES, DIGEST_BYTES = 16, 1 << 12  # steps from one sample of a file's content to the next; bytes of a sample
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
 MAX_KEPT = 1.2  # times as long a side stays as it is, rather than losing sharpness for few pixels
 HEIC_SUFFIXES = (".heic", ".heif", ".hif")
@@ -104,12 +105,14 @@ class Chosen:
     """A photograph as it will be used: its pixels, the size its lens was calibrated for, and the size wanted.
 
     plane: all its bits, where they are more than eight
+    digest: of its file, see `digest_of`; empty where there is none
     """
 
     picture: ImageSource
     calibrated: Size
     wanted: Size
     plane: PixelPlane | None = None
+    digest: str = ""
 
 
 def choose(shot: Shot, downscale: int | None) -> Chosen:
@@ -170,6 +173,7 @@ def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Ch
         calibrated,
         wanted,
         deep_plane(path, turn, identity),
+        digest_of(path),
     )
 
 
@@ -200,6 +204,16 @@ def stat(path: Path) -> str:
     with readable(path):
         found = path.stat()
     return f"{found.st_mtime_ns} {found.st_size}"
+
+
+def digest_of(path: Path) -> str:
+    """Size of a file and a hash of samples of its content, by which a changed photograph is noticed."""
+    with readable(path), open(path, "rb") as file:
+        size, crc = path.stat().st_size, 0
+        for number in range(DIGEST_SAMPLES + 1):
+            file.seek(max(0, size - DIGEST_BYTES) * number // DIGEST_SAMPLES)
+            crc = zlib.crc32(file.read(DIGEST_BYTES), crc)
+    return f"{size}-{crc:08x}"
 
 
 @cache

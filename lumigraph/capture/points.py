@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,8 @@ import plyfile
 from jaxtyping import Float, UInt8
 
 from ..errors import LumigraphError
+from ..files import read_bytes
+from ..system.memory import free_memory
 
 POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera positions belong to one capture
 
@@ -27,7 +30,7 @@ class SparsePoints:
 def read_ply(path: Path) -> SparsePoints:
     """Vertices with x, y, z and, where they have them, red, green, blue, and sightings (in how many photographs)."""
     try:
-        vertex = plyfile.PlyData.read(path)["vertex"]
+        vertex = plyfile.PlyData.read(io.BytesIO(read_bytes(path, free_memory())))["vertex"]
         positions = np.stack([np.asarray(vertex[k], np.float64) for k in "xyz"], -1)
         names = {p.name for p in vertex.properties}
         if names >= {"red", "green", "blue"}:
@@ -44,7 +47,7 @@ def read_ply(path: Path) -> SparsePoints:
 
 def read_points3d(path: Path) -> SparsePoints:
     """COLMAP's points3D.bin by itself: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
-    data = path.read_bytes()
+    data = read_bytes(path, free_memory())
     try:
         (count,), offset = struct.unpack_from("<Q", data), 8
         positions, colours, sightings = [], [], []

@@ -15,6 +15,7 @@ import torch
 
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
+from ..files import read_text
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, measure
@@ -59,7 +60,7 @@ def read(folder: Path) -> Capture:
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
     try:
-        lines = path.read_text(errors="replace").splitlines()
+        lines = read_text(path).splitlines()
         matrix = np.array([line.split() for line in lines if line.strip()], np.float64)
         assert matrix.shape == (size, size)
     except (ValueError, AssertionError) as fault:

@@ -15,7 +15,7 @@ import torch
 
 from ..camera.lens import Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
-from ..files import is_file
+from ..files import is_file, read_text
 from ..geometry import to_matrix
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
@@ -69,7 +69,7 @@ def read(folder: Path) -> Capture:
 
 def read_rows(path: Path, columns: int) -> list[list[str]]:
     """The words of each line that is no comment."""
-    rows = [line.split() for line in path.read_text(errors="replace").splitlines() if line.strip()[:1] not in ("", "#")]
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip()[:1] not in ("", "#")]
     try:
         for row in rows:
             numbers = [float(x) for x in (row[:columns] if columns > 2 else row[:1])]
@@ -98,7 +98,7 @@ def read_lens(folder: Path) -> Lens:
     )
     if path.is_file():
         try:
-            numbers = tuple(float(x) for x in path.read_text(errors="replace").split())
+            numbers = tuple(float(x) for x in read_text(path).split())
             assert len(numbers) in (4, 9)
         except (ValueError, AssertionError) as fault:
             raise LumigraphError(

@@ -107,7 +107,8 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
         for name, layer in scene.layers.items()
     }
     about = {name: torch.cat([values] * scales) for name, values in scene.about.items()}
-    return replace(scene, cameras=cameras, images=images, splits=splits, names=names, layers=layers, about=about)
+    scene = replace(scene, digests=scene.digests * scales, layers=layers, about=about)
+    return replace(scene, cameras=cameras, images=images, splits=splits, names=names)
 
 
 def reduced(scene: Scene, index: int, factor: int) -> tuple[np.ndarray, np.ndarray | None]:

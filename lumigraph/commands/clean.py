@@ -64,8 +64,9 @@ class Clean:
                 "or a smaller --strength"
             )
         counts = {reason: count for reason, some in reasons.items() if (count := int(some.sum()))}
+        sheet = before_and_after(opened, gaussians, which)  # reads the cameras, so it comes before anything is written
         save_picked(opened, ~which.cpu(), self.output, {"removed": counts})
-        save_picture(picture, before_and_after(opened, gaussians, which), "comparison")
+        save_picture(picture, sheet, "comparison")
         show(
             {"Gaussians": f"{int((~which).sum()):,} of {len(gaussians):,} stay"}
             | {reason: f"{count:,} went" for reason, count in counts.items()}

@@ -29,9 +29,8 @@ from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
 from ..files.ranges import coherent, domain, is_surprising, outside, shown
-from ..system.allocation import settle_memory
 from ..system.signals import exit_code, listening, number_of
-from ..system.threads import considerate
+from ..system.work import at_work
 from .bench import Bench
 from .canonicalise import Canonicalise
 from .capture import CaptureCommand
@@ -126,12 +125,14 @@ COMMANDS: dict[str, type] = {
     "methods": Methods,
     "bench": Bench,
 }
+METHOD_FILE = "--method-file"  # an option of every command
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 
   lumigraph demo                        run every step on a procedural scene, in a few minutes
   lumigraph capture PHOTOS_OR_VIDEO     find the camera poses of photographs
   lumigraph train instant-ngp PHOTOS    train on a folder of photographs or a video
-  lumigraph eval runs/PHOTOS-instant-ngp-1     compare with held-out photographs"""
+  lumigraph eval runs/PHOTOS-instant-ngp-1     compare with held-out photographs
+  lumigraph train my-method PHOTOS --method-file my.py    train a method of your own; all commands take the option"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -140,9 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         print(f"lumigraph {__version__}")
         return 0
-    settle_memory()
     try:
-        with listening(), printed_warnings(), considerate():
+        with listening(), printed_warnings(), at_work():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
@@ -181,8 +181,23 @@ def refuse(sentence: str, code: int = 2) -> int:
     return code
 
 
+def without_method_files(arguments: list[str]) -> list[str]:
+    """The arguments without each --method-file, whose methods are registered."""
+    rest, words = list[str](), iter(arguments)
+    for word in words:
+        name, equals, file = word.partition("=")
+        if name != METHOD_FILE:
+            rest.append(word)
+        elif not (path := file if equals else next(words, "")):
+            raise LumigraphError(f"{METHOD_FILE} names no file; give it the Python file of a method")
+        else:
+            methods.load(path)
+    return rest
+
+
 def parse(arguments: list[str]) -> Any:
     """The command with its options. Leaves with code 2 if they cannot be understood."""
+    arguments = without_method_files(arguments)
     commands, first, rest = dict(COMMANDS), "".join(arguments[:1]), arguments[1:]
     there = methods.available()
     named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert") else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from ..budget import Budget, Quality
@@ -17,7 +18,8 @@ class Resume:
     """Continue an interrupted run as if it had not been interrupted, or extend a run with a larger budget.
 
     A finished run may get a larger budget too. Its schedules then follow the new total: learning rates rise again and
-    decay again, and clouds may grow; coarse stages at the beginning of a run are not repeated.
+    decay again, and clouds may grow; coarse stages at the beginning of a run are not repeated. A run in blocks goes on
+    with the blocks that are not done.
     """
 
     run_folder: RunOption
@@ -44,13 +46,28 @@ class Resume:
         from ..run import Run, is_block_run
 
         if is_block_run(self.run_folder):
-            raise LumigraphError(
-                f"{self.run_folder} is a run in blocks, which the same `lumigraph train` command goes on with; for a "
-                "longer budget choose another --output"
-            )
+            return self._go_on_in_blocks(self.run_folder)
         run = Run(self.run_folder)
         with run.held():
             return self._go_on(run)
+
+    def _go_on_in_blocks(self, folder: Path) -> int:
+        """Train the blocks that are not done, as the run's own plan says, one after another in this process."""
+        from ..large.plan import PLAN_FILE, Plan
+        from ..large.planning import begin
+        from ..large.training import Workers
+        from .train import train_all
+
+        for name in ("seconds", "steps", "quality", "scene", "pause_at", "view"):
+            if getattr(self, name):
+                raise LumigraphError(
+                    f"{folder} is a run in blocks, which goes on as it began, so --{name.replace('_', '-')} is not for "
+                    "it; leave it out, or train a new run"
+                )
+        plan = Plan.read(folder / PLAN_FILE)
+        if self.device != "same":
+            raise LumigraphError(f"{folder} goes on with the device of its blocks, {plan.device}; leave --device out")
+        return train_all(folder, begin(folder, plan), Workers())
 
     def _go_on(self, run: Any) -> int:
         from ..run.derived import Inferred

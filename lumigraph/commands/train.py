@@ -88,7 +88,7 @@ class BlockOptions:
         import torch
 
         from ..large.planning import BlockRecipe, begin, make_plan
-        from ..large.training import Workers, conduct, finish
+        from ..large.training import Workers
         from ..system.memory import free_memory
 
         here = self.address is None
@@ -110,19 +110,7 @@ class BlockOptions:
         show_plan(output, plan, budget)
         gpus = 1.0 if device.type == "cuda" else 0.0
         memory = min(MEMORY_BYTES, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY_BYTES
-        found = conduct(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
-        if found.signal is not None:
-            say(f"Stopped and saved, {len(found.done)} of {len(plan.blocks)} blocks done; the same command goes on")
-            return exit_code(found.signal)
-        if found.failed:
-            first, why = next(iter(found.failed.items()))
-            raise LumigraphError(
-                f"{len(found.failed)} of {len(plan.blocks)} blocks of {output} could not be learnt; block {first}: "
-                f"{why}; the others are kept, and the same command tries again"
-            )
-        finish(output)
-        show_done(output, found)
-        return 0
+        return train_all(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
 
     def _again(self, train: Any, run: Path) -> int:
         from ..large.planning import survey
@@ -139,6 +127,26 @@ class BlockOptions:
         took = f"{ended.done.steps} steps in {ended.done.seconds:.1f} s, from {ended.done.photographs} photographs"
         show({"run": str(run), f"block {self.blocks}": took} | onward(run, source))
         return 0
+
+
+def train_all(output: Path, plan: Any, workers: Any) -> int:
+    """Train the blocks of a plan that are not done, and print what they took. Returns the exit code."""
+    from ..large.training import conduct, finish
+
+    found = conduct(output, plan, workers)
+    if found.signal is not None:
+        done = f"{len(found.done)} of {len(plan.blocks)} blocks done"
+        say(f"Stopped and saved, {done}; the same command goes on, and so does {typed('resume', output)}")
+        return exit_code(found.signal)
+    if found.failed:
+        first, why = next(iter(found.failed.items()))
+        raise LumigraphError(
+            f"{len(found.failed)} of {len(plan.blocks)} blocks of {output} could not be learnt; block {first}: "
+            f"{why}; the others are kept, and {typed('resume', output)} tries again"
+        )
+    finish(output)
+    show_done(output, found)
+    return 0
 
 
 def unfinished(prefix: str, plan: Any) -> Path:

@@ -1,5 +1,6 @@
 """Composition: several methods in one picture with mutual occlusion, and parts of one method."""
 
+from .composed import Composed as Composed
 from .composed import PickedCloud as PickedCloud
 from .composed import compose as compose
 from .composed import cropped as cropped

@@ -33,6 +33,7 @@ from ..volume import composite, packed
 from .placed import Placed
 
 NEAR_PLANE_SCALE = 0.1  # of the frame's near distance: how near to a camera Gaussians are still drawn
+MIN_CHUNK_RAYS = 256  # rays of many parts that are looked along together; more parts have more samples on each ray
 THICKNESS_SHARE = 1e-3  # of its distance: how thick a surface is that a rendered part stands as
 MIN_OPACITY = 1e-3  # opacity below which there is no surface
 OPAQUE_THRESHOLD = 1 - 1e-6  # opacity that counts as fully so
@@ -61,12 +62,17 @@ def cropped(method: Method, crop: Crop) -> Method:
 
 
 class Composed(Method):
-    """Base of compositions: parts at places, not trainable."""
+    """Base of compositions: parts at places, not trainable. count: of parts, those of compositions among them"""
+
+    count: int
+    rays_per_chunk: int
 
     def __init__(self, frame: Frame, parts: Sequence[Placed]):
         super().__init__(frame, None)
         self.pieces = tuple(parts)
         self.methods = nn.ModuleList(part.method for part in parts)  # so that they move to devices together
+        self.count = sum(part.method.count if isinstance(part.method, Composed) else 1 for part in parts)
+        self.rays_per_chunk = max(MIN_CHUNK_RAYS, RayMethod.rays_per_chunk // max(self.count, 1))
         self.eval()
 
     @property
@@ -125,8 +131,6 @@ class ComposedCloud(Composed):
 
 class ComposedMixture(Composed):
     """Parts of several kinds: some march, the rest are rendered first and stand as surfaces."""
-
-    rays_per_chunk: int = RayMethod.rays_per_chunk
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

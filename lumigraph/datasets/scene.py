@@ -231,6 +231,7 @@ class Scene:
     layers:  what else is known of every pixel, by name: depth, labels ...; read when asked for
     about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
     full_sizes: width and height of the photographs before they were reduced, where they come from files
+    digests: size and hash of each photograph's file, "" where it comes from none
     """
 
     kind: ClassVar[str] = "photographs"
@@ -247,9 +248,25 @@ class Scene:
     layers: dict[str, Layer] = field(default_factory=dict)
     about: dict[str, Tensor] = field(default_factory=dict)
     full_sizes: Int[Tensor, "photograph 2"] | None = None
+    digests: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def __repr__(self) -> str:
+        """Five lines: photographs, their sizes, the frame, what else is known, the source."""
+        sizes = sorted({(int(w), int(h)) for w, h in self.cameras.size.tolist()}, reverse=True)
+        counts = ", ".join(f"{len(index)} {split}" for split, index in self.splits.items())
+        low, high = ([round(x, 3) for x in corner] for corner in self.frame.bounds)
+        further = [*self.layers, *self.about, *([] if self.points is None else [f"{len(self.points):,} points"])]
+        more = f" to {sizes[-1][0]}x{sizes[-1][1]}" if len(sizes) > 1 else ""
+        return (
+            f"Scene of {len(self)} photographs: {counts}\n"
+            f"  size    {sizes[0][0]}x{sizes[0][1]}{more} pixels, {type(self.cameras.lens).__name__} lens\n"
+            f"  frame   {low} to {high}, reach {self.frame.reach:g}, near {self.frame.near:.3g}\n"
+            f"  also    {', '.join(further) or 'nothing else'}\n"
+            f"  source  {self.source or 'none'}"
+        )
 
     def pixels(self, split: str) -> int:
         """Number of pixels for training or comparison."""

@@ -30,9 +30,10 @@ from ..method import Method
 from ..method.capabilities import FromField, HasDensity, HasField, HasGaussians, HasLooks, RefinesPoses, can, needs
 from ..metrics import psnr
 from ..run import Opened, Run, State, build, check_new
-from ..run.derived import ConversionStart, Converted, LearntFrom, MeasuredModel
+from ..run.derived import ConversionStart, Converted, LearntFrom, MeasuredModel, whole_run
 from ..system.progress import NumberedStages, clock, track
 from ..system.signals import go_on_unless
+from ..system.work import at_work
 from ..training import fit
 from .compression.compress import bytes_of
 
@@ -72,6 +73,7 @@ class ConversionTarget:
     seed: int = 0
 
 
+@at_work()
 def convert(
     source: Opened,
     name: str,
@@ -193,15 +195,16 @@ def created(
         told = source.settings.scene
         data, options = replace(data, source=told.source), told.options
     seed = getattr(student.config, "seed", seed)
-    run = Run.create(output, student, data, seed=seed, options=options, budget=budget.to_json())
-    if isinstance(source, Run):
-        files.write_bytes(output / "cameras.json", (source.folder / "cameras.json").read_bytes(), ours=True)
-        run.settings = replace(run.settings, splits=source.settings.splits)
-    run.settings = begun.within(run.settings)
-    run.settings.write(output / "config.json")
-    if can(student, FromField):  # so that it does not begin from the photographs
-        run.save(State(), student, student.optimizers(), torch.Generator().manual_seed(seed))
-    return run
+    with whole_run(output) as folder:
+        run = Run.create(folder, student, data, seed=seed, options=options, budget=budget.to_json())
+        if isinstance(source, Run):
+            files.write_bytes(folder / "cameras.json", (source.folder / "cameras.json").read_bytes(), ours=True)
+            run.settings = replace(run.settings, splits=source.settings.splits)
+        run.settings = begun.within(run.settings)
+        run.settings.write(folder / "config.json")
+        if can(student, FromField):  # so that it does not begin from the photographs
+            run.save(State(), student, student.optimizers(), torch.Generator().manual_seed(seed))
+    return Run(output)
 
 
 def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, ConversionStart] | None:

@@ -24,6 +24,7 @@ from ..method import Method
 from ..method.capabilities import HasDistance, HasMesh, can, needs
 from ..metrics import Score, chamfer_distance, intersection_over_union, normal_consistency
 from ..system.progress import track
+from ..system.work import at_work
 from .views import reveal
 
 POINTS = 100_000  # in the volume, and on each surface (Mescheder 2019)
@@ -96,6 +97,7 @@ class ShapesEvaluation:
 
 
 @torch.no_grad()
+@at_work()
 def evaluate_shapes(
     method: Method,
     shapes: Shapes,

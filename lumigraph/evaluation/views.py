@@ -31,6 +31,7 @@ from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
+from ..system.work import at_work
 from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
@@ -162,6 +163,7 @@ class Evaluation:
         return contact_sheet(title, ["photograph", "rendering", f"{ERROR_GAIN}x error", "depth"], rows)
 
 
+@at_work()
 def evaluate(
     method: Method,
     scene: Scene,

@@ -30,7 +30,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from ..errors import LumigraphError
-from ..files import from_json, replacing_folder, write_bytes
+from ..files import from_json, read_bytes, replacing_folder, write_bytes
 from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
 from ..gaussians import Gaussians
 from .checks import Bundle, check_room, zipped
@@ -153,8 +153,8 @@ class OldMeta:
 def recognises(folder: Path) -> bool:
     """True if a folder has a meta.json with pictures of means; a run's folder has none."""
     try:
-        return b'"means"' in (folder / META).read_bytes()
-    except OSError:
+        return b'"means"' in read_bytes(folder / META)
+    except LumigraphError:
         return False
 
 

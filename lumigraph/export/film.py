@@ -26,6 +26,7 @@ from ..method import Method
 from ..method.controls import Value
 from ..system.memory import ask_for_picture
 from ..system.progress import track
+from ..system.work import at_work
 from .video import open_video
 
 PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, for the range of depth
@@ -34,6 +35,7 @@ PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, for the range of depth
 Pictures = Literal["png", "exr"]
 
 
+@at_work()
 def film(
     method: Method | Sequence[Method],
     cameras: Camera,

@@ -22,6 +22,7 @@ from ..errors import LumigraphError
 from ..method import Method
 from ..method.capabilities import HasDensity, can, needs
 from ..system.progress import counting, track
+from ..system.work import at_work
 from .surface import (
     BLOCK,
     Faces,
@@ -51,6 +52,7 @@ Way = Literal["auto", "density", "depth"]
 
 
 @torch.no_grad()
+@at_work()
 def extract_mesh(
     method: Method,
     cameras: Camera,

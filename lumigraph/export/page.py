@@ -39,6 +39,7 @@ from ..method import Method
 from ..paths import Surroundings, camera_path, film_size
 from ..paths.opening import Backdrop, Opening
 from ..system.progress import counting, track
+from ..system.work import at_work
 
 BACKDROP_VIEWS, BACKDROP_SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
 MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
@@ -149,6 +150,7 @@ def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
     return page_bytes("volumes", asdict(opening) | {"webgl": True, "packed": True} | volume.settings, packed)
 
 
+@at_work()
 def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
     """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
 

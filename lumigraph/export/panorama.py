@@ -34,6 +34,7 @@ from ..method import Method
 from ..paths import Surroundings
 from ..system.memory import ask_for_picture
 from ..system.progress import track
+from ..system.work import at_work
 
 PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two updates of the progress bar
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
@@ -55,6 +56,7 @@ def panorama(method: Method, place: Point, heading: Point, width: int) -> Render
     return sphere(method, level_camera(place, heading, Equirectangular(sphere_size(width))), "Panorama")
 
 
+@at_work()
 def sphere(method: Method, camera: Camera, name: str, columns: int | None = None) -> Rendering:
     """Rendering of an upright camera with an `Equirectangular` lens, or a subclass of it.
 

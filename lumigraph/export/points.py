@@ -19,6 +19,7 @@ from ..errors import LumigraphError
 from ..files import replacing
 from ..method import Method
 from ..system.progress import counting, track
+from ..system.work import at_work
 
 CANDIDATES_PER_POINT = 4  # pixels that are considered for each point
 MIN_COSINE = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
@@ -46,6 +47,7 @@ class PointCloud:
 
 
 @torch.no_grad()
+@at_work()
 def extract_points(
     method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64, crop: Crop | None = None
 ) -> PointCloud:

@@ -1,6 +1,7 @@
 """Files: written whole or not at all, read as typed values."""
 
 from .atomic import Kind as Kind
+from .atomic import check_room as check_room
 from .atomic import claim as claim
 from .atomic import claim_folder as claim_folder
 from .atomic import exchange as exchange
@@ -9,7 +10,9 @@ from .atomic import expanded as expanded
 from .atomic import explained as explained
 from .atomic import from_json as from_json
 from .atomic import is_file as is_file
+from .atomic import read_bytes as read_bytes
 from .atomic import read_json as read_json
+from .atomic import read_text as read_text
 from .atomic import refusal as refusal
 from .atomic import remove as remove
 from .atomic import replacing as replacing

@@ -14,6 +14,7 @@ import itertools
 import json
 import os
 import re
+import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
@@ -31,6 +32,7 @@ from .ranges import typed
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux's AT_FDCWD, RENAME_EXCHANGE
 NUMBER_LIST = re.compile(r"\[[-+.eE\d,\s]*\]")
+MAX_TEXT_BYTES = 1 << 28  # bytes of a file of JSON, poses or a log
 MAX_JSON_DEPTH = 100  # nesting levels of JSON; a recursive walk has room for them
 BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 
@@ -215,8 +217,33 @@ def read_json(path: Path, kind: Any = Any) -> Any:
     Raises LumigraphError, naming the file, if it is missing, is no JSON (NaN, infinity and numbers of hundreds of
     digits are none either), nests deeper than anything sound does, or does not hold what the kind says.
     """
-    with explained(path):
-        return typed(kind, from_json(path.read_bytes(), path), path)
+    return typed(kind, from_json(read_bytes(path), path), path)
+
+
+def read_bytes(path: Path, most: int = MAX_TEXT_BYTES) -> bytes:
+    """Contents of an ordinary file of so many bytes at most.
+
+    Raises LumigraphError, naming the file, if it is missing, too large, or a device or pipe that would never end.
+    """
+    with explained(path), open(path, "rb", opener=without_waiting) as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
+            raise LumigraphError(f"{path} is no ordinary file but a device, a pipe or a folder; name a file")
+        if about.st_size > most:
+            raise LumigraphError(
+                f"{path} has {about.st_size:,} bytes, and {most:,} are the most for such a file; restore it from a copy"
+            )
+        return file.read(most)
+
+
+def read_text(path: Path) -> str:
+    """Text of an ordinary file, as `read_bytes`; what is no UTF-8 becomes a replacement character."""
+    return read_bytes(path).decode("utf-8", errors="replace")
+
+
+def without_waiting(path: str, flags: int) -> int:
+    """Descriptor of a file, without waiting for whoever writes to a pipe."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def from_json(data: bytes, where: Path | str) -> Any:

@@ -14,6 +14,7 @@ from ..camera.lens import Mixed, OpenCV, Pinhole
 from ..camera.rays import Rendering
 from ..color.blending import over
 from ..errors import LumigraphError
+from ..system.work import at_work
 from .cloud import Gaussians
 
 FOOTPRINT_BLUR = 0.3  # square pixels added to the covariance of every footprint (Kerbl 2023; the original release)
@@ -56,6 +57,7 @@ def splat(
     return Splatted(rgb, depth, opacity, centres, opacities)
 
 
+@at_work()
 @torch.no_grad()
 def render(
     cloud: Gaussians,

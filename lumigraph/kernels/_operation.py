@@ -24,6 +24,12 @@ from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from ..errors import LumigraphError
+
+NO_TRITON = (
+    "needs Triton, which is not installed; PyTorch's CUDA and ROCm builds bring it, so install one of them, or take "
+    "--device cpu"
+)
 Engine = Literal["reference", "cpu", "gpu"]
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
@@ -156,7 +162,12 @@ def using(engine: Engine) -> Iterator[None]:
 def implementation(operation: str, tensor: Tensor) -> Callable:
     """The `run` function of an operation, on the engine that fits the tensor's device."""
     engine = _forced.get() or ("gpu" if tensor.is_cuda else "cpu")
-    return importlib.import_module(f"{__package__}.{operation}.{engine}").run
+    try:
+        return importlib.import_module(f"{__package__}.{operation}.{engine}").run
+    except ModuleNotFoundError as fault:
+        if fault.name != "triton":
+            raise
+        raise LumigraphError(f"The GPU kernel {operation} {NO_TRITON}") from fault
 
 
 def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:

@@ -34,6 +34,7 @@ from ..method.capabilities import HasGaussians, RefinesPoses, can
 from ..run.checkpoint import State
 from ..run.folder import Run
 from ..run.opened import Trained
+from ..run.records import warn_of_changes
 from ..run.settings import Settings, Source
 from .block_cache import Nearby
 from .compositing import InBlocks, merged
@@ -208,6 +209,8 @@ class BlockRun(Trained):
         before = Before(names, np.array(self.plan.upright))
         data = open_dataset(source or origin, Scene, **options, part=part, before=before)
         assert isinstance(data, Scene)
+        runs = [self.runs[block.name] for block in self.blocks if self._source(block) == origin]
+        warn_of_changes({name: digest for run in runs for name, digest in run.digests().items()}, data, self.folder)
         return replace(data, frame=self.frame)
 
     def scene(self, source: str | None = None) -> Scene:

@@ -29,7 +29,6 @@ from ..errors import LumigraphError
 from ..exchange import write_gaussians
 from ..files.locks import held
 from ..method.capabilities import HasGaussians, can
-from ..system.allocation import settle_memory
 from ..system.signals import Interrupt
 from .alignment import align_appearance
 from .block_cache import Nearby
@@ -208,7 +207,6 @@ def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
 
 def on_worker(folder: str) -> Done | str | None:
     """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped."""
-    settle_memory()
     with contextlib.redirect_stderr(sys.stdout):
         try:
             writable(Path(folder))

@@ -31,6 +31,7 @@ from ..files.locks import held
 from ..files.ranges import typed
 from ..method import Method
 from ..run import Run, build
+from ..run.records import warn_of_changes
 from ..training import fit
 from .plan import DONE_FILE, Done, Task
 
@@ -112,6 +113,7 @@ def begun(folder: Path, task: Task, data: Scene) -> tuple[Run, Method]:
         mine = task.config, task.seed, task.scene.options["part"]
         if (run.settings.config, run.settings.seed, run.settings.scene.options.get("part")) != mine:
             raise LumigraphError(f"{folder} holds a run of other settings; choose another --output")
+        warn_of_changes(run.digests(), data, folder)
         return run, run.new_method(device)
     config = typed(kind.Config, task.config, folder / "task.json", closed=True)
     method = build(kind, data.frame, config, device, task.seed, learning=True)

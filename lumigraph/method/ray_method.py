@@ -13,6 +13,7 @@ from ..budget import BY_RAY, Efforts
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Batch, Photograph, Scene
+from ..system.work import at_work
 from ..volume import composite
 from .capabilities import ColourPairs, HasLooks, needs
 from .method import Method
@@ -74,6 +75,7 @@ class RayMethod(Method):
 
         return pairs
 
+    @at_work()
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
         width, height = camera.size[0].tolist()

@@ -29,6 +29,7 @@ from ..files.partials import partial
 from ..files.plain import flatten, understood, unflatten
 from ..files.ranges import Lasted, Tally, typed
 from ..method import Method
+from ..system.memory import free_memory
 
 CHECKPOINT_FORMAT = "lumigraph checkpoint 1"
 GRID_AXES = 4  # axes of a grid of cells, of which the first is the number of the grid
@@ -191,8 +192,7 @@ class Checkpoints:
     def _read_tensors(self, checkpoint: Path, name: str) -> dict[str, Tensor]:
         path = checkpoint / name
         expected = self._about(checkpoint).files.get(name)
-        with files.explained(path):
-            data = path.read_bytes()
+        data = files.read_bytes(path, free_memory())
         if checksum(data) != expected:
             raise LumigraphError(f"{path} is damaged: its checksum is not the one it was saved with; restore a copy")
         if name == PACKED_FILE:

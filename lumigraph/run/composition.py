@@ -44,15 +44,20 @@ import torch
 from .. import files
 from ..camera import Camera
 from ..camera.crop import CropBox
-from ..composition import Placed, compose, frame_around
+from ..composition import Composed, Placed, compose, frame_around
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
+from ..method.capabilities import HasGaussians, can
+from ..system.memory import ask_for
 from .folder import Run
 from .opened import Opened
 
+MAX_PARTS = 1000  # parts of a composition, those of its compositions counted as often as they are named
+MAX_DEPTH = 32  # compositions inside each other
+CLOUD_COPIES = 2  # of each part's Gaussians while they are joined: in their place, and in the whole
 FORMAT = "lumigraph composition 1"
 CANONICAL_FORMAT = "lumigraph canonical 1"
 
@@ -66,29 +71,40 @@ class CompositionPart:
     box: CropBox | None = None
 
 
-class Composition(Opened):
-    """A composition's file, opened with all its parts. Raises LumigraphError for one that cannot be.
+@dataclass(frozen=True)
+class Nesting:
+    """Compositions around a part, and everything that was opened for them, by its resolved path."""
 
-    open_part: opens what a part names, given the files that it is a part of
-    within:    those that this one is a part of
+    above: tuple[Path, ...] = ()
+    opened: dict[Path, Opened] = field(default_factory=dict)
+
+
+class Composition(Opened):
+    """A composition's file, opened with all its parts, each path once. Raises LumigraphError for one that cannot be.
+
+    open_part: opens what a part names
+    within:    what this one is a part of
+    count:     of its parts, those of its compositions counted as often as they are named
     """
 
-    def __init__(
-        self, path: Path | str, open_part: Callable[[Path, tuple[Path, ...]], Opened], within: tuple[Path, ...] = ()
-    ):
-        self.path = Path(path)
+    count: int
+
+    def __init__(self, path: Path | str, open_part: Callable[[Path, Nesting], Opened], within: Nesting | None = None):
+        self.path, within = Path(path), within or Nesting()
         here = self.path.resolve()
-        if here in within:
+        if here in within.above:
             raise LumigraphError(f"{self.path} holds itself, by way of its parts; take that part out of it")
+        if len(within.above) >= MAX_DEPTH:
+            raise LumigraphError(
+                f"{self.path} lies inside {MAX_DEPTH} compositions, one inside another; "
+                "name its parts in a composition nearer to the first"
+            )
         self.parts, self.lead = read_composition(self.path)
-        self.opened = []
-        for part in self.parts:
-            place = self.path.parent / files.expanded(part.source)
-            if not files.exists(place):
-                raise LumigraphError(
-                    f"{self.path} names {part.source} as a part, but there is no {place}; correct its path"
-                )
-            self.opened.append(open_part(place, (*within, here)))
+        inner = Nesting((*within.above, here), within.opened)
+        self.opened = [self._open(part.source, open_part, inner) for part in self.parts]
+        self.count = sum(part.count if isinstance(part, Composition) else 1 for part in self.opened)
+        if self.count > MAX_PARTS:
+            raise LumigraphError(f"{self.path} has {self.count:,} parts, and {MAX_PARTS:,} are the most; name fewer")
         first = self.opened[self.lead].frame
         to_source = self.parts[self.lead].place @ first.to_source
         self.places = [
@@ -101,8 +117,20 @@ class Composition(Opened):
         del others[self.lead]
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
+    def _open(self, source: str, open_part: Callable[[Path, Nesting], Opened], inner: Nesting) -> Opened:
+        """What a part names, as it was opened before if it was."""
+        place = self.path.parent / files.expanded(source)
+        if not files.exists(place):
+            raise LumigraphError(f"{self.path} names {source} as a part, but there is no {place}; correct its path")
+        key = place.resolve()
+        if key not in inner.opened or key in inner.above:
+            inner.opened[key] = open_part(place, inner)
+        return inner.opened[key]
+
     def method(self, device: torch.device | str = "cpu") -> Method:
-        """All parts in one picture. A source that is named several times is held once."""
+        """All parts in one picture. A source that is named several times is held once.
+
+        Raises LumigraphError where its clouds, one for each part, do not fit into memory."""
         built: dict[Path, Method] = {}
         placed = []
         for i, (part, opened, place) in enumerate(zip(self.parts, self.opened, self.places, strict=True)):
@@ -110,6 +138,8 @@ class Composition(Opened):
             if name not in built:
                 built[name] = opened.method(device)
             placed.append(Placed(built[name], place, part.box, leads=i == self.lead))
+        needed = CLOUD_COPIES * sum(cloud_bytes(part.method) for part in placed)
+        ask_for(needed, torch.device(device), f"{self.path} with {self.count:,} parts", "name fewer parts")
         return compose(self.frame, placed).to(device)
 
     def cameras(self) -> dict[str, Camera]:
@@ -126,6 +156,14 @@ class Composition(Opened):
 
     def view_names(self) -> dict[str, list[str]]:
         return self.opened[self.lead].view_names()
+
+
+def cloud_bytes(method: Method) -> int:
+    """Bytes of the Gaussians that a method joins for a picture; 0 of one that has none."""
+    if isinstance(method, Composed):
+        return sum(cloud_bytes(part.method) for part in method.pieces)
+    held = (*method.parameters(), *method.buffers()) if can(method, HasGaussians) else ()
+    return sum(x.numel() * x.element_size() for x in held)
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ config.json                    `converted`, `inferred`: how the run began
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from .. import files
 from ..camera import Camera
+from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
@@ -26,6 +28,7 @@ from ..files.ranges import Count, Lasted, Name, Seed, Share, Tally, typed
 from ..method import Method
 from ..method.capabilities import CanPrune, needs
 from ..method.prior import Prior
+from ..system.work import at_work
 from .checkpoint import Checkpoints, State
 from .folder import Run, check_new
 from .opened import Opened
@@ -172,6 +175,7 @@ class Inferred(Origin):
     seed: Seed | None = None
 
 
+@at_work()
 def infer(made_by: Run, prior: Prior, scene: Scene, output: Path, options: dict[str, Any]) -> Run:
     """The run of one scene, in a new or empty folder, that a prior makes of its photographs to learn from.
 
@@ -181,8 +185,8 @@ def infer(made_by: Run, prior: Prior, scene: Scene, output: Path, options: dict[
     begin = time.perf_counter()
     method = prior.infer(scene)
     seconds = time.perf_counter() - begin
-    run = Run.create(output, method, scene, seed=made_by.settings.seed, options=options)
-    return kept(run, method, Inferred(str(made_by.folder.resolve()), len(scene.splits["train"]), round(seconds, 3)))
+    said = Inferred(str(made_by.folder.resolve()), len(scene.splits["train"]), round(seconds, 3))
+    return kept(output, method, scene, made_by.settings.seed, said, options)
 
 
 def draw(made_by: Run, prior: Prior, seed: int, output: Path) -> Run:
@@ -191,8 +195,8 @@ def draw(made_by: Run, prior: Prior, seed: int, output: Path) -> Run:
     begin = time.perf_counter()
     method = prior.draw(seed)
     seconds = time.perf_counter() - begin
-    run = Run.create(output, method, Drawn(f"{made_by.title}, seed {seed}", method.frame), seed=seed)
-    return kept(run, method, Inferred(str(made_by.folder.resolve()), 0, round(seconds, 3), seed))
+    said = Inferred(str(made_by.folder.resolve()), 0, round(seconds, 3), seed)
+    return kept(output, method, Drawn(f"{made_by.title}, seed {seed}", method.frame), seed, said)
 
 
 @dataclass(frozen=True)
@@ -211,12 +215,25 @@ class Drawn:
         return None
 
 
-def kept(run: Run, method: Method, said: Inferred) -> Run:
-    """The run with its method saved, and what config.json says of how it was made."""
-    run.settings = said.within(run.settings)
-    run.settings.write(run.folder / "config.json")
-    run.save(State(seconds=said.seconds), method, [], torch.Generator().manual_seed(0))
-    return run
+def kept(
+    output: Path, method: Method, data: Dataset, seed: int, said: Inferred, options: dict[str, Any] | None = None
+) -> Run:
+    """The run of a method that a prior has made, and what config.json says of how; whole, or not there."""
+    with whole_run(output) as folder:
+        run = Run.create(folder, method, data, seed=seed, options=options)
+        run.settings = said.within(run.settings)
+        run.settings.write(folder / "config.json")
+        run.save(State(seconds=said.seconds), method, [], torch.Generator().manual_seed(0))
+    return Run(output)
+
+
+@contextlib.contextmanager
+def whole_run(output: Path) -> Iterator[Path]:
+    """A folder to fill with a run, which is whole when it takes its place, or not there."""
+    for leftover in output.iterdir() if output.is_dir() else ():
+        files.remove(leftover)  # of a killed process, as `check_new` has made sure of
+    with files.replacing_folder(output) as folder:
+        yield folder
 
 
 def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:

@@ -8,13 +8,16 @@
     photographs.json, photographs.png: findings on its photographs, and the five worst
     eval.json, eval.png, renders/, report.html: what the commands made of it
 
-Nothing in it runs code when opened.
+Nothing in it runs code when opened: a method's file runs only as the user has loaded it before.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import html
 import json
+import os
 import platform
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -41,7 +44,7 @@ from ..files.ranges import check
 from ..method import Method
 from .checkpoint import PACKED_FILE, Checkpoints, State
 from .opened import Trained
-from .records import cameras_json, cameras_of, read_cameras, read_rows
+from .records import cameras_json, cameras_of, read_cameras, read_rows, warn_of_changes
 from .settings import Settings, Source, check_memory
 
 
@@ -87,7 +90,9 @@ class Run(Trained):
         """
         folder = Path(folder)
         check_new(folder)
-        place = Path(data.source)
+        place, kind = Path(data.source), type(method)
+        if methods.name_of(kind) not in methods.available():
+            methods.register(kind)  # so that this process opens the run
         settings = Settings(
             method=methods.name_of(method),
             config=asdict(method.config),
@@ -99,10 +104,11 @@ class Run(Trained):
             device=str(method.device),
             processor=processor(method.device),
             versions=versions(),
+            method_file=methods.file_of(kind),
         )
         with files.explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        with held(folder, "made a run"):
+        with held(folder, "made a run"), taken_back(folder, lambda: not files.is_file(folder / "config.json")):
             check_new(folder)  # again, for another process may have been quicker
             if isinstance(data, Scene):
                 files.write_json(folder / "cameras.json", cameras_json(data))
@@ -113,15 +119,8 @@ class Run(Trained):
     def kept_if_learnt(self) -> Iterator[None]:
         """A block in which a new run is trained. Where a fault ends it that a user can mend, before anything was kept,
         the run is taken back, so that the same command may name the same folder again."""
-        try:
+        with taken_back(self.folder, lambda: not self.has_state):
             yield
-        except LumigraphError:
-            if not self.has_state:
-                for name in ("config.json", "cameras.json", "metrics.jsonl", LOCK_FILE):
-                    files.remove(self.folder / name)
-                with contextlib.suppress(OSError):
-                    self.folder.rmdir()
-            raise
 
     def held(self) -> AbstractContextManager[None]:
         """A block in which no other process trains this run. Raises LumigraphError that says who does."""
@@ -144,10 +143,11 @@ class Run(Trained):
 
     def new_method(self, device: torch.device | str = "cpu") -> Method:
         """The run's method as it was before the first step."""
-        if self.method_name not in methods.available():
+        if not methods.known_again(self.method_name, file := self.settings.method_file):
             raise LumigraphError(
                 f"{self.folder} is a run of {self.method_name}, a method that is not installed; "
-                f"there are: {', '.join(methods.available())}"
+                + (f"it came from {file}, so give --method-file {file} if you trust it" if file else "")
+                + ("" if file else f"there are: {', '.join(methods.available())}")
             )
         kind = methods.find(self.method_name)
         with understood(self._config):
@@ -197,6 +197,8 @@ class Run(Trained):
         if not alike(self.frame.to_json(), data.frame.to_json()):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"
             raise LumigraphError(f"{source} is not what {self.folder} was trained on: {what}; train a new run on it")
+        if isinstance(data, Scene):
+            warn_of_changes(self.digests(), data, self.folder)
         return data
 
     def scene(self, source: str | None = None) -> Scene:
@@ -217,6 +219,24 @@ class Run(Trained):
             return {}
         said = read_cameras(self._cameras)
         return {split: [said.names[i] for i in index] for split, index in said.splits.items()}
+
+    def digests(self) -> dict[str, str]:
+        """Sizes and hashes of the photographs' files by name, as they were in training; see `Scene.digests`."""
+        said = read_cameras(self._cameras)
+        return dict(zip(said.names, said.digests, strict=False))
+
+    def _repr_html_(self) -> str:
+        """A notebook's view: the latest preview, and a table of what was trained on what."""
+        state, scores = self.state if self.has_state else State(), self.evaluation() or {}
+        rows = {"run": self.folder, "method": self.method_name, self.kind: self.settings.scene.source}
+        rows |= {"trained": f"{state.step:,} steps in {state.seconds:.1f} s"}
+        rows |= {"PSNR": f"{scores['psnr']:.2f} dB, held out"} if scores.get("psnr") is not None else {}
+        cells = "".join(f"<tr><th>{name}</th><td>{html.escape(str(value))}</td></tr>" for name, value in rows.items())
+        picture = ""
+        if previews := self.previews():
+            data = base64.b64encode(files.read_bytes(previews[max(previews)])).decode()
+            picture = f'<img alt="preview" src="data:image/png;base64,{data}">'
+        return f"{picture}<table>{cells}</table>"
 
     # Its state
 
@@ -299,6 +319,25 @@ def build(
     return method.to(device)
 
 
+@contextlib.contextmanager
+def taken_back(folder: Path, useless: Callable[[], bool]) -> Iterator[None]:
+    """A block after whose fault, such as a full disk, nothing of a run is left in its folder, if it is useless."""
+    try:
+        yield
+    except (LumigraphError, OSError):
+        if useless():
+            for preview in (folder / "previews").glob("*.png"):
+                files.remove(preview)
+            for name in ("config.json", "cameras.json", "metrics.jsonl", LOCK_FILE):
+                files.remove(folder / name)
+            if [path.name for path in folder.glob("*") if path.name not in ("previews", "checkpoints")] == [MARKS_FILE]:
+                files.remove(folder / MARKS_FILE)
+            for place in (folder / "previews", folder / "checkpoints", folder):
+                with contextlib.suppress(OSError):  # somebody else's files are in it
+                    place.rmdir()
+        raise
+
+
 def is_block_run(folder: Path) -> bool:
     """True if a folder contains a block run; see `large`."""
     return files.is_file(folder / "blocks.json")
@@ -313,6 +352,7 @@ def check_new(folder: Path) -> None:
     with files.explained(folder):
         if folder.exists() and not (folder.is_dir() and all(map(is_leftover, folder.iterdir()))):
             raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
+        files.check_room(Path(os.path.abspath(folder / "config.json")))
     check_place(folder)
 
 

@@ -21,7 +21,7 @@ from ..files.ranges import changed
 from ..gaussians import Gaussians
 from ..geometry import Similarity
 from ..method import Method
-from .composition import CANONICAL_FORMAT, Canonicalised, Composition
+from .composition import CANONICAL_FORMAT, Canonicalised, Composition, Nesting
 from .folder import Run, is_block_run
 from .opened import Opened, Trained
 
@@ -32,11 +32,11 @@ VOXEL_MARGIN = 0.02  # beyond [-1, 1]^3, that a voxel may reach
 WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
 
-def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
+def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a folder of
     SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
 
-    within: compositions that it is opened as a part of
+    within: what it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
     """
     path = Path(path)

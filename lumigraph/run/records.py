@@ -3,6 +3,8 @@ metrics.jsonl; the contents of eval.json and related files."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,14 @@ from .. import files
 from ..camera import Camera
 from ..camera.lens import Lens
 from ..datasets.scene import Scene
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
+from ..files.names import counted
 from ..files.ranges import Coordinate, Lasted, Row, Side, Tally, typed
 from ..geometry import RIGID_TOLERANCE
 from ..metrics import Score
 
 MAX_PIXELS = 10**9  # of one picture
+MAX_NAMES = 3  # photographs that a warning names
 
 
 @dataclass(frozen=True)
@@ -98,8 +102,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     rows = []
-    with files.explained(path):
-        lines = path.read_bytes().splitlines()
+    lines = files.read_bytes(path).splitlines()
     for line in lines:
         try:
             row = files.from_json(line, path)
@@ -119,7 +122,8 @@ def read_evaluation(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class CamerasRecord:
-    """Contents of cameras.json: one row per camera, and row numbers by split. lens: see `Lens.to_json`."""
+    """Contents of cameras.json: one row per camera, and row numbers by split. lens: see `Lens.to_json`; digests: of the
+    photographs' files, see `Scene`"""
 
     names: list[str]
     splits: dict[str, list[int]]
@@ -127,6 +131,7 @@ class CamerasRecord:
     lens: dict[str, Any]
     size: list[tuple[Side, Side]]
     time: list[Coordinate] | None = None
+    digests: list[str] = field(default_factory=list)
 
 
 def cameras_json(scene: Scene) -> dict[str, Any]:
@@ -138,7 +143,21 @@ def cameras_json(scene: Scene) -> dict[str, Any]:
         "lens": camera.lens.to_json(),
         "size": camera.size.tolist(),
         "time": None if camera.time is None else camera.time.tolist(),
+        **({"digests": scene.digests} if any(scene.digests) else {}),
     }
+
+
+def warn_of_changes(known: Mapping[str, str], data: Scene, run: Path) -> None:
+    """Warn where photographs are not the ones that a run has learnt from. known: digests by name"""
+    own = dict(zip(data.names, data.digests, strict=False))
+    if changed := [name for name, digest in known.items() if digest and own.get(name, digest) not in ("", digest)]:
+        more = f" and {len(changed) - MAX_NAMES} more" if len(changed) > MAX_NAMES else ""
+        warnings.warn(
+            f"{counted(len(changed), 'photograph')} of {data.source} changed since {run} learnt from them: "
+            f"{', '.join(changed[:MAX_NAMES])}{more}; restore them, or train a new run",
+            LumigraphWarning,
+            stacklevel=3,
+        )
 
 
 def read_cameras(path: Path) -> CamerasRecord:
@@ -146,6 +165,7 @@ def read_cameras(path: Path) -> CamerasRecord:
     said = files.read_json(path, CamerasRecord)
     count = len(said.pose)
     rows = {"names": len(said.names), "size": len(said.size), "time": count if said.time is None else len(said.time)}
+    rows |= {"digests": len(said.digests)} if said.digests else {}
     if wrong := [f"{number} of {name}" for name, number in rows.items() if number != count]:
         raise LumigraphError(f"{path} has {count} poses, but {', '.join(wrong)}; restore it from a copy")
     if not said.splits.get("train") or any(i not in range(count) for index in said.splits.values() for i in index):

@@ -56,6 +56,7 @@ class Settings:
     seed:      of all random choices
     budget:    {"steps": n} or {"seconds": s}, and what else `Budget.to_json` says
     device:    that it began on;  processor: what kind of machine that was
+    method_file: the Python file of a method from elsewhere, see `methods.load`; nothing runs it unasked
     said:      the file as it was read. What a newer version has added to it is kept when it is written again
     """
 
@@ -69,6 +70,7 @@ class Settings:
     device: str = "cpu"
     processor: str = "unknown"
     versions: dict[str, str] = field(default_factory=dict)
+    method_file: str | None = None
     said: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @staticmethod
@@ -90,6 +92,8 @@ class Settings:
     def to_json(self) -> dict[str, Any]:
         """Contents of config.json, under the same names."""
         own: dict[str, Any] = {x.name: getattr(self, x.name) for x in fields(self) if x.name != "said"}
+        if self.method_file is None:
+            del own["method_file"]
         parts = {"frame": self.frame.to_json(), "scene": self.scene.to_json()}
         return {"format": RUN_FORMAT} | self.said | own | parts
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import os
 import sys
+from functools import cache
 
 ARENA_MAX, MMAP_THRESHOLD, TRIM_THRESHOLD = -8, -3, -1  # mallopt's names for what follows
 LARGE_BYTES = 256 << 20  # size of a piece that is requested from the system, and returned to it, by itself
@@ -22,8 +24,10 @@ USER_SETTINGS = {  # by which users, and programs, say so themselves
 }
 
 
+@cache
 def settle_memory() -> None:
-    """Let all threads allocate from one arena and keep freed memory there, unless the user's environment decides.
+    """Let all threads of the process allocate from one arena and keep freed memory there, unless the user's environment
+    decides.
 
     GNU's C library gives every thread an arena of its own, whose freed memory others cannot use: a process that opened
     six viewers one after the other held 130 MB of it. Our threads are few and allocate seldom.
@@ -35,3 +39,11 @@ def settle_memory() -> None:
         for name, value in ((ARENA_MAX, 1), (MMAP_THRESHOLD, LARGE_BYTES), (TRIM_THRESHOLD, KEPT_BYTES)):
             if USER_SETTINGS[name] not in os.environ:
                 mallopt(name, value)
+
+
+def give_back_memory() -> None:
+    """Return freed memory that is kept to the system, at the end of work that took much."""
+    gc.collect()
+    if sys.platform == "linux":
+        with contextlib.suppress(AttributeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)

@@ -9,17 +9,21 @@ photographs, a sixth at 100 000 and a quarter at 40 000.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, MutableMapping
+from functools import partial
 from pathlib import Path
 
 SPIN_COUNT = 300_000  # polls for work before a thread sleeps: some milliseconds
 USER_SETTINGS = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # environment variables by which users set how threads wait
 POLL_SECONDS = 0.5  # between measurements of contention
+LINGER_SECONDS = 20.0  # after the last work, that contention is still measured
 SLEEP_POLLS = 20  # measurements during which threads then sleep
 MAX_WAITING_SHARE = 0.25  # of the time that our threads could run: above it other programs slow them down
 MIN_RUNNING_SHARE = 0.1  # of the time: threads that run less do not wait for others
@@ -49,23 +53,72 @@ def share_one_pool() -> None:
 
 @contextlib.contextmanager
 def considerate() -> Iterator[None]:
-    """Inside this block threads hardly look for work while other programs hold them up.
+    """Inside this block, and for LINGER_SECONDS after the last such block, threads hardly look for work while other
+    programs hold them up.
 
-    Only where Linux tells so; a user's own way of waiting stays.
+    Only where Linux tells so; a user's own way of waiting stays. Blocks may lie inside each other.
     """
     if not (TASKS_FOLDER / str(os.getpid()) / "schedstat").exists() or os.environ.get("GOMP_SPINCOUNT") != str(
         SPIN_COUNT
     ):
         yield
         return
-    over = threading.Event()
-    watch = threading.Thread(target=make_way, args=(over, Contention()), name="considerate", daemon=True)
-    watch.start()
+    WATCH.enter()
     try:
         yield
     finally:
-        over.set()
-        watch.join()
+        WATCH.leave()
+
+
+class ContentionWatch:
+    """A thread that makes way for other programs while anybody works, and a little longer: work comes in short pieces,
+    such as pictures."""
+
+    def __init__(self) -> None:
+        self._lock, self._over = threading.Lock(), threading.Event()
+        self._thread: threading.Thread | None = None
+        self._process, self._workers, self._left = 0, 0, 0.0
+
+    @property
+    def running(self) -> bool:
+        """True while the thread of this process lives."""
+        return self._thread is not None and self._thread.is_alive() and self._process == os.getpid()
+
+    def enter(self) -> None:
+        with self._lock:
+            if self._process != os.getpid():  # a fork has neither the thread nor those who worked
+                self._process, self._workers = os.getpid(), 0
+                self._thread = None
+                atexit.register(self.stop)  # Python that ends while a thread is inside PyTorch aborts
+            self._workers += 1
+            if not self.running or self._over.is_set():
+                self._over = threading.Event()
+                look = partial(self._held, self._over, Contention())
+                self._thread = threading.Thread(
+                    target=make_way, args=(self._over, look), name="considerate", daemon=True
+                )
+                self._thread.start()
+
+    def leave(self) -> None:
+        with self._lock:
+            self._workers, self._left = self._workers - 1, time.monotonic()
+
+    def stop(self) -> None:
+        """End the thread, and wait for it."""
+        self._over.set()
+        if self.running and self._thread is not None:
+            self._thread.join()
+
+    def _held(self, over: threading.Event, contention: Callable[[], float]) -> float:
+        """Share of the time in which others hold us up; without work for a while, 0, and it is over."""
+        with self._lock:
+            if self._workers == 0 and time.monotonic() > self._left + LINGER_SECONDS:
+                over.set()
+                return 0.0
+        return contention()
+
+
+WATCH = ContentionWatch()
 
 
 class Contention:
@@ -80,7 +133,7 @@ class Contention:
         pairs = [(before, now[name]) for name, before in self._before.items() if name in now]
         self._before = now
         ran, waited = (sum(after[i] - before[i] for before, after in pairs) for i in (0, 1))
-        return waited / max(ran + waited, MIN_RUNNING_SHARE * POLL_SECONDS * 1e9)
+        return waited / max(ran + waited, MIN_RUNNING_SHARE * POLL_SECONDS * 1e9, 1)
 
     @staticmethod
     def _now() -> dict[str, list[int]]:

@@ -23,6 +23,7 @@ from ..run import Run, State, check_memory
 from ..system.memory import peak_memory
 from ..system.progress import counting
 from ..system.signals import Interrupt
+from ..system.work import at_work
 from .demand import about_memory
 from .display import TrainingDisplay
 from .verdict import shares_seen
@@ -65,6 +66,7 @@ class Watch(Protocol):
         """So many steps are done. row: the line of metrics.jsonl, empty for most steps."""
 
 
+@at_work()
 def fit(
     method: Method,
     data: Dataset,

@@ -68,6 +68,8 @@ class Guard:
 
         With a token any IP address is accepted: DNS rebinding uses a name, and has no token.
         """
+        if "@" in host:  # user information, which no browser sends
+            return False
         try:
             name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
             _ = urlsplit(f"//{host}").port
@@ -219,7 +221,9 @@ def understood(frame: bytes | str, handle: Callable[[str], Any]) -> bytes | None
         part = handle(message.uuid)
         if part is None or not fits(part, message.updates.get("value")):
             return None
-    elif isinstance(message, (ViewerCameraMessage, TransformControlsUpdateMessage)) and not (
+    elif isinstance(message, ViewerCameraMessage):  # a hidden window has no size, and ratios of it are taken
+        message.image_width, message.image_height = max(1, message.image_width), max(1, message.image_height)
+    if isinstance(message, (ViewerCameraMessage, TransformControlsUpdateMessage)) and not (
         abs(math.hypot(*message.wxyz) - 1) < 1e-2
     ):
         return None

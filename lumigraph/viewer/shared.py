@@ -24,6 +24,7 @@ from ..method import Method, RayMethod
 from ..method.capabilities import HasGaussians, needs
 from ..paths import Surroundings
 from ..paths.opening import Backdrop, Opening, opening_of_scene, pivot, subject_of
+from ..system.allocation import give_back_memory
 from .cameras import ViewRequest
 from .scenery import Scenery
 from .turns import Turns
@@ -155,6 +156,11 @@ class Shared:
                 cloud = painted(cloud, floating, CANDIDATE_COLOUR)
             self._picked = wanted, cloud[~lost]
         return self._picked[1]
+
+    def forget(self) -> None:
+        """Drop what was computed for clients, and give its memory back to the system."""
+        self._picked = self._evidence = None
+        give_back_memory()
 
     def unwanted(self, request: ViewRequest) -> Masks:
         """Masks of the Gaussians that a client has cropped or removed, by reason. Call it inside `turns.turn`."""

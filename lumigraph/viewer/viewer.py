@@ -26,6 +26,7 @@ from .turns import Turns
 from .visitor import Visitor
 
 UPDATE_SECONDS = 1.0  # seconds between updates
+FORGET_SECONDS = 2.0  # seconds after the last client has left, at which memory is given back
 CURVE_POINTS = 200  # of the curve
 INK = "#5686d6"
 Measure = Literal["psnr", "loss"]
@@ -240,8 +241,17 @@ class Viewer:
     def _farewell(self, client: Any) -> None:
         with self._lock:
             visitor = self._visitors.pop(client.client_id, None)
+            if not self._visitors:  # once their threads have ended too
+                clearing = threading.Timer(FORGET_SECONDS, self._forget)
+                clearing.daemon = True
+                clearing.start()
         if visitor is not None:
             visitor.stop()
+
+    def _forget(self) -> None:
+        """Give back what was kept for clients, if there still is none."""
+        if not self._everyone():
+            self._shared.forget()
 
     def _clicked(self, client: Any, camera: Camera) -> None:
         with self._lock:

@@ -32,6 +32,7 @@ from ...run import Run, check_new
 from ...run.checkpoint import Checkpoints
 from ...run.derived import Compressed
 from ...system.progress import NumberedStages, clock, track
+from ...system.work import at_work
 from ...training.verdict import last_psnr
 from .model import LADDER, RUNG_POSITIONS, Model, rung_at
 
@@ -67,6 +68,7 @@ class CompressionTarget:
         return self.steps and max(1, round(share * self.steps)), self.seconds and share * self.seconds
 
 
+@at_work()
 def compress(
     run: Run,
     output: Path,

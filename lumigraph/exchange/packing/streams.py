@@ -13,6 +13,7 @@ from jaxtyping import Shaped
 from ...files.ranges import Tally, between
 
 ZSTD_LEVEL = 19  # of zstandard: 3 takes a tenth of the time and gives 5 % more
+QUICK_LEVEL = 3  # of zstandard, that tells whether differences are smaller
 MAX_ZSTD_RATIO = 1 << 15  # times that zstandard can shrink what it is given
 CHUNK_BYTES = 1 << 24  # bytes
 
@@ -43,12 +44,13 @@ class Stream:
 def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
     """An array as a stream, whichever way is smaller."""
     ways = (False, True) if array.dtype.kind in "ui" and array.ndim else (False,)
-    coder = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+    quick, coder = (zstandard.ZstdCompressor(level=level) for level in (QUICK_LEVEL, ZSTD_LEVEL))
     found = []
     for delta in ways:
         values = np.diff(array, axis=0, prepend=np.zeros_like(array[:1])) if delta else array
-        found.append((delta, coder.compress(_bytes(values))))
-    delta, data = min(found, key=lambda pair: len(pair[1]))
+        found.append((delta, _bytes(values)))
+    delta, raw = min(found, key=lambda pair: len(quick.compress(pair[1]))) if len(found) > 1 else found[0]
+    data = coder.compress(raw)
     return Stream(kind_of(array), array.shape, len(data), delta), data
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
@@ -68,7 +69,7 @@ class Config:
     final_learning_rate: LearningRate = 5e-5  # learning rate of the field at the end of the first stage
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the first stage before that rate falls
     teacher_share: Share = 0.9  # share of the budget after which the field is baked; the leaves have the rest
-    octree_depth: Annotated[int, between(1, 10)] = 9  # levels of the octree, section 4.1; 9 has 512 cells per axis
+    octree_depth: Annotated[int, between(1, 10)] = 9  # levels of the octree, section 4.1, to a pixel's size at most
     leaf_points: Annotated[int, between(1, 4096)] = 256  # points of a leaf that are averaged, section 4.1
     weight_threshold: PositiveShare = 1e-3  # least weight of a leaf on some ray, section 4.1; higher drops more leaves
     rays_per_step: BatchSize = 4096  # rays in a step of the last stage; more reduce noise, and cost time
@@ -222,7 +223,7 @@ class PlenOctrees(FieldMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
-        known, chance, numbers = teacher_of(teacher, cameras), self.random(-1), self._baking
+        known, chance, numbers = teacher_of(teacher, cameras), self.random(-1), self._baking(cameras)
         mask = met(teacher, cameras, numbers, chance) if can(teacher, HasLooks) else None
         density = density_of(teacher) if can(teacher, HasField) else known.density
         bake(self.leaves, density, mask, cameras, numbers, chance)
@@ -240,16 +241,16 @@ class PlenOctrees(FieldMethod):
     def _bake(self, cameras: Camera) -> None:
         """Bake the field into leaves, and drop it."""
         assert self.teacher is not None
-        chance, numbers = self.random(-1), self._baking
+        chance, numbers = self.random(-1), self._baking(cameras)
         mask = met(self, cameras, numbers, chance)
         bake(self.leaves, self.density, mask, cameras, numbers, chance)
         averaged_harmonics(self.leaves, self.teacher.geometry, numbers.points, chance)  # type: ignore[arg-type]  # one tensor
         self._leave_field()
 
-    @property
-    def _baking(self) -> Baking:
-        c = self.config
-        return Baking(c.octree_depth, c.leaf_points, c.weight_threshold, self.frame.near)
+    def _baking(self, cameras: Camera) -> Baking:
+        """Numbers of baking. The octree is no deeper than what has a cell for each pixel along the largest picture."""
+        c, depth = self.config, math.ceil(math.log2(int(cameras.size.max())))
+        return Baking(min(c.octree_depth, max(depth, 1)), c.leaf_points, c.weight_threshold, self.frame.near)
 
     def _leave_field(self) -> None:
         """Drop the teacher and its sampler."""

@@ -64,7 +64,7 @@ class Config:
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # share of the budget ahead of baking
     voxel_share: Share = 0.0  # share of the rest in which voxels learn too, then the small network alone; 0: none
     whole: bool = True  # bake an open capture whole, contracted; off: its box alone, for the published viewer
-    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the grid's longest side, section 5.1
+    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the grid, section 5.1, at most two for a pixel
     block_size: Annotated[int, between(4, 66)] = 32  # voxels along a block's side with its apron, section 5.1
     visibility_resolution: Annotated[int, between(8, 512)] = 256  # cells per axis that record visibility
     least_alpha: Share = 0.005  # alpha of a voxel below which it is empty, section 5.1; higher makes smaller files
@@ -87,6 +87,7 @@ class Config:
 FIELD, VOXELS, ATLAS = 0, 1, 2  # stages
 TAUGHT_VOXEL_SHARE = 0.7  # least share of the rest of the budget in which voxels of a teacher learn: they have no
 # features yet
+VOXELS_PER_PIXEL = 2  # voxels along the grid, for each pixel of a photograph's longer side, at most
 SLAB_VOXELS = 1 << 22  # voxels of a slab that is baked together
 POINTS_PER_CHUNK = 1 << 18  # points at which a field is evaluated together
 SOLID_OPACITY = 0.9  # opacity from which on a pixel of an open capture shows baked voxels, not what lies beyond
@@ -116,6 +117,7 @@ class SNeRG(FieldMethod):
 
     began:      share of the budget at which the field was baked; -1 before
     of_another: whether the voxels were made of another method
+    longest_side: pixels of the largest photograph; 0 while unknown. Voxels need not be much finer than it
     """
 
     Config = Config
@@ -123,6 +125,7 @@ class SNeRG(FieldMethod):
     stage: Tensor
     began: Tensor
     of_another: Tensor
+    longest_side: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -145,6 +148,7 @@ class SNeRG(FieldMethod):
         self.register_buffer("stage", torch.tensor(FIELD))
         self.register_buffer("began", torch.tensor(-1.0))
         self.register_buffer("of_another", torch.tensor(False))
+        self.register_buffer("longest_side", torch.tensor(0))
         self._lazy: LazyAdam | None = None
         self._adam: torch.optim.Adam | None = None
 
@@ -341,6 +345,7 @@ class SNeRG(FieldMethod):
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         if self._bounded:
             warnings.warn(BOUNDED_WARNING, LumigraphWarning, stacklevel=2)
+        self.longest_side.fill_(data.cameras.size.max())
         super().begin(data, seconds)
 
     def before_step(self, step: int, progress: float) -> None:
@@ -415,14 +420,16 @@ class SNeRG(FieldMethod):
         cells = visible.nonzero()
         if not len(cells):
             raise LumigraphError("There is nothing to bake: no ray sees anything in the box of interest; train longer")
+        resolution, longest = self.config.resolution, int(self.longest_side)
+        resolution = min(resolution, VOXELS_PER_PIXEL * longest) if longest else resolution
         if self.voxels.space:
-            count = -(-self.config.resolution // self.voxels.block) * self.voxels.block
+            count = -(-resolution // self.voxels.block) * self.voxels.block
             return self.background.new_full((3,), -2.0), 4 / count, torch.full((3,), count, device=self.device)
         low, high = (x * (2 / len(visible)) - 1 for x in (cells.amin(0), cells.amax(0) + 1))
         if self.sampler.is_open:
             bounds = torch.tensor(self.frame.bounds, device=low.device)
             low, high = torch.maximum(low, bounds[0]), torch.minimum(high, bounds[1])
-        edge = float((high - low).max()) / self.config.resolution
+        edge = float((high - low).max()) / resolution
         return low, edge, ((high - low) / edge - 1e-3).ceil().long()
 
     def _release(self) -> None:
@@ -447,6 +454,7 @@ class SNeRG(FieldMethod):
 
         Raises LumigraphError where cameras see nothing solid.
         """
+        self.longest_side.fill_(cameras.size.max())
         known, grid = teacher_of(teacher, cameras), self.visibility
         points, origins = (x.to(self.device) for x in (known.surface.points, known.surface.origins))
         seen = self.voxel_space.warp(points)
