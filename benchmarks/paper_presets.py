@@ -2,9 +2,10 @@
 
     python benchmarks/paper_presets.py nerf-w block-nerf --steps 200 --output FILE
 
-Networks, tables, grids and the samples of a ray are the preset's. Smaller are the photographs, the steps, and the rays
-of a step: about as many as take `evaluations` of the field. A run stops after 85 % of its steps, ahead of stages that
-bake a field. It shows means over each fifth of these steps, of the loss and of the PSNR of the rays it learnt from.
+Networks, tables, grids and the samples of a ray are the preset's. Smaller are the photographs, the steps, the grid of
+empty space, and the rays of a step: about as many as take `evaluations` of the field. A run stops after 85 % of its
+steps, ahead of stages that bake a field. It shows means over each fifth of these steps, of the loss and of the PSNR of
+the rays it learnt from.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from lumigraph.training import fit
 STOP, PARTS = 0.85, 5
 OBJECT = "procedural:still-life,size=64,views=40"
 SCENES = {  # by method, where that is no object
-    "block-nerf": "procedural:city,crossings=1,views=40,size=64",
+    "block-nerf": "procedural:city,crossings=2,views=40,size=64",
     "fourier-features": str(Path(__file__).parent.parent / "docs" / "images" / "block-nerf.jpg"),
     "hyp-nerf": "procedural:toys,count=10,size=32,views=10",
     "nerf-w": "procedural:tourists,size=64,views=40",
@@ -101,7 +102,7 @@ def smaller_batch(config: Any, evaluations: int) -> dict[str, int]:
     elif holds(config, "members_per_step"):
         few = {"members_per_step": 1, "rays_per_member": evaluations // 128}
     else:
-        few = {"samples_per_step": evaluations, "pixels_per_step": evaluations}
+        few = {"samples_per_step": evaluations, "pixels_per_step": evaluations, "occupancy_resolution": 32}
     return {key: value for key, value in (few | {"unseen_patches": 1}).items() if holds(config, key)}
 
 

@@ -235,7 +235,7 @@ def test_the_network_has_three_colour_layers_and_a_squared_loss():
     scene = dimmed(known=True)
     paper = BlockNeRF(scene.frame, BlockNeRF.preset(torch.device("cuda")))
     shapes = [tuple(p.shape) for p in paper.network.network.colour.parameters() if p.ndim == 2]
-    assert shapes == [(128, 512 + 24 + 32 + 9), (128, 128), (128, 128), (3, 128)]
+    assert shapes == [(128, 512 + 27 + 32 + 9), (128, 128), (128, 128), (3, 128)]
     method = made(scene, visibility=False, **NETWORK | STILL)
     batch = method.batch(scene, torch.Generator().manual_seed(0))
     batch = replace(batch, alpha=None)
