@@ -71,16 +71,18 @@ def main(options: Options) -> None:
     result = {}
     table = Table("method", "steps", "s a step", "loss", "PSNR of training rays")
     for name in options.names or methods.available():
-        found = result[name] = trained(name, options)
+        signal, found = trained(name, options)
+        result[name] = found
         curves = (" ".join(f"{x:.4g}" for x in found[curve]) for curve in ("loss", "psnr"))
         table.add_row(name, str(found["steps"]), f"{found['seconds_per_step']:.2f}", *curves)
         if options.output:
             write_json(options.output, {"processor": processor(torch.device(options.device)), "methods": result})
+        go_on_unless(signal)
     console().print(table)
 
 
-def trained(name: str, options: Options) -> dict[str, Any]:
-    """Train one method; the scene, its numbers that differ from the preset's, and the two curves."""
+def trained(name: str, options: Options) -> tuple[int | None, dict[str, Any]]:
+    """Train one method: the signal that ended it, if one did; the scene, numbers that differ, and the two curves."""
     kind, device, notes = methods.find(name), torch.device(options.device), Notes()
     source = SCENES.get(name, OBJECT)
     data = open_dataset(source, kind.learns_from)
@@ -88,11 +90,10 @@ def trained(name: str, options: Options) -> dict[str, Any]:
     method = build(kind, data.frame, changed(kind.Config(), **numbers), device, options.seed, learning=True)
     budget = {"steps": options.steps, "pause_at": int(STOP * options.steps)}
     outcome = fit(method, data, **budget, seed=options.seed, show=False, log_every=1, watch=notes)
-    go_on_unless(outcome.signal)
     curves = {key: parts([row[key] for row in notes.rows if key in row]) for key in ("loss", "psnr")}
     seconds = outcome.state.seconds / outcome.state.step
-    source = Path(source).name
-    return {"scene": source, "numbers": numbers, "steps": outcome.state.step, "seconds_per_step": seconds, **curves}
+    found = {"scene": Path(source).name, "numbers": numbers, "steps": outcome.state.step, "seconds_per_step": seconds}
+    return outcome.signal, found | curves
 
 
 def smaller_batch(config: Any, evaluations: int) -> dict[str, int]:

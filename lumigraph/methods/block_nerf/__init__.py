@@ -99,7 +99,7 @@ class BlockNeRF(FieldMethod):
                 self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
             else:
                 head = [c.head_width] * c.head_layers
-                common = dict(code=code, joining=joining, head=head, padding=0.0)
+                common: dict[str, Any] = {"code": code, "joining": joining, "head": head, "padding": 0.0}
                 self.network = FrustumField(c.network, c.hidden_width, space, **common)
                 learns_coarse, padding = c.coarse_loss_weight > 0, c.resample_padding
                 self.sampler = ConeSampler(space, c.rays, learns_coarse=learns_coarse, resample_padding=padding)
