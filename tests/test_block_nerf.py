@@ -30,6 +30,7 @@ from lumigraph.methods.block_nerf import BlockNeRF
 from lumigraph.methods.block_nerf.parts import CELLS, Moving, Visibility, transmittance
 from lumigraph.run import build
 from lumigraph.training import fit
+from lumigraph.volume import composite
 
 pytestmark = budget("methods", 15)
 
@@ -203,6 +204,47 @@ def test_every_part_can_be_left_out(options, without):
         other = method.given(appearance=1)
         assert torch.equal(other.density(points), method.density(points))
         assert not torch.equal(other.field(points, directions)[1], method.field(points, directions)[1])
+
+
+def test_refined_poses_are_held_near_the_given_ones():
+    """The weight of the changes' squares falls linearly over the budget; without weights there is no such term."""
+    scene = dimmed(known=True)
+    method = made(scene, pose_penalty=100.0, final_pose_penalty=20.0)
+    with torch.no_grad():
+        method.poses.twist.normal_(generator=torch.Generator().manual_seed(0))
+    batch = method.batch(scene, torch.Generator().manual_seed(0))
+    squares = method.poses.moves[batch.rays.image_index].square()
+    for progress, weight in (0.0, 100.0), (0.25, 80.0), (1.0, 20.0):
+        method.before_step(0, progress)
+        found = method.loss(batch, 0)["poses"]
+        torch.testing.assert_close(found, weight * squares.sum() / len(batch))
+    found.backward()
+    assert method.poses.twist.grad.any()
+    free = made(scene, pose_penalty=0.0, final_pose_penalty=0.0)
+    assert "poses" not in free.loss(batch, 0)
+
+
+def test_the_learning_rate_rises_for_as_many_steps_as_it_is_told():
+    method = made(dimmed(known=True), warmup_steps=1024, learning_rate=2e-3, final_learning_rate=2e-5)
+    rates = [method.learning_rate(step, progress) for step, progress in ((0, 0.0), (511, 0.0), (1023, 0.0), (9, 1.0))]
+    assert rates == pytest.approx([2e-3 / 1024, 1e-3, 2e-3, 2e-5 * 10 / 1024])
+
+
+def test_the_network_has_three_colour_layers_and_a_squared_loss():
+    """Section 4.2 and figure 3: f_sigma of eight layers of 512, f_c of three of 128, code and exposure behind z."""
+    scene = dimmed(known=True)
+    paper = BlockNeRF(scene.frame, BlockNeRF.preset(torch.device("cuda")))
+    shapes = [tuple(p.shape) for p in paper.network.network.colour.parameters() if p.ndim == 2]
+    assert shapes == [(128, 512 + 27 + 32 + 9), (128, 128), (128, 128), (3, 128)]
+    method = made(scene, visibility=False, **NETWORK | STILL)
+    batch = method.batch(scene, torch.Generator().manual_seed(0))
+    batch = replace(batch, alpha=None)
+    terms, codes = method.loss(batch, 0), method.codes(batch.rays.image_index)
+    for each in method.sampler.sample(batch.rays, method.network, codes, method.random(0)):
+        look = each.look(method.network, codes)
+        rgb = composite(look.samples, look.density, look.rgb, method.background).rgb
+        weight = 0.1 if each.name == "coarse" else 1.0
+        torch.testing.assert_close(terms[each.name], weight * (rgb - batch.rgb).square().mean())
 
 
 # What moves

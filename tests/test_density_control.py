@@ -8,12 +8,15 @@ import torch
 from budgets import budget
 from test_gaussians import NAMES, cloud
 
+from lumigraph import methods
+from lumigraph.errors import LumigraphError
 from lumigraph.methods.gaussian_splatting.adaptive import AdaptiveDensity, AdaptiveNumbers
 from lumigraph.methods.gaussian_splatting.cloud import Cloud, CloudAdam
 from lumigraph.methods.gaussian_splatting.density_control import PRUNE_OPACITY, RefineNumbers
 from lumigraph.methods.gaussian_splatting.initialization import initial_cloud, nearest_distance
 from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain, McmcNumbers, sample_by, shared_out
 from lumigraph.methods.gaussian_splatting.mip_filter import FILTER_VARIANCE, convolved, sampling_interval
+from lumigraph.run import build
 
 pytestmark = budget("methods")
 
@@ -124,6 +127,25 @@ def test_a_cloud_grows_no_further_than_it_may_and_says_so(generator):
     strongest = some.means.detach()[[8, 9]].clone()
     assert control.refine(some, 1.0, 12, generator)
     assert len(some) == 12 and torch.equal(some.means.detach()[10:], strongest)
+
+
+@pytest.mark.parametrize("ramp", [False, True])
+def test_a_cap_may_rise_over_the_budget_and_need_not_be(ramp, monkeypatch):
+    from lumigraph.methods.gaussian_splatting import density_control
+
+    monkeypatch.setattr(density_control, "room_for", lambda size, device: 10_000)
+    some = Cloud(cloud(10))
+    for most, caps in (110, (10, 60, 110)), (0, (10, 5010, 10_010)):
+        control = AdaptiveDensity(RefineNumbers(most, cap_ramp=ramp, refine_until=0.5), AdaptiveNumbers(), 10)
+        control.initial_count.fill_(10)
+        found = [control.current_cap(some, progress) for progress in (0.0, 0.25, 0.5)]
+        assert found == (list(caps) if ramp else [caps[-1]] * 3)
+
+
+def test_a_chain_needs_a_cap():
+    kind = methods.find("gaussian-splatting")
+    with pytest.raises(LumigraphError, match="--max-gaussians"):
+        build(kind, tiny.scene().frame, kind.Config(strategy="mcmc"), torch.device("cpu"), 0)
 
 
 def test_opacity_is_reset_for_all_but_the_faint():

@@ -20,7 +20,7 @@ from lumigraph.explain.activation import fits
 from lumigraph.methods.dvgo import DVGO, point_error, shift_of
 from lumigraph.run import build
 from lumigraph.training import fit
-from lumigraph.volume import weights_of
+from lumigraph.volume import composite, weights_of
 
 pytestmark = budget("methods", 8)
 
@@ -117,9 +117,24 @@ def test_each_sample_answers_for_its_own_colour(generator):
     samples = Samples.rows(torch.tensor([[1.0, 1.5], [2.0, 2.25]]), torch.tensor([2.0, 3.0]))
     density, rgb = torch.rand(4, generator=generator), torch.rand(4, 3, generator=generator)
     target = torch.rand(2, 3, generator=generator)
-    off = (rgb - target.repeat_interleave(2, 0)).square().mean(-1)
+    off = (rgb - target.repeat_interleave(2, 0)).square().sum(-1)
     wanted = (weights_of(samples, density) * off).sum() / 2
     torch.testing.assert_close(point_error(Look("samples", samples, density, rgb), target), wanted)
+
+
+def test_each_stage_has_weights_of_its_own():
+    scene = tiny.scene()
+    made = method(scene.frame, coarse_point_weight=0.4, point_weight=0.1, coarse_entropy_weight=0.3, entropy_weight=0.1)
+    batch = made.batch(scene, torch.Generator().manual_seed(0))
+    for stage, points, entropy in (0, 0.4, 0.3), (1, 0.1, 0.1):
+        made.network.stage.fill_(stage)
+        terms = made.loss(batch, 0)
+        (samples,), _ = made.learn(batch.rays, made.random(0))
+        look = samples.look(made.network)
+        torch.testing.assert_close(terms["points"], points * point_error(look, batch.before(made.background)))
+        opacity = composite(look.samples, look.density, look.rgb).opacity.clamp(1e-6, 1 - 1e-6)
+        chaos = torch.distributions.Bernoulli(opacity).entropy().mean()
+        torch.testing.assert_close(terms["entropy"], entropy * chaos, rtol=1e-3, atol=1e-9)
 
 
 def test_it_learns_held_out_views():

@@ -31,6 +31,7 @@ GROWING = {
     "refine_every": 10,
     "densify_grad_threshold": 1e-5,
     "max_gaussians": 600,
+    "cap_ramp": True,
     "initial_gaussians": 300,
     "opacity_reset_interval": 25,
 }

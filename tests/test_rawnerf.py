@@ -40,23 +40,29 @@ def batch_of(scene, mosaic, filters, images):
     return Batch(replace(rays, image_index=torch.tensor(images)), torch.zeros(len(mosaic), 3), None, extra)
 
 
-def test_the_loss_is_the_papers_on_the_colour_that_was_measured(night, begun, monkeypatch):
-    light = torch.tensor([[0.2, 0.3, 0.4], [0.5, 0.02, 0.1], [3.0, 3.0, 3.0], [3.0, 3.0, 3.0]], requires_grad=True)
-    opacity, moments = torch.ones(4), torch.zeros(4, 2)
-    seen = Rendering(light, torch.ones(4), opacity, {"moments": moments})
+@pytest.mark.parametrize("delta", [0.0, 1.0])
+def test_the_loss_is_the_papers_on_the_colour_that_was_measured(delta, night, begun, monkeypatch):
+    """Eq. 4: the square of the relative error, also where that is above 1; with a delta, its tangent beyond that."""
+    values = [[0.2, 0.3, 0.4], [0.5, 0.02, 0.1], [3.0, 3.0, 3.0], [3.0, 3.0, 3.0], [0.02, 0.02, 0.02]]
+    light = torch.tensor(values, requires_grad=True)
+    seen = Rendering(light, torch.ones(5), torch.ones(5), {"moments": torch.zeros(5, 2)})
     monkeypatch.setattr(begun, "light_and_spread", lambda look: seen)
+    monkeypatch.setattr(begun, "config", replace(begun.config, huber_delta=delta))
     longest = int(night.splits["train"][night.about["exposure"][night.splits["train"]].argmax()])
-    batch = batch_of(night, [0.1, -0.001, 1.2, 0.9], [0, 1, 2, 2], [longest] * 4)
+    batch = batch_of(night, [0.1, -0.001, 1.2, 0.9, 0.5], [0, 1, 2, 2, 0], [longest] * 5)
     found = begun.loss(batch, 0)["relative"]
     found.backward()
     # A full sensor says no more than that there was enough light, so the third one is right.
-    residual = torch.tensor([0.2 - 0.1, 0.02 + 0.001, 1 - 1.2, 3.0 - 0.9])
-    expected = (residual / (torch.tensor([0.2, 0.02, 1.0, 3.0]) + 1e-3)).square()
+    scale = torch.tensor([0.2, 0.02, 1.0, 3.0, 0.02]) + 1e-3  # it is no variable
+    error = torch.tensor([0.2 - 0.1, 0.02 + 0.001, 1 - 1.2, 3.0 - 0.9, 0.02 - 0.5]) / scale
+    expected, slope = error.square(), 2 * error / scale
+    assert float(error[4]) < -20
+    if delta:
+        expected[4], slope[4] = 2 * delta * error[4].abs() - delta**2, -2 * delta / scale[4]
     torch.testing.assert_close(found.detach(), expected.mean())
-    slope = 2 * residual / (torch.tensor([0.2, 0.02, 1.0, 3.0]) + 1e-3) ** 2 / 4  # what it is divided by is no variable
     slope[2] = 0
-    gradient = torch.zeros(4, 3)
-    gradient[torch.arange(4), torch.tensor([0, 1, 2, 2])] = slope
+    gradient = torch.zeros(5, 3)
+    gradient[torch.arange(5), torch.tensor([0, 1, 2, 2, 0])] = slope / 5
     torch.testing.assert_close(light.grad, gradient)
 
 

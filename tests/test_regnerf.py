@@ -11,15 +11,23 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph.camera.rays import Samples
-from lumigraph.components.training.regularizers import near_thickness, patches, roughness, unseen_cameras
+from lumigraph.camera.rays import Rays, Samples
+from lumigraph.components.training.regularizers import (
+    near_thickness,
+    normalized_distance,
+    patches,
+    roughness,
+    unseen_cameras,
+)
+from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
-from lumigraph.methods.regnerf import RegNeRF
+from lumigraph.methods.regnerf import RegNeRF, clipped, joined
 from lumigraph.methods.regnerf.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.run import build
+from lumigraph.volume import composite
 
 pytestmark = budget("methods")
 
@@ -85,7 +93,7 @@ def test_roughness_counts_what_is_opaque_alone():
     depth[0, 1, 1] = 0.5
     opaque, clear = torch.ones(1, 3, 3), torch.ones(1, 3, 3)
     clear[0, 1, 1] = 0
-    assert float(roughness(depth, opaque)) == pytest.approx(0.5 * (0.5 + 0.5) / 6)  # 2 of 6 pairs each way
+    assert float(roughness(depth, opaque)) == pytest.approx((0.5 + 0.5) / 6)  # 2 of 6 pairs each way
     assert float(roughness(depth, clear)) == 0
 
 
@@ -150,6 +158,56 @@ def test_a_step_learns_from_patches_nobody_photographed(field):
     assert moved and all(p.grad is None for p in method.flow.parameters())
 
 
+def test_the_loss_of_the_network_is_the_release_s():
+    """Colours summed over channels, eq. 6 without a half, falling weights, and a tenth of both on the coarse pass."""
+    scene = tiny.scene()
+    config = changed(RegNeRF.smallest(), likelihood_weight=0.0, depth_settling=0.5, depth_weight_start=400.0)
+    method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
+    method.before_step(0, 0.125)
+    batch = replace(method.batch(scene, chance()), alpha=None)
+    terms = method.loss(batch, 3)
+    passes = method.sampler.sample(joined(batch.rays, batch.unseen), method.network, generator=method.random(3))
+    assert [each.name for each in passes] == ["coarse", "fine"] and set(terms) == {
+        *("coarse", "fine", "smoothness", "coarse smoothness")
+    }
+    weights = {"coarse": (0.1, 0.1, "coarse smoothness"), "fine": (1.0, 300 + 0.1 / 4, "smoothness")}
+    for each in passes:
+        look, (colour, depth, name) = each.look(method.network), weights[each.name]
+        distance = normalized_distance(look.samples.t)[:, None]
+        seen = composite(look.samples, look.density, look.rgb, method.background, places=distance)
+        error = (seen.rgb[: len(batch)] - batch.rgb).square().sum() / len(batch)
+        torch.testing.assert_close(terms[each.name], colour * error)
+        opacity = seen.opacity[len(batch) :].detach().view(-1, SIDE, SIDE)
+        place = seen.extra["places"][len(batch) :, 0].view(-1, SIDE, SIDE) / opacity.clamp_min(1e-3)
+        pairs = [
+            opacity[p, i, j] * opacity[p, i + di, j + dj] * (place[p, i, j] - place[p, i + di, j + dj]) ** 2
+            for di, dj in ((0, 1), (1, 0))
+            for p in range(2)
+            for i in range(SIDE - di)
+            for j in range(SIDE - dj)
+        ]
+        torch.testing.assert_close(terms[name], depth * torch.stack(pairs).sum() / (2 * SIDE * (SIDE - 1)))
+
+
+def test_noise_is_added_to_densities_in_training_alone():
+    scene = tiny.scene()
+    method = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
+    points, before = torch.rand(500, 3, generator=chance()), method.network.noise
+    plain, noisy = (method.network.density_at(points, generator=x) for x in (None, chance()))
+    raw = [x.expm1().log() + 1 for x in (plain, noisy)]  # of the shifted softplus
+    assert before == 1.0 and float((raw[1] - raw[0]).detach().std()) == pytest.approx(1.0, abs=0.1)
+    assert torch.equal(method.density(points), method.density(points))
+
+
+def test_gradients_are_clipped_by_value_and_by_norm():
+    weight = torch.nn.Parameter(torch.zeros(4))
+    optimizer = clipped(torch.optim.SGD([weight], lr=1.0), 0.1)
+    weight.grad = torch.tensor([5.0, -5.0, 0.05, 0.0])
+    optimizer.step()
+    limited = torch.tensor([0.1, -0.1, 0.05, 0.0])
+    torch.testing.assert_close(-weight.detach(), limited * 0.1 / limited.norm())
+
+
 def test_a_table_has_numbers_of_its_own():
     """It learns five times as fast as a network, the networks behind it are smaller, and a plain CPU has it unasked."""
     config = RegNeRF.preset(torch.device("cpu"))
@@ -186,6 +244,21 @@ def test_samples_spread_from_the_middle():
         hit = far > near
         start = look.samples.t_start.view(64, -1)[:, 0]
         assert torch.allclose((start - near)[hit], ((1 - share) / 2 * (far - near))[hit], atol=1e-4)
+
+
+def test_samples_of_forward_facing_captures_spread_from_the_far_plane():
+    """Release, llff3.gin: anneal_mid_perc 1, anneal_nearfar_perc 1e-4."""
+    look = Forward(((1.0, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)), (2.0, 2.0), 1.0)
+    frame = Frame(reach=4.0, near=0.1, forward=look, image_count=4)
+    method = build(RegNeRF, frame, changed(RegNeRF.smallest(), annealing=0.5), torch.device("cpu"), 0)
+    rays = Rays(torch.zeros(5, 3), torch.tensor([0.0, 0.0, 1.0]).expand(5, 3), torch.full((5,), 1e-3))
+    for progress, share in (0.0, 1e-4), (0.25, 0.5), (0.5, 1.0):
+        method.before_step(0, progress)
+        samples = method.sampler.sample(rays, method.network, generator=chance())[0].samples
+        ends = samples.t_start.view(5, -1)[:, 0], samples.t_end.view(5, -1)[:, -1]
+        first, last = (1 - 1 / t for t in ends)  # evenly sampled, from 0 at the near plane to 1
+        torch.testing.assert_close(last, torch.full((5,), 0.999))
+        torch.testing.assert_close(first, 0.999 - share * 0.999 * torch.ones(5), atol=2e-5, rtol=0)
 
 
 def test_a_table_by_itself_learns_as_instant_ngp_does():

@@ -321,8 +321,35 @@ def test_nothing_hangs_near_camera():
     torch.testing.assert_close(camera_distance(means, positions), expected)
 
 
+RULES = ("prune_near", "limit_scale", "limit_anisotropy", "observed_harmonics")
+
+
+@pytest.mark.parametrize("rule", [None, *RULES])
+def test_each_rule_is_an_option(rule):
+    """A Gaussian before a lens, a giant, a needle, and harmonics that few photographs determine: each rule changes one
+    of these, and no rule none."""
+    method, _ = new(**({rule: True} if rule else {}))
+    fit(method, tiny.scene(), steps=1, show=False, rehearsal=False)
+    method.drawn.fill_(100)
+    cloud, camera = method.cloud, tiny.scene().cameras[1]
+    with torch.no_grad():
+        cloud.view_bits.fill_(1)
+        cloud.means[:3] = torch.stack([camera.position[0], torch.zeros(3), torch.zeros(3)])
+        cloud.log_scales[:3] = torch.tensor([[0.01] * 3, [9.0, 9.0, 0.1], [0.5, 0.01, 0.01]]).log()
+        cloud.harmonics[:, 1:] = 1.0
+        before = cloud.gaussians().log_scales.clone()
+        method.current, method.bands = SimpleNamespace(due=True), 2
+        method.tidying.after_step(method, 1)
+    scales = cloud.log_scales.detach()
+    found = {"prune_near": len(cloud) < len(before), "observed_harmonics": not cloud.harmonics[:, 1:].any()}
+    if len(cloud) == len(before):
+        limits = (scales[1:3] != before[1:3]).any(1).tolist()
+        found |= dict(zip(("limit_scale", "limit_anisotropy"), limits, strict=True))
+    assert [name for name, changed in found.items() if changed] == ([rule] if rule else [])
+
+
 def test_a_sheet_before_a_training_camera_goes():
-    method, _ = new()
+    method, _ = new(prune_near=True)
     scene = tiny.scene()
     camera = scene.cameras[1]
     fit(method, scene, steps=1, show=False, rehearsal=False)

@@ -61,8 +61,10 @@ class Config:
     feature_learning_rate: LearningRate = 0.1  # rate of the feature grid at first, section 6.1
     network_learning_rate: LearningRate = 1e-3  # rate of the colour network at first, section 6.1
     final_learning_rate: PositiveShare = 0.1  # share of these rates at the end of the budget, section 6.1
-    point_weight: NonNegative = 0.01  # weight of each sample's own colour in the loss, eq. 12; 0: off
-    entropy_weight: NonNegative = 0.001  # weight of the entropy of opacity, eq. 13; higher gives harder edges
+    coarse_point_weight: NonNegative = 0.1  # weight of each sample's own colour in the coarse stage, eq. 12; 0: off
+    point_weight: NonNegative = 0.01  # the same in the fine stage; 0: off
+    coarse_entropy_weight: NonNegative = 0.01  # weight of the entropy of opacity in the coarse stage, eq. 13; 0: off
+    entropy_weight: NonNegative = 0.001  # the same in the fine stage; higher gives harder edges
     tv_density_weight: NonNegative = 1e-3  # weight of density's total variation, in the open; higher smooths
     tv_feature_weight: NonNegative = 1e-4  # weight of features' total variation, in the open; higher smooths
     tv_interval: Steps = 8  # steps between these two terms, whose weight is multiplied by it; more are faster
@@ -176,7 +178,7 @@ class DVGO(FieldMethod):
         c = Config(occupancy, coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8)
         c = replace(c, coarse_share=0.1, doublings=3, growing_share=0.4, open_samples_per_step=1 << 16)
         c = replace(c, density_learning_rate=0.6, feature_learning_rate=0.2, network_learning_rate=5e-3)
-        return replace(c, point_weight=0.0, entropy_weight=0.0)
+        return replace(c, coarse_point_weight=0.0, point_weight=0.0, coarse_entropy_weight=0.0, entropy_weight=0.0)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -196,16 +198,16 @@ class DVGO(FieldMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Eqs. 11 to 13: squared error of rays, of each sample by its weight, entropy of opacity."""
-        generator, c = self.random(step), self.config
+        generator, c, fine = self.random(step), self.config, self.network.stage > 0
         (samples,), terms = self.learn(batch.rays, generator)
         look = samples.look(self.network)
         background = backdrop(batch, self.background, generator, self.sampler.is_open)
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         terms |= {"colour": residual.square().mean()}
-        if weight := c.point_weight:
+        if weight := c.point_weight if fine else c.coarse_point_weight:
             terms["points"] = weight * point_error(look, batch.before(self.background))
-        if weight := c.entropy_weight:
+        if weight := c.entropy_weight if fine else c.coarse_entropy_weight:
             a = rendering.opacity.clamp(1e-6, 1 - 1e-6)
             terms["entropy"] = weight * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
         if self.sampler.is_open and step % c.tv_interval == 0 and len(look.samples):
@@ -364,4 +366,4 @@ def point_error(look: Look, target: Float[Tensor, "ray 3"]) -> Float[Tensor, ""]
     """sum_i w_i |c_i - C|^2 over each ray, its mean; weights are taken as they are (eq. 12)."""
     seen = composite(look.samples, look.density.detach(), look.rgb, square=look.rgb.square().sum(-1, keepdim=True))
     squares = seen.extra["square"][:, 0] - 2 * (seen.rgb * target).sum(-1)
-    return (squares + seen.opacity * target.square().sum(-1)).mean() / 3
+    return (squares + seen.opacity * target.square().sum(-1)).mean()

@@ -118,10 +118,10 @@ def opaque(thickness: Float[Tensor, " sample"]) -> Float[Tensor, " sample"]:
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, but for samples and learning rates; `NeRFW.preset` has those of a plain CPU."""
+    """The paper's numbers, with NeRF's learning rates; `NeRFW.preset` has those of a plain CPU."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=15)  # supplement
-    rays: RayNumbers = RayNumbers(64, 64, rays_per_step=2048)  # supplement
+    rays: RayNumbers = RayNumbers(512, 512, rays_per_step=2048)  # supplement
     table: HashNumbers = HashNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()
     steps: StepNumbers = StepNumbers()
@@ -182,7 +182,8 @@ class NeRFW(FieldMethod):
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, transient_layers=2, transient_width=32, beta_min=0.1)
-        return replace(c, transient_start=0.1, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
+        c = replace(c, transient_start=0.1, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
+        return replace(c, rays=RayNumbers(64, 64, rays_per_step=2048))
 
     @classmethod
     def smallest(cls) -> Any:

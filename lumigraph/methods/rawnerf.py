@@ -45,6 +45,7 @@ class Config:
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers()
     epsilon: Positive = 1e-3  # epsilon of eq. 4; 1 is white in the longest exposure; higher: less weight in the dark
+    huber_delta: NonNegative = 0.0  # relative error at which the loss turns from squared to linear; 0: always squared
     variance_weight: NonNegative = 1e-3  # weight of the variance of weights, supplement; higher: thinner surfaces
     exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2; off: as stated
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
@@ -57,7 +58,6 @@ class Config:
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen
 DEFAULT_APERTURE = 0.06  # diameter of the lens, as a share of the distance, where a focus is told and no aperture
 MAX_APERTURE, MAX_FOCUS = 0.5, 8.0  # aperture in scene units; focus in reaches
-HUBER_DELTA = 1.0  # relative error from which on the loss is linear
 DECAY_START = 0.3  # share of the budget before the learning rate falls
 WHITE_QUANTILE = 0.97  # quantile of the light that is shown as white, where nobody said how bright to develop it
 GLANCE_PIXELS = 1 << 14  # pixels that tell how much light there is
@@ -115,13 +115,13 @@ class RawNeRF(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        return Config(**CPU_HASH, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3)
+        return Config(**CPU_HASH, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=1.0)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
         poses = PoseNumbers(refine_cameras=True)
-        return Config(**TINY_HASH, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0)
+        return Config(**TINY_HASH, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0, huber_delta=1.0)
 
     # What there is to learn from
 
@@ -220,9 +220,14 @@ class RawNeRF(FieldMethod):
         error = (shown - measured) / (shown.detach() + self.config.epsilon)
         first, second = seen.extra["moments"].unbind(-1)
         variance = (second - first.square() / seen.opacity.clamp_min(1e-3)).mean()
-        # Gross errors count linearly: noise is far below, and what is dark by mistake does not outweigh all else.
-        relative = 2 * nn.functional.huber_loss(error[known], torch.zeros_like(error[known]), delta=HUBER_DELTA)
-        return {"relative": relative, "variance": self.config.variance_weight * variance, **terms}
+        return {"relative": self.penalized(error[known]), "variance": self.config.variance_weight * variance, **terms}
+
+    def penalized(self, error: Float[Tensor, " value"]) -> Float[Tensor, ""]:
+        """The mean square of relative errors; beyond a delta the tangent of the square, so that what is dark by mistake
+        does not outweigh all else. Noise is far below."""
+        if not (delta := self.config.huber_delta):
+            return error.square().mean()
+        return 2 * nn.functional.huber_loss(error, torch.zeros_like(error), delta=delta)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,6 +52,7 @@ class CoordinateField(Field):
     keep_input: whether the input itself joins its octaves
     activation: density per unit of the coordinates from the network's output
     noise:      deviation of noise that is added to the output for density in training
+    head:       channels of the hidden colour layers; one of half the width by default
     coarse:     field of the coarse pass; None for this one
     """
 
@@ -67,6 +68,7 @@ class CoordinateField(Field):
         keep_input: bool = False,
         activation: Activation = torch.relu,
         noise: float = 0.0,
+        head: Sequence[int] = (),
         coarse: CoordinateField | None = None,
     ):
         super().__init__()
@@ -76,7 +78,7 @@ class CoordinateField(Field):
         self.encode_position, self.encode_direction = self.encodings(keep_input)
         inputs = self.encode_position.width, self.encode_direction.width + code
         shape = numbers.depth, hidden_width, numbers.skip_layer
-        self.network = CoordinateNetwork(*inputs, *shape, exact=not numbers.bfloat16)  # type: ignore[arg-type]
+        self.network = CoordinateNetwork(*inputs, *shape, not numbers.bfloat16, head)  # type: ignore[arg-type]
 
     def encodings(self, keep_input: bool) -> tuple[nn.Module, FrequencyEncoding]:
         """Encodings of places and of directions."""

@@ -3,8 +3,9 @@ position alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -45,16 +46,25 @@ class CoordinateNetwork(SkipNetwork):
 
     position, direction: widths of the encoded inputs
     exact: multiply in float32 even where bfloat16 is faster
+    head:  channels of the hidden colour layers; one of half the width by default
     Both outputs are raw; activations are the method's.
     """
 
     def __init__(
-        self, position: int, direction: int, depth: int = 8, width: int = 256, skip_layer: int = 5, exact: bool = False
+        self,
+        position: int,
+        direction: int,
+        depth: int = 8,
+        width: int = 256,
+        skip_layer: int = 5,
+        exact: bool = False,
+        head: Sequence[int] = (),
     ):
         dense = partial(Dense, exact=exact)
         super().__init__(position, depth, width, skip_layer, dense)
         self.density_layer, self.feature = dense(width, 1), dense(width, width)
-        self.colour = nn.Sequential(dense(width + direction, width // 2, True), dense(width // 2, 3))
+        widths = [width + direction, *(head or [width // 2])]
+        self.colour = nn.Sequential(*(dense(a, b, True) for a, b in pairwise(widths)), dense(widths[-1], 3))
 
     def forward(
         self, position: Encoded, direction: Float[Tensor, "sample direction"]

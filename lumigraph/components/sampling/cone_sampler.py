@@ -20,18 +20,19 @@ class ConeSampler(HierarchicalSampler):
     """Two passes of a `FrustumField`. Places along rays are edges of frustums; the second pass has its own.
 
     resample_padding: weight that every frustum has at least (alpha of eq. 17)
-    sampled_share:    share of each ray, around its middle, that is sampled in training (Niemeyer 2022, eq. 10)
+    sampled_share:    share of each ray, around `sampled_from`, that is sampled in training (Niemeyer 2022, eq. 10)
+    sampled_from:     share of the way along each ray
     """
 
     def __init__(self, *arguments: Any, resample_padding: float = 0.01, **named: Any):
         super().__init__(*arguments, **named)
-        self.resample_padding, self.sampled_share = resample_padding, 1.0
+        self.resample_padding, self.sampled_share, self.sampled_from = resample_padding, 1.0, 0.5
 
     def coarse_shares(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "ray edge"]:
         count = self.numbers.coarse_samples
         between = (0.5 + (count - 1) * stratified(len(rays), count - 1, generator, rays.origins.device)) / count
         edges = pad(pad(between, (1, 0)), (0, 1), value=1.0)
-        return edges if generator is None else 0.5 + self.sampled_share * (edges - 0.5)
+        return edges if generator is None else self.sampled_from + self.sampled_share * (edges - self.sampled_from)
 
     def fine_shares(
         self, shares: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], generator: torch.Generator | None

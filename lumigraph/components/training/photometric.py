@@ -247,6 +247,12 @@ def residuals(
     return residual, mse
 
 
-def huber(residual: Float[Tensor, "row 3"], delta: float) -> Float[Tensor, ""]:
-    """The mean of residuals' Huber loss, divided by delta, so that the linear part has slope 1."""
-    return huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
+def huber(residual: Float[Tensor, "row 3"], delta: float, reduction: str = "mean") -> Tensor:
+    """Huber loss of residuals divided by delta, so that the linear part has slope 1; with a delta of 1, the largest
+    residual of colours, the squared error.
+
+    reduction: "mean", or "none" for a row of each residual
+    """
+    if delta >= 1:
+        return residual.square().mean() if reduction == "mean" else residual.square()
+    return huber_loss(residual, torch.zeros_like(residual), reduction=reduction, delta=delta) / delta

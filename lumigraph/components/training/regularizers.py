@@ -148,9 +148,9 @@ def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch
 def roughness(
     depth: Float[Tensor, "patch row column"], opacity: Float[Tensor, "patch row column"]
 ) -> Float[Tensor, ""]:
-    """Squared difference of each two neighbouring depths of a patch, where both are opaque, mean of all pairs
-    (Niemeyer 2022, eq. 6, which has no opacity: there everything is opaque)."""
+    """Squared differences of each depth of a patch from its neighbours to the right and below, where both are opaque,
+    mean of all (Niemeyer 2022, eq. 6, which has no opacity: there everything is opaque)."""
     counts = opacity.detach()
     across = (depth[:, :, 1:] - depth[:, :, :-1]).square() * counts[:, :, 1:] * counts[:, :, :-1]
     down = (depth[:, 1:] - depth[:, :-1]).square() * counts[:, 1:] * counts[:, :-1]
-    return 0.5 * (across.mean() + down.mean())
+    return across.mean() + down.mean()

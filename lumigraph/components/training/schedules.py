@@ -13,7 +13,7 @@ from torch import Tensor
 from ...method import Part
 
 FIRST_SHARE = 0.01  # of the learning rate, at the very beginning of a warm-up
-RISE = 20  # steps in which a rate that is held rises
+RISE = 20  # steps in which a rate that is held rises, unless a Config says otherwise
 
 
 def falling(first: float, last: float, progress: float, warmup: float = 0.0) -> float:
@@ -25,14 +25,15 @@ def falling(first: float, last: float, progress: float, warmup: float = 0.0) -> 
     return rate * (FIRST_SHARE + (1 - FIRST_SHARE) * min(1.0, progress / warmup) if warmup else 1.0)
 
 
-def held(first: float, last: float, step: int, progress: float, start: float) -> float:
-    """The learning rate that rises for twenty steps, is constant until a share `start` of the budget is spent, and
-    falls to `last` exponentially.
+def held(first: float, last: float, step: int, progress: float, start: float, rise: int = RISE) -> float:
+    """The learning rate that rises for some steps, is constant until a share `start` of the budget is spent, and falls
+    to `last` exponentially.
 
     progress: share of the budget that is spent, in [0, 1]
+    rise:     steps of the warm-up
     """
     fall = max(0.0, progress - start) / (1 - start)
-    return falling(first, last, fall) * min(1.0, (step + 1) / RISE)
+    return falling(first, last, fall) * min(1.0, (step + 1) / rise)
 
 
 def exponential_decay(method: Any, step: int, progress: float) -> float:
@@ -44,7 +45,8 @@ def exponential_decay(method: Any, step: int, progress: float) -> float:
 def held_decay(method: Any, step: int, progress: float) -> float:
     """`Method.learning_rate` that is `held`, by the numbers of the Config."""
     c = method.config
-    return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+    rise = getattr(c, "warmup_steps", RISE)
+    return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start, rise)
 
 
 INITIAL_BANDS = 1 / 4  # share of the bands that are there from the beginning

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import huber_loss
 
 from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
@@ -21,11 +20,11 @@ from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayN
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
-from ...components.training.photometric import backdrop
+from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.schedules import held_decay
+from ...components.training.schedules import RISE, held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
-from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
+from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, between
 from ...method import FieldMethod
 from ...method.field import Directions, Points
 from ...volume import composite
@@ -34,15 +33,17 @@ from .parts import Exposures, Moving, Visibility
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers with a section; others are Mip-NeRF's or ours. `BlockNeRF.preset` has a CPU's."""
+    """The paper's numbers, with where it gives them; `BlockNeRF.preset` has a CPU's."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)  # mip-NeRF's
-    rays: RayNumbers = RayNumbers(128, 128)  # mip-NeRF's
+    rays: RayNumbers = RayNumbers(256, 512, rays_per_step=16_384)  # appendix
     table: HashNumbers = HashNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers(match_photographs=False)  # section 4.2.2
+    pose_penalty: NonNegative = 1e5  # weight of the squares of refined poses' changes at first, appendix; 0: none
+    final_pose_penalty: NonNegative = 0.1  # that weight at the end of the budget, reached linearly; 0: none
     field: Literal["hash", "network"] = "network"  # field of the block: Mip-NeRF's network, or a faster hash table
     appearance: bool = True  # learn an appearance code for each photograph, section 4.2.1; off: one light
     appearance_code: CodeWidth = 32  # numbers of an appearance code, section 4.2.1; more fit its light more closely
@@ -55,9 +56,12 @@ class Config:
     residual_masks: bool = False  # exclude parts of photographs with large errors, in addition to given masks
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
     own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
-    hidden_width: Width = 512  # channels of a layer; wider holds more detail, and costs time
-    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
-    final_learning_rate: LearningRate = 1e-5  # learning rate at the end of the budget, reached exponentially
+    hidden_width: Width = 512  # channels of a layer, appendix; wider holds more detail, and costs time
+    head_layers: Layers = 3  # of the network: hidden colour layers, appendix; more cost time
+    head_width: Width = 128  # of the network: channels of a hidden colour layer, appendix; wider costs time
+    learning_rate: LearningRate = 2e-3  # Adam's learning rate at first, appendix; higher: faster, may diverge
+    final_learning_rate: LearningRate = 2e-5  # learning rate at the end of the budget, reached exponentially
+    warmup_steps: Steps = 1024  # steps in which the learning rate rises, appendix; more begin more carefully
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     resample_padding: NonNegative = 0.01  # of the network: least weight of a frustum; higher samples more evenly
     coarse_loss_weight: NonNegative = 0.1  # of the network: weight of the coarse colours; 0: it only guides
@@ -78,7 +82,7 @@ class BlockNeRF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space, photographs, self.sky = space_of(frame), frame.image_count, None
-        self.poses = poses_for(frame, c.poses)
+        self.poses, self._progress = poses_for(frame, c.poses), 0.0
         # Exposures come first: the appearance of a photograph is found in its exposure.
         self.exposures = Exposures(photographs, c.exposure_frequencies) if c.exposure else None
         evidence = Photograph, Patches, Appearance
@@ -94,7 +98,9 @@ class BlockNeRF(FieldMethod):
                 self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
                 self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
             else:
-                self.network = FrustumField(c.network, c.hidden_width, space, code=code, joining=joining, padding=0.0)
+                head = [c.head_width] * c.head_layers
+                common: dict[str, Any] = {"code": code, "joining": joining, "head": head, "padding": 0.0}
+                self.network = FrustumField(c.network, c.hidden_width, space, **common)
                 learns_coarse, padding = c.coarse_loss_weight > 0, c.resample_padding
                 self.sampler = ConeSampler(space, c.rays, learns_coarse=learns_coarse, resample_padding=padding)
                 self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
@@ -105,7 +111,11 @@ class BlockNeRF(FieldMethod):
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, huber_delta=0.3)
+        c = replace(
+            c, rays=RayNumbers(128, 128), head_layers=1, head_width=16, pose_penalty=0.0, final_pose_penalty=0.0
+        )
+        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE)
+        return replace(c, decay_start=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -113,7 +123,7 @@ class BlockNeRF(FieldMethod):
         poses = PoseNumbers(refine_cameras=True, match_photographs=False)
         c = Config(**TINY_HASH, field="hash", poses=poses, hidden_width=16, residual_masks=True, appearance_code=4)
         c = replace(c, exposure_frequencies=2, visibility_frequencies=3, visibility_layers=1, visibility_width=16)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE, pose_penalty=1.0)
 
     # Learning
 
@@ -135,10 +145,11 @@ class BlockNeRF(FieldMethod):
             if weight := self.pass_weights.get(each.name, 1.0):
                 look = each.look(self.network, codes)
                 residual = composite(look.samples, look.density, look.rgb, behind).rgb - target
-                error = huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=c.huber_delta)
-                terms[each.name] = weight * (counted * error.mean(-1)).mean() / c.huber_delta
+                terms[each.name] = weight * (counted * huber(residual, c.huber_delta, "none").mean(-1)).mean()
         if self.sight:
             terms["visibility"] = self.sight.error(rays, look.samples, look.density.detach(), generator)
+        if self.poses and (weight := c.pose_penalty + self._progress * (c.final_pose_penalty - c.pose_penalty)):
+            terms["poses"] = weight * self.poses.moves[rays.image_index].square().sum(-1).mean()
         if self.moving:
             self.moving.note(rays.image_index, batch.extra["place"], residual.detach().abs().mean(-1))
         self.figures |= {"mse": float(residual.detach().square().mean())}
@@ -161,6 +172,10 @@ class BlockNeRF(FieldMethod):
         else:
             own = [torch.optim.Adam([*self.network.parameters(), *codes], rate)]
         return [*own, *super().optimizers()]
+
+    def before_step(self, step: int, progress: float) -> None:
+        self._progress = progress
+        super().before_step(step, progress)
 
     def codes(self, image: Int[Tensor, " ray"]) -> Float[Tensor, "ray code"]:
         """The code of each ray's photograph: appearance, then exposure."""

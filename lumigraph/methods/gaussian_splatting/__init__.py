@@ -20,6 +20,7 @@ from ...components.clouds.moved_cloud import seen_from
 from ...components.fields.teacher import teacher_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
+from ...errors import LumigraphError
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
@@ -36,7 +37,7 @@ from .interval_schedule import intervals
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
 from .robust_mask import RobustMask, RobustNumbers
-from .tidying import Tidying
+from .tidying import ALL_RULES, Tidying, TidyingNumbers
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,13 @@ class Config:
     photographs: AppearanceNumbers = AppearanceNumbers()
     distractors: RobustNumbers = RobustNumbers()
     sparse: FewViewNumbers = FewViewNumbers()
+    tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        if self.strategy == "mcmc" and not self.refine.max_gaussians:
+            raise LumigraphError("With --strategy mcmc a cloud grows up to its cap; give one with --max-gaussians")
 
 
 BLACK = 0.0, 0.0, 0.0
@@ -89,7 +96,7 @@ class GaussianSplatting(Method):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians)
+        count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians or PLACEHOLDER_COUNT)
         self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), c.rates)
         self.cloud.antialiased = c.filters.antialiased
         self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
@@ -98,7 +105,7 @@ class GaussianSplatting(Method):
             MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
         )
         self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
-        self.tidying = Tidying()
+        self.tidying = Tidying(c.tidying)
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
         self.poses = poses_for(frame, c.poses)
         self.register_buffer("drawn", torch.tensor(0))
@@ -119,8 +126,8 @@ class GaussianSplatting(Method):
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
         c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
-        c = replace(c, refine=RefineNumbers(max_gaussians=120_000), mcmc=McmcNumbers(joining_per_step=120.0))
-        return replace(c, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"))
+        c = replace(c, refine=RefineNumbers(120_000, cap_ramp=True), mcmc=McmcNumbers(joining_per_step=120.0))
+        return replace(c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"))
 
     @classmethod
     def smallest(cls) -> Any:
@@ -129,7 +136,8 @@ class GaussianSplatting(Method):
             sh_degree=2,
             sh_degree_interval=4,
             initial_gaussians=200,
-            refine=RefineNumbers(max_gaussians=300, refine_every=4, refine_from=4, refine_until=0.8),
+            refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
+            tidying=ALL_RULES,
             adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
             poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
             photographs=AppearanceNumbers(appearance="no"),

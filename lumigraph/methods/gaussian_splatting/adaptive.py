@@ -81,8 +81,10 @@ class AdaptiveDensity(DensityControl):
             self.reset_opacity(cloud)
 
     def current_cap(self, cloud: Cloud, progress: float) -> int:
-        """Cap at this share of the budget: it rises evenly until `refine_until`, so that early steps are quick."""
+        """Cap at this share of the budget: with `cap_ramp` it rises evenly until `refine_until`."""
         first, cap = int(self.initial_count), self.max_count(cloud)
+        if not self.refining.cap_ramp:
+            return cap
         share = min(1.0, progress / self.refining.refine_until)
         return min(cap, int(first + share * max(cap - first, 0)))
 

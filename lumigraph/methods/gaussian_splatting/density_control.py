@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from ...errors import LumigraphWarning
-from ...files.ranges import CloudSize, PositiveShare, Share, Steps
+from ...files.ranges import PositiveShare, Share, Steps, between
 from ...system.memory import room_for
 from .addition import Addition
 from .cloud import Cloud
@@ -25,7 +26,8 @@ BYTES_PER_GAUSSIAN = 4096  # lower bound while it learns: itself, its gradient a
 class RefineNumbers:
     """A Config's numbers of when a strategy changes the cloud."""
 
-    max_gaussians: CloudSize = 1_000_000  # Gaussians at most; more give detail, and cost memory and time
+    max_gaussians: Annotated[int, between(0, 100_000_000)] = 0  # Gaussians at most; more cost time; 0: as memory allows
+    cap_ramp: bool = False  # raise the cap evenly until refine_until, with adaptive, so that early steps are quick
     refine_every: Steps = 100  # steps between density control, section 5.2; or the share below, if sooner
     refine_every_share: PositiveShare = 0.1  # share of the budget between density control, if that is sooner
     refine_from: Steps = 500  # step at which density control starts, section 5.2; or the share below, if sooner
@@ -62,12 +64,13 @@ class DensityControl(Addition, ABC):
 
     def max_count(self, cloud: Cloud) -> int:
         """Cap on the number of Gaussians: `max_gaussians`, or as many as fit into free memory."""
-        return min(self.refining.max_gaussians, len(cloud) + room_for(BYTES_PER_GAUSSIAN, cloud.means.device))
+        fit = len(cloud) + room_for(BYTES_PER_GAUSSIAN, cloud.means.device)
+        return min(self.refining.max_gaussians or fit, fit)
 
     def warn_full(self, cloud: Cloud) -> None:
         """Warn, once, that the cloud has reached its cap."""
         if not self.warned:
             self.warned = True
-            by_option = len(cloud) >= 0.95 * self.refining.max_gaussians
+            by_option = len(cloud) >= 0.95 * (self.refining.max_gaussians or math.inf)
             why = "--max-gaussians says so" if by_option else "memory is short"
             warnings.warn(f"The cloud stops growing at {len(cloud):,} Gaussians, for {why}", LumigraphWarning, 2)

@@ -47,7 +47,7 @@ class FewViewNumbers:
     few_views: Literal["auto", "yes", "no"] = (
         "no"  # regularisation for few photographs; auto: if plane sweeps agree little
     )
-    depth_weight: NonNegative = 1.0  # weight of depth's roughness at unobserved views, with few_views; 0: off
+    depth_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
     surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
 
 

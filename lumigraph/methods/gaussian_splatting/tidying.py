@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,20 +22,39 @@ GAUSSIANS_PER_CHUNK = 1 << 14  # whose distances to all cameras are held at a ti
 PASSES_BEFORE_PRUNING = 2  # times that each photograph is learnt from before Gaussians are pruned
 
 
+@dataclass(frozen=True)
+class TidyingNumbers:
+    """A Config's rules on Gaussians that few photographs determine. The paper has none of them."""
+
+    prune_near: bool = False  # prune Gaussians close to a camera; off: they may hang before a lens
+    limit_scale: bool = False  # clamp scales to half the distance to the nearest camera; off: giants may stay
+    limit_anisotropy: bool = False  # clamp the largest scale to 20 times the second; off: needles may stay
+    observed_harmonics: bool = False  # zero harmonics that too few photographs determine; off: any are learnt
+
+
+ALL_RULES = TidyingNumbers(True, True, True, True)
+
+
 class Tidying(Addition):
-    """Rules on Gaussians that few photographs determine; it has no options."""
+    """The rules of a Config, after each step or at density control."""
+
+    def __init__(self, rules: TidyingNumbers):
+        super().__init__()
+        self.rules = rules
 
     @torch.no_grad()
     def after_step(self, method: Any, step: int) -> None:
-        cloud, cameras = method.cloud, method.cameras
-        if method.current.due:
+        cloud, cameras, rules = method.cloud, method.cameras, self.rules
+        limits = rules.limit_scale, rules.limit_anisotropy
+        if method.current.due and (rules.prune_near or any(limits)):
             distance = camera_distance(cloud.means, method.refined(cameras).position.to(cloud.means.device))
             near = near_camera(distance, cloud.view_count, method.frame.near)
-            if int(method.drawn) >= PASSES_BEFORE_PRUNING * len(cameras) and near.any() and not near.all():
+            known = rules.prune_near and int(method.drawn) >= PASSES_BEFORE_PRUNING * len(cameras)
+            if known and near.any() and not near.all():
                 method.prune(~near)
                 distance = distance[~near]
-            cloud.log_scales.copy_(clamped_scales(cloud.gaussians(), distance, float(cloud.extent)))
-        if method.bands > 1:
+            cloud.log_scales.copy_(clamped_scales(cloud.gaussians(), distance, float(cloud.extent), *limits))
+        if method.bands > 1 and rules.observed_harmonics:
             zero_unobserved_sh(cloud.harmonics, cloud.view_count)
 
 
@@ -57,14 +77,21 @@ def near_camera(
 
 
 def clamped_scales(
-    gaussians: Gaussians, distance: Float[Tensor, " gaussian"], extent: float
+    gaussians: Gaussians,
+    distance: Float[Tensor, " gaussian"],
+    extent: float,
+    by_distance: bool = True,
+    by_anisotropy: bool = True,
 ) -> Float[Tensor, "gaussian 3"]:
     """Log scales with the largest deviation at most MAX_SCALE times the distance to the nearest camera, and at most
     MAX_ANISOTROPY times the second, unless it is short.
 
-    extent: of the cameras, in scene units
+    extent:                     of the cameras, in scene units
+    by_distance, by_anisotropy: apply the first limit, the second one
     """
     log_scales = gaussians.log_scales
-    second = log_scales.sort(-1).values[:, 1].exp()
-    longest = torch.minimum(MAX_SCALE * distance, (MAX_ANISOTROPY * second).clamp_min(MIN_ELONGATED_SCALE * extent))
+    longest = MAX_SCALE * distance if by_distance else torch.full_like(distance, torch.inf)
+    if by_anisotropy:
+        second = log_scales.sort(-1).values[:, 1].exp()
+        longest = torch.minimum(longest, (MAX_ANISOTROPY * second).clamp_min(MIN_ELONGATED_SCALE * extent))
     return torch.minimum(log_scales, longest.clamp_min(1e-12).log()[:, None])

@@ -66,7 +66,7 @@ class Config:
     sparsity_points: Annotated[int, between(1, 1 << 20)] = 10_000  # K, random points of eq. 4; more cost time
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the cube's diagonal, first stage
     learning_rate: LearningRate = 5e-4  # the field's learning rate at first, section 5.1; higher may diverge
-    final_learning_rate: LearningRate = 5e-5  # learning rate of the field at the end of the first stage
+    final_learning_rate: LearningRate = 5e-6  # learning rate of the field at the end of the first stage, the release's
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the first stage before that rate falls
     teacher_share: Share = 0.9  # share of the budget after which the field is baked; the leaves have the rest
     octree_depth: Annotated[int, between(1, 10)] = 9  # levels of the octree, section 4.1, to a pixel's size at most

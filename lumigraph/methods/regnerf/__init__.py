@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
@@ -21,7 +21,7 @@ from ...components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWOR
 from ...components.sampling.occupancy import MaskNumbers
 from ...components.sampling.occupancy_sampler import MIN_RESOLUTION, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ...components.sampling.spaces import space_of
+from ...components.sampling.spaces import NDC, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.regularizers import near_thickness, normalized_distance, patches, roughness, unseen_cameras
@@ -35,7 +35,8 @@ from .patch_flow import SIDE, PatchFlow
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, mip-NeRF's of the network, Instant-NGP's of the table; `RegNeRF.preset` has a CPU's."""
+    """The release's numbers for three photographs (configs/llff3.gin), with those of its flow ours and Instant-NGP's of
+    the table; `RegNeRF.preset` has a CPU's."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)
     rays: RayNumbers = RayNumbers(128, 128)
@@ -46,24 +47,27 @@ class Config:
     field: Literal["network", "hash"] = "network"  # field: mip-NeRF's network, as in the paper, or a faster hash table
     unseen_patches: Annotated[int, between(0, 4096)] = 64  # patches of 8 x 8 unobserved rays in a step; 0: none
     depth_weight: NonNegative = 0.1  # weight of depth's roughness in these patches, eq. 6; higher smooths depth
-    depth_weight_start: NonNegative = 10.0  # weight of that roughness at first, which falls to depth_weight
-    depth_settling: Share = 0.05  # share of the budget in which it falls
+    depth_weight_start: NonNegative = 400.0  # weight of that roughness at first, which falls to depth_weight
+    depth_settling: Share = 512 / 69_768  # share of the budget in which it falls
     likelihood_weight: NonNegative = 1e-3  # weight of the patches' negative log likelihood, eq. 8; 0: no flow
     flow_steps: Steps = 400  # steps that train the normalising flow of eq. 8, of 512 patches each
     coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels are added; 0: at once
     occlusion_weight: NonNegative = 0.0  # weight of density right before cameras (Yang 2023, eq. 5); 0: off
     occlusion_range: Share = 0.1  # share of each ray that counts as right before its camera
     random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
-    annealing: Share = 0.01  # share of the budget in which samples spread from the middle of rays, eq. 10
-    annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
+    annealing: Share = 512 / 69_768  # share of the budget in which samples spread along rays, eq. 10
+    annealing_start: PositiveShare = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
+    forward_annealing_start: PositiveShare = 1e-4  # the same of forward-facing captures, from the far plane on
     seed: Seed = 0
     # Of the network.
     hidden_width: Width = 256  # channels of a layer
+    density_noise: NonNegative = 1.0  # deviation of noise on raw density in training; 0: none
+    gradient_clip: NonNegative = 0.1  # largest gradient of a weight, and largest norm of all; 0: no limit
     resample_padding: NonNegative = 0.01  # weight that every frustum has at least
     coarse_loss_weight: NonNegative = 0.1  # 0: the coarse pass only guides the fine one
     learning_rate: LearningRate = 2e-3  # learning rate of the network at first; higher: faster, may diverge
     final_learning_rate: LearningRate = 2e-5  # learning rate of the network at the end of the budget
-    warmup: Share = 0.0025  # share of the budget in which the learning rate grows
+    warmup: Share = 512 / 69_768  # share of the budget in which the learning rate grows
     # Of the hash table and its networks.
     table_learning_rate: LearningRate = 1e-2  # learning rate of the hash table and its networks at first
     final_table_learning_rate: LearningRate = 1e-3  # learning rate of the hash table and its networks at the end
@@ -128,10 +132,11 @@ class RegNeRF(FieldMethod):
                 self.network = HashField(c.table, c.table_width, space, frame.reach, joining=joining)
             self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         else:
-            self.network = FrustumField(c.network, c.hidden_width, space, joining=joining)
+            self.network = FrustumField(c.network, c.hidden_width, space, joining=joining, noise=c.density_noise)
             self.sampler = ConeSampler(
                 space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding
             )
+            self.sampler.sampled_from = 1.0 if isinstance(space, NDC) else 0.5
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             self.flow = PatchFlow() if c.likelihood_weight else None
@@ -143,6 +148,8 @@ class RegNeRF(FieldMethod):
         Fewer patches, and a larger share of the budget for what the paper does in its first hundreds of steps."""
         network = NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16)
         c = Config(**CPU_NETWORK, network=network, unseen_patches=8, annealing=0.25, depth_settling=0.25)
+        c = replace(c, depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5)
+        c = replace(c, density_noise=0.0, gradient_clip=0.0)
         c = replace(c, field="hash", table=CPU_HASH["table"], steps=CPU_HASH["steps"], table_width=32)
         c = replace(c, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15)
         return replace(c, table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
@@ -189,7 +196,9 @@ class RegNeRF(FieldMethod):
             if c.field == "hash":
                 terms["huber"] = huber(residual, c.huber_delta)
             else:
-                terms[look.name] = weight * residual.square().mean()
+                terms[look.name] = weight * residual.square().sum(-1).mean()
+            if unseen is not None and each is not passes[-1]:
+                terms["coarse smoothness"] = c.coarse_loss_weight * self._roughness(rest)
         if unseen is not None:
             terms |= self._unlike(rest)
         if c.occlusion_weight:
@@ -198,17 +207,21 @@ class RegNeRF(FieldMethod):
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
         """Loss terms of unobserved patches: roughness of their depth, negative log likelihood of their colours."""
-        c, shape, terms = self.config, (-1, SIDE, SIDE), {}
-        opacity = seen.opacity.view(shape)
-        place = (seen.extra["places"][:, 0] / seen.opacity.clamp_min(1e-3)).view(shape)
+        c, terms = self.config, {}
         if c.depth_weight:
             weight = c.depth_weight
             if self._progress < c.depth_settling:
                 weight += (c.depth_weight_start - weight) * (1 - self._progress / c.depth_settling)
-            terms["smoothness"] = weight * roughness(place, opacity)
+            terms["smoothness"] = weight * self._roughness(seen)
         if self.flow:
-            terms["likelihood"] = c.likelihood_weight * self.flow(seen.rgb.view(*shape, 3)).mean()
+            terms["likelihood"] = c.likelihood_weight * self.flow(seen.rgb.view(-1, SIDE, SIDE, 3)).mean()
         return terms
+
+    def _roughness(self, seen: Rendering) -> Tensor:
+        """Roughness of patches' expected t / (1 + t)."""
+        shape = (-1, SIDE, SIDE)
+        place = seen.extra["places"][:, 0] / seen.opacity.clamp_min(1e-3)
+        return roughness(place.view(shape), seen.opacity.view(shape))
 
     def _before_cameras(self, rays: Rays, look: Look) -> Tensor:
         """Optical thickness of the first share of each ray, mean of all rays."""
@@ -222,7 +235,7 @@ class RegNeRF(FieldMethod):
         if isinstance(self.network, HashField):
             own = self.network.optimizers_at(c.table_learning_rate, c.hash_weight_decay)
         else:
-            own = [torch.optim.Adam(self.network.parameters(), c.learning_rate)]
+            own = [clipped(torch.optim.Adam(self.network.parameters(), c.learning_rate), c.gradient_clip)]
         return [*own, *super().optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> float:
@@ -234,8 +247,22 @@ class RegNeRF(FieldMethod):
     def before_step(self, step: int, progress: float) -> None:
         c, self._progress = self.config, progress
         grown = progress / c.annealing if progress < c.annealing else 1.0
-        self.sampler.sampled_share = max(grown, c.annealing_start)
+        forward = isinstance(self.network.space, NDC)
+        self.sampler.sampled_share = max(grown, c.forward_annealing_start if forward else c.annealing_start)
         super().before_step(step, progress)
+
+
+def clipped(optimizer: torch.optim.Optimizer, most: float) -> torch.optim.Optimizer:
+    """An optimizer that limits gradients ahead of its steps: each number, then the norm of all; 0: neither."""
+
+    def clip(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+        nn.utils.clip_grad_value_(weights, most)
+        nn.utils.clip_grad_norm_(weights, most)
+
+    if most:
+        optimizer.register_step_pre_hook(clip)
+    return optimizer
 
 
 def joined(first: Rays, second: Rays) -> Rays:

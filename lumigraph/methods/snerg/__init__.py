@@ -20,7 +20,7 @@ from ...components.fields.teacher import teacher_of
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
-from ...components.training.photometric import backdrop, residuals
+from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.regularizers import cauchy
 from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling, held
@@ -52,7 +52,7 @@ from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, Net
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them, but for huber_delta; `SNeRG.preset` has those of a plain CPU."""
+    """The paper's numbers, with where it or its release gives them; `SNeRG.preset` has those of a plain CPU."""
 
     table: TableNumbers = TableNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers(transmittance_threshold=1e-3)
@@ -60,7 +60,7 @@ class Config:
     proposals: ProposalNumbers = ProposalNumbers()
     field: Literal["hash", "network"] = "network"  # field to bake: the paper's network, or a faster hash table
     view_width: Width = 16  # channels of the view-dependence network, section 4.2; wider is slower in a browser
-    sparsity_weight: NonNegative = 1e-4  # lambda_s of eq. 8, section 4.2; higher gives emptier voxels
+    sparsity_weight: NonNegative = 1e-7  # lambda_s of eq. 8: 1e-4 over a ray's 1024 samples; higher: emptier voxels
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # share of the budget ahead of baking
     voxel_share: Share = 0.0  # share of the rest in which voxels learn too, then the small network alone; 0: none
     whole: bool = True  # bake an open capture whole, contracted; off: its box alone, for the published viewer
@@ -75,12 +75,12 @@ class Config:
     view_learning_rate: LearningRate = 5e-4  # learning rate of the view-dependence network
     voxel_learning_rate: LearningRate = 0.01  # learning rate of voxels at first; a tenth of it at the end
     hidden_layers: Layers = 8  # hidden layers of the field's network; more cost time
-    hidden_width: Width = 256  # channels of the field's hidden layers, section 4.1; wider costs memory and time
+    hidden_width: Width = 512  # channels of the field's hidden layers, the release's; wider costs memory and time
     # Of the paper's network.
     skip_layer: Layers = 5  # layer whose activation the input is concatenated to again
     position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
-    huber_delta: PositiveShare = 0.1  # residual at which the loss turns from squared to linear; 1: always squared
+    huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -158,7 +158,7 @@ class SNeRG(FieldMethod):
         c = Config(**CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32)
         c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3)
         c = replace(c, deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128)
-        return replace(c, rays_per_step=4096, hash_weight_decay=0.3, huber_delta=0.3)
+        return replace(c, rays_per_step=4096, hash_weight_decay=0.3, huber_delta=0.3, sparsity_weight=1e-4)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -167,6 +167,7 @@ class SNeRG(FieldMethod):
         table = TINY_HASH | {"table": TINY_LEVELS, "occupancy": occupancy}
         c = Config(**table, field="hash", hidden_layers=1, hidden_width=16, rays_per_step=512)
         c = replace(c, learning_rate=2e-2, final_learning_rate=2e-3, view_learning_rate=5e-3, visibility_resolution=16)
+        c = replace(c, huber_delta=0.1, sparsity_weight=1e-4)
         return replace(c, deferred_share=0.6, voxel_share=0.6, resolution=32, block_size=8)
 
     @classmethod
@@ -296,9 +297,7 @@ class SNeRG(FieldMethod):
         if self._bounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt
             solid = seen.opacity.detach() > SOLID_OPACITY
             residual = residual * solid.repeat(len(residual) // len(solid))[:, None]  # before two backgrounds, maybe
-        delta = self.config.huber_delta
-        huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
-        return {"huber": huber, **terms}
+        return {"huber": huber(residual, self.config.huber_delta), **terms}
 
     def _learn_field(self, rays: Rays, generator: torch.Generator) -> tuple[RaySum, dict[str, Tensor]]:
         """Sums along rays through the field, and the loss terms beside colours (eq. 8) by name."""
