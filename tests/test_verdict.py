@@ -12,9 +12,10 @@ from lumigraph import methods
 from lumigraph.budget import Budget
 from lumigraph.commands.eval import beside_training
 from lumigraph.commands.outcome import advice, more_time, next_commands, photographed, seen
+from lumigraph.metrics.rows import last_psnr
 from lumigraph.run import Run, build
 from lumigraph.training import fit
-from lumigraph.training.verdict import Trend, last_psnr, loss_trend
+from lumigraph.training.verdict import Trend, loss_trend
 
 pytestmark = budget("runs")
 

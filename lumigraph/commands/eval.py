@@ -48,8 +48,8 @@ class Eval:
         from ..metrics import scores_of
         from ..metrics.detail import FineDetail
         from ..metrics.lpips import load_lpips, named_files
+        from ..metrics.rows import last_psnr
         from ..run import open_run
-        from ..training.verdict import last_psnr
         from .outcome import next_commands
 
         run = open_run(self.run_folder)

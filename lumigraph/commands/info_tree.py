@@ -23,11 +23,12 @@ from ..gaussians import Gaussians
 from ..geometry import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
+from ..metrics.rows import last_psnr
 from ..run import Run
 from ..run.derived import Compressed, Converted, Inferred
 from ..system.console import bold, dim
 from ..training.display import learner, pixel_sizes
-from ..training.verdict import cameras_moved, last_psnr
+from ..training.verdict import cameras_moved
 
 MAX_MEMBERS = 12  # shapes that are listed
 

@@ -19,7 +19,8 @@ NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "e
 
 def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Print the state of a Run after an Outcome, and the next commands."""
-    from ..training.verdict import cameras_moved, last_psnr, loss_trend
+    from ..metrics.rows import last_psnr
+    from ..training.verdict import cameras_moved, loss_trend
 
     state, budget = outcome.state, Budget.from_json(run.settings.budget)
     besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"

@@ -21,9 +21,10 @@ from ..figures.charts import STYLE as CHARTS
 from ..figures.charts import Series, bar_chart, line_chart
 from ..files import claim, write_bytes
 from ..metrics import scores_of
+from ..metrics.rows import of_final_size
 from ..run import Run
 from ..system.progress import clock, short
-from ..training.verdict import cameras_moved, of_final_size
+from ..training.verdict import cameras_moved
 from .photographs import SHEET_FILE, examined
 
 MAX_FILM_BYTES = 12 << 20  # bytes; larger ones are named instead of embedded

@@ -14,6 +14,7 @@ from ..datasets.alignment import Moves, moves
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
 from ..method import Lesson, Method
+from ..metrics.rows import of_final_size
 
 STRETCH_COUNTS = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
 FALLING_SHARE = 0.05  # share of the loss, over the second half, from which on it still falls
@@ -70,23 +71,8 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
     return Trend(1 - math.exp(slope * length), deviation * length, length / half[-1]["step"])
 
 
-def of_final_size(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Lines of metrics.jsonl from steps whose photographs were reduced as in the last one. Errors of smaller pictures
-    are smaller, so that others do not compare."""
-    times = [row.get("statistics", {}).get("reduction", 1.0) for row in rows]
-    return [row for row, reduction in zip(rows, times, strict=True) if reduction == times[-1]]
-
-
 def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
     """Displacement of the training cameras by a method, each against all of them; None where it learns no
     poses. cameras: those of training photographs as they were given"""
     refined = method.refined(cameras)
     return None if refined is cameras else moves(cameras, refined, method.frame)
-
-
-def last_psnr(rows: Sequence[dict[str, Any]]) -> float | None:
-    """The PSNR of training photographs in dB, its mean over the last quarter of training, at their final size; None
-    where there is none."""
-    found = [(row["step"], row["psnr"]) for row in of_final_size(rows) if "psnr" in row]
-    last = [psnr for step, psnr in found if step > 3 / 4 * found[-1][0]]
-    return sum(last) / len(last) if last else None

@@ -16,8 +16,8 @@ from jaxtyping import Float
 from ..camera import Camera
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
+from ..metrics.rows import last_psnr
 from ..system.progress import clock, short
-from ..training.verdict import last_psnr
 from .address import Address
 from .scenery import Scenery
 from .serving import quiet, start_server

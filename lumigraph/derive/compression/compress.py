@@ -28,12 +28,12 @@ from ...evaluation import evaluate
 from ...geometry import evenly
 from ...method import Method
 from ...method.capabilities import CanCompress, needs
+from ...metrics.rows import last_psnr
 from ...run import Run, check_new
 from ...run.checkpoint import Checkpoints
 from ...run.derived import Compressed
 from ...system.progress import NumberedStages, clock, track
 from ...system.work import at_work
-from ...training.verdict import last_psnr
 from .model import LADDER, RUNG_POSITIONS, Model, rung_at
 
 JUDGED_VIEWS = 6  # training photographs that judge a rung; held-out ones judge the outcome alone
