@@ -145,7 +145,21 @@ def test_rays_end_at_places_that_are_known_until_half_of_the_budget_is_spent():
         errors.append(float(made.terms(wall(place), found, generator)["depth"]))
     assert errors[0] < 0.8 * errors[1]
     made.before_step(None, 0, 0.9)
-    assert "depth" not in made.terms(wall(1.0), found, generator)
+    assert not {"depth", "air"} & made.terms(wall(1.0), found, generator).keys()
+
+
+def test_air_between_cameras_is_clear_half_way_to_the_nearest_surface():
+    made, generator = sampler(), torch.Generator().manual_seed(0)
+    made.surface = torch.tensor([[0.0, 0.0, 2.0]]).expand(64, 3)
+    made.surface_from = torch.tensor([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]]).repeat(32, 1)
+    made.before_step(None, 0, 0.1)
+    (found,) = made.sample(rays(), Formula(lambda points: 0 * points[:, 0]), generator=generator)
+
+    def air(formula) -> float:
+        return float(made.terms(formula, found, generator)["air"]) / made.numbers.air_weight
+
+    assert air(lambda points: 9.0 * (points.norm(dim=-1) > 1.25)) == 0.0  # 0.2 of it aside
+    assert air(lambda points: 9.0 * (points.norm(dim=-1) < 0.9)) > 0.7
 
 
 def test_contraction_loops_as_it_is_written():

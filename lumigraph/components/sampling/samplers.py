@@ -2,7 +2,8 @@
 
 Proposals: samples along rays without an end, where a grid of density proposes (Barron 2022, section 3.1). Every ray
 gets the same number of samples. Terms of the loss keep the air clear: the distortion loss (Barron 2022, eq. 15),
-gradients scaled near cameras (Philip 2023), and at first depth from plane sweeps over neighbouring photographs.
+gradients scaled near cameras (Philip 2023), and at first depth from plane sweeps over neighbouring photographs with
+clear air between cameras.
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from typing import Annotated, Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ...camera.rays import Rays
 from ...datasets.scene import Frame, Scene
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, between
 from ...method import Field, Pass, Sampler
+from ...method.field import Points as Places
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
@@ -39,6 +42,10 @@ MAX_POINTS = 1 << 16  # surface points that are kept
 DEPTH_RAYS = 128  # rays of a step with known depth
 DEPTH_MARGIN = 0.005  # of distances t / (1 + t): accuracy of a surface point
 DEPTH_UNTIL = 0.5  # share of the budget after which photographs alone supervise depth
+NEAREST_OF = 1024  # surface points among which the nearest to a place is looked for
+OUTLIERS = 0.02  # share of them that may be wrong, and nearer
+CLEAR_SHARE = 0.5  # of the distance to the nearest surface, in which air is clear
+CONE = 0.5  # deviation of rays through air from the ways to surfaces, of unit length
 RAYS_PER_CHUNK = 4096  # rendered at once: the activations of their samples fit into a cache
 MIN_WEIGHT = 5e-4  # weight in a ray's colour up to which a rendering omits a sample
 
@@ -51,6 +58,7 @@ class ProposalNumbers:
     samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray in the field; more are sharper, slower
     distortion_weight: NonNegative = 0.01  # distortion loss's weight (Barron 2022, eq. 15); higher: fewer floaters
     depth_weight: NonNegative = 0.03  # weight of plane-sweep depth at first, falling to 0; 0: off
+    air_weight: NonNegative = 0.05  # weight of clear air between cameras in the first half of training; 0: off
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
         """Bytes of the proposal grid, with its gradient and moments while it learns."""
@@ -117,26 +125,31 @@ class ProposalSampler(Sampler):
         return Pass("samples", seen, density.index_select(0, rows), features, directions, evaluated=count)
 
     def terms(self, density: Density, last: Pass, generator: torch.Generator) -> dict[str, Tensor]:
-        """The proposal loss, the distortion loss, and the depth loss of some more rays whose depth is known."""
+        """The proposal loss, the distortion loss, and where surfaces are known the depth loss of some more rays and the
+        share of light that air between cameras stops."""
         weights = weights_of(last.samples, last.density)
         terms = {"proposal": proposal_loss(last.proposals, weights)}
         if self.numbers.distortion_weight:
             terms["distortion"] = self.numbers.distortion_weight * distortion_loss(last.samples, weights)
         weight = self.numbers.depth_weight * (1 - self.progress / DEPTH_UNTIL)
         if weight > 0 and len(self.surface):
-            error, missed = self._depth_error(density, generator)
+            chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
+            origins = places_between(self.surface_from[chosen], self.stands, generator)
+            ways = self.surface[chosen] - origins
+            error, missed = self._depth_error(density, origins, ways, generator)
             terms["depth"] = weight * error
+            if self.numbers.air_weight:
+                terms["air"] = self.numbers.air_weight * self._stopped_by_air(density, origins, ways, generator)
             terms["proposal"] = terms["proposal"] + missed * (DEPTH_RAYS / len(last.proposals.edges))
         return terms
 
-    def _depth_error(self, density_at: Density, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """`depth_loss` of some rays with known depth, and the proposal loss of these.
+    def _depth_error(
+        self, density_at: Density, origins: Places, ways: Places, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """`depth_loss` of rays to surfaces, and the proposal loss of these.
 
         They begin between two cameras: air that is clear along the rays of photographs alone may be fog from beside.
         """
-        chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
-        origins = places_between(self.surface_from[chosen], self.stands, generator)
-        ways = self.surface[chosen] - origins
         distance = ways.norm(dim=-1)
         rays = Rays(origins, ways / distance[:, None], torch.zeros_like(distance))
         proposals = self.proposal.sample(rays, torch.rand(DEPTH_RAYS, 2, generator=generator).to(distance))
@@ -144,6 +157,19 @@ class ProposalSampler(Sampler):
         (density,) = scale_gradients(samples.t, density_at(samples.along(rays)[0]))
         weights = weights_of(samples, density)
         return depth_loss(samples, weights, distance, DEPTH_MARGIN), proposal_loss(proposals, weights)
+
+    def _stopped_by_air(
+        self, density_at: Density, origins: Places, ways: Places, generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """Share of light that is stopped half way from between cameras to the nearest surface, around the ways to
+        surfaces; by the density at one random place of each ray."""
+        some = torch.randint(len(self.surface), (NEAREST_OF,), generator=generator).to(self.surface.device)
+        nearest = torch.cdist(origins, self.surface[some]).quantile(OUTLIERS, dim=1)
+        aside = CONE * torch.randn(ways.shape, generator=generator).to(ways)
+        directions = normalize(normalize(ways, dim=-1) + aside, dim=-1)
+        clear = CLEAR_SHARE * nearest
+        t = clear * torch.rand(len(ways), generator=generator).to(ways)
+        return -torch.expm1(-clear * density_at(origins + t[:, None] * directions)).mean()
 
     @cached_property
     def stands(self) -> Float[Tensor, "camera 3"]:
