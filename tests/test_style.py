@@ -211,7 +211,11 @@ def lost(text: str, page: Path, files: Iterable[Path]) -> list[str]:
     for span in re.findall(r"`([^`\n]+)`", prose):
         match = SOURCE.match(span) or re.match(r"[\w.-]+/[\w./-]*(?![\w./<*{-])", span)
         path = match[0].removesuffix("/") if match else ""
-        if not match or path in TO_BE_WRITTEN | KERNEL_FILES or (match.re is not SOURCE and path.split("/")[0] not in own):
+        if (
+            not match
+            or path in TO_BE_WRITTEN | KERNEL_FILES
+            or (match.re is not SOURCE and path.split("/")[0] not in own)
+        ):
             continue
         if path not in below and tails[path] != 1 and not any(path == file.as_posix() for file in files):
             found.append(path)
