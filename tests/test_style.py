@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import functools
+import os
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -182,25 +184,68 @@ def test_a_config_that_inherits_is_noticed():
 # Documents name files that are there
 
 
-def lost(text: str, files: Iterable[Path]) -> list[str]:
-    """Paths of Python files in back-ticks that no file ends with."""
-    there = {"/".join(path.parts[-count:]) for path in files for count in range(1, len(path.parts) + 1)}
-    spans = re.findall(r"`([^`\n]+)`", re.sub(r"(?ms)^```.*?^```", "", text))
-    named = [match[0] for span in spans if (match := re.match(r"[\w./-]+\.py\b", span))]
-    return [path for path in named if path not in there and path not in TO_BE_WRITTEN]
+ROOTS = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "docs", ROOT / "web")
+SOURCE = re.compile(r"[\w./-]+\.(py|pyi|js|mjs|md|svg|toml|cu|css)\b")
+NOT_OURS = {"node_modules", "__pycache__"}
+KERNEL_FILES = {"__init__.py", "reference.py", "cpu.py", "gpu.py", "faults.py"}  # of every kernel's folder
+
+
+def repository() -> list[Path]:
+    """Files of the repository, relative to it."""
+    inside = [path.relative_to(ROOT) for root in ROOTS for path in root.rglob("*") if path.is_file()]
+    here = [path.relative_to(ROOT) for path in ROOT.iterdir() if path.is_file()]
+    return [path for path in (*here, *inside) if not NOT_OURS & set(path.parts)]
+
+
+def lost(text: str, page: Path, files: Iterable[Path]) -> list[str]:
+    """Paths that a page names and that are missing, or that name several files.
+
+    These are: source files and paths below the repository's own folders in back-ticks, scripts that `python` runs, and
+    the targets of relative links.
+    """
+    tails = Counter("/".join(path.parts[-count:]) for path in files for count in range(1, len(path.parts) + 1))
+    folders = {path.as_posix() for file in files for path in file.parents}
+    own = {folder.split("/")[0] for folder in folders} - {"."}
+    below = folders | {folder.removeprefix("lumigraph/") for folder in folders}
+    found, prose = list[str](), re.sub(r"(?ms)^```.*?^```", "", text)
+    for span in re.findall(r"`([^`\n]+)`", prose):
+        match = SOURCE.match(span) or re.match(r"[\w.-]+/[\w./-]*(?![\w./<*{-])", span)
+        path = match[0].removesuffix("/") if match else ""
+        if (
+            not match
+            or path in TO_BE_WRITTEN | KERNEL_FILES
+            or (match.re is not SOURCE and path.split("/")[0] not in own)
+        ):
+            continue
+        if path not in below and tails[path] != 1 and not any(path == file.as_posix() for file in files):
+            found.append(path)
+    found += [path for path in re.findall(r"\bpython ([\w./-]+\.py)\b", text) if Path(path) not in files]
+    for target in re.findall(r"\]\(([^)#\s]+)", prose):
+        path = Path(os.path.normpath(page.parent / target))
+        if "://" not in target and path not in files and path.as_posix() not in folders:
+            found.append(target)
+    return found
 
 
 def test_documents_name_files_that_are_there():
-    folders = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "web")
-    files = [path.relative_to(ROOT) for folder in folders for path in folder.rglob("*.py")]
-    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-    at_most(0, [f"{x.relative_to(ROOT)}: {path}" for x in documents for path in lost(x.read_text("utf-8"), files)])
+    files = repository()
+    pages = [
+        path for path in files if path.suffix == ".md" and path.parts[0] in ("README.md", "CONTRIBUTING.md", "docs")
+    ]
+    at_most(0, [f"{page}: {path}" for page in pages for path in lost((ROOT / page).read_text("utf-8"), page, files)])
 
 
 def test_a_lost_file_is_noticed():
-    files = [Path("lumigraph/metrics/lpips.py"), Path("tests/tiny.py")]
-    fine = "`metrics/lpips.py`, `lumigraph/metrics/lpips.py: Lpips`, `<x>.py`, [`x`](a.py) `tiny.py`\n```\n`a.py`\n```"
-    assert lost(fine, files) == []
-    assert lost("`lumigraph/lpips.py`, `pips.py` and `lumigraph/metrics/x.py: X`", files) == [
+    files = [
+        Path(path) for path in ("lumigraph/metrics/lpips.py", "tests/tiny.py", "tests/a.py", "docs/a.py", "docs/x.md")
+    ]
+    fine = "`metrics/lpips.py`, `lumigraph/metrics/lpips.py: Lpips`, `<x>.py`, [`x`](a.py) `tiny.py` `docs/a.py`"
+    page = Path("docs/x.md")
+    fine += "\n`tests/`, `metrics/`, `tests/tiny_<x>.py`, `w/h` `eval.json`, `python tests/tiny.py`\n```\n`a.py`\n```"
+    assert lost(fine, page, files) == []
+    assert lost("`lumigraph/lpips.py`, `pips.py` and `lumigraph/metrics/x.py: X`", page, files) == [
         *("lumigraph/lpips.py", "pips.py", "lumigraph/metrics/x.py")
+    ]
+    assert lost("`a.py`, `tests/data/x.json`\n```\npython tests/b.py\n```\n[b](b.md)", page, files) == [
+        *("a.py", "tests/data/x.json", "tests/b.py", "b.md")
     ]

@@ -328,30 +328,30 @@ FIGURES: dict[tuple[str, str], Published] = {
 
 @dataclass(frozen=True)
 class Few:
-    """Held-out PSNR in dB from few photographs, the mean of several scenes; where a figure's source says how many and
-    of what.
+    """Held-out PSNR in dB from few photographs, the mean of several scenes.
 
-    views: photographs that were learnt from; None where the source does not say
+    views: photographs that were learnt from
+    protocol: the scenes, and the pixels that were compared
+    source: who measured it, and where it is published
     """
 
     method: str
     psnr: float
-    views: int | None
-    scenes: str
+    views: int
+    protocol: str
     source: str
 
 
-STUDY = "a study of few photographs by others, protocol not known"
+REGNERF_LLFF = "LLFF, 8 scenes, every 8th photograph held out, whole pictures"
+REGNERF_DTU = "DTU, 15 scenes, background masked out"
+PIXELNERF_DTU = "DTU, 15 scenes, whole pictures, other input views than RegNeRF's"
+NIEMEYER = "Niemeyer et al. 2022, arXiv 2112.00724"
 FEW_VIEW_FIGURES: tuple[Few, ...] = (
-    Few("mip-nerf", 14.62, 3, "LLFF", "Niemeyer et al. 2022"),
-    Few("regnerf", 19.08, 3, "LLFF", "Niemeyer et al. 2022"),
-    Few("mip-nerf", 8.68, 3, "DTU", "Niemeyer et al. 2022"),
-    Few("regnerf", 18.89, 3, "DTU", "Niemeyer et al. 2022"),
-    Few("pixelnerf", 19.31, 3, "DTU", "Yu et al. 2021"),
-    Few("nerf", 24.3, None, "not stated", STUDY),
-    Few("pixelnerf", 23.2, None, "not stated", STUDY),
-    Few("regnerf", 25.2, None, "not stated", STUDY),
-    Few("snerg", 24.0, None, "not stated", STUDY),
+    Few("mip-nerf", 14.62, 3, REGNERF_LLFF, NIEMEYER),
+    Few("regnerf", 19.08, 3, REGNERF_LLFF, NIEMEYER),
+    Few("mip-nerf", 8.68, 3, REGNERF_DTU, NIEMEYER),
+    Few("regnerf", 18.89, 3, REGNERF_DTU, NIEMEYER),
+    Few("pixelnerf", 19.33, 3, PIXELNERF_DTU, "Yu et al. 2021, arXiv 2012.02190"),
 )
 
 

@@ -56,9 +56,9 @@ def few_photographs(rows: Sequence[Row]) -> str:
         parts += [f"{scores_of(found[0])[0].name} of {of_what}, {resolution(found[0])}:", table(names, lines)]
     if not parts:
         return ""
-    figures = [[f.method, str(f.psnr), str(f.views or NONE), f.scenes, f.source] for f in FEW_VIEW_FIGURES]
-    told = table(["method", "PSNR", "photographs", "scenes", "source"], figures)
-    return "\n\n".join(["## How many photographs", *parts, "What others report, by protocols of their own:", told])
+    figures = [[f.method, str(f.psnr), str(f.views), f.protocol, f.source] for f in FEW_VIEW_FIGURES]
+    told = table(["method", "PSNR", "photographs", "protocol", "source"], figures)
+    return "\n\n".join(["## How many photographs", *parts, "Published results, each by its own protocol:", told])
 
 
 def short_table(rows: Sequence[Row]) -> str:

@@ -1,0 +1,123 @@
+"""Python in the documents: each block runs as it is written, on small scenes. CONTRIBUTING.md has a test of its own."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from textwrap import indent
+from typing import Any
+
+import pytest
+import tiny
+import torch
+from budgets import budget
+from conftest import PACKAGE
+from test_cleaning import soiled
+
+import lumigraph
+from lumigraph.components.sampling.importance import importance
+from lumigraph.exchange.packing import Stored, most_important
+from lumigraph.methods.instant_ngp import InstantNGP
+from lumigraph.run import build
+
+pytestmark = budget("runs")
+
+ROOT = PACKAGE.parent
+SECONDS = {"seconds=30.0": "steps=2"}  # of the block of docs/convert.md
+ELSEWHERE = {"CONTRIBUTING.md"}  # tests/test_contributing.py
+NEEDS_DATA = {"docs/methods/gaussian_splatting.md"}  # seven minutes of structure from motion; its names are tested
+
+
+def blocks() -> dict[str, list[str]]:
+    """Blocks of Python by page."""
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    found = {page.relative_to(ROOT).as_posix(): written(page.read_text("utf-8")) for page in pages}
+    return {page: sources for page, sources in found.items() if sources}
+
+
+def written(text: str) -> list[str]:
+    return re.findall(r"(?ms)^```python\n(.*?)^```", text)
+
+
+def execute(page: str, **given: Any) -> dict[str, Any]:
+    """Names after the only block of a page, which finds these names."""
+    (source,) = blocks()[page]
+    for before, after in SECONDS.items():
+        source = source.replace(before, after)
+    exec(compile(source, page, "exec"), given)
+    return given
+
+
+@pytest.fixture
+def in_folder_of_runs(ball_run, tmp_path, monkeypatch):
+    """A working folder whose runs have the names that pages use."""
+    (tmp_path / "runs").mkdir()
+    for name in ("lego-instant-ngp-1", "lego-nerf"):
+        (tmp_path / "runs" / name).symlink_to(Path(ball_run.path).resolve())
+    monkeypatch.chdir(tmp_path)
+
+
+def test_every_block_has_a_test():
+    tested = {
+        "README.md",
+        "docs/cleaning.md",
+        "docs/compress.md",
+        "docs/convert.md",
+        "docs/datasets.md",
+        "docs/layers.md",
+    }
+    assert set(blocks()) == tested | ELSEWHERE | NEEDS_DATA
+    assert written("```python\na = 1\n```\n```\nb\n```\n") == ["a = 1\n"]
+
+
+def test_a_run_renders(in_folder_of_runs):
+    view = execute("README.md")["view"]
+    assert view.rgb.shape == (tiny.SIZE, tiny.SIZE, 3) and view.rgb.std() > 0.05
+
+
+def test_a_run_is_converted(in_folder_of_runs):
+    made = execute("docs/convert.md")["made"]
+    assert made.psnr > 10 and made.student.seconds > 0 and Path("runs/grid/config.json").exists()
+
+
+def test_a_collection_opens():
+    assert isinstance(execute("docs/datasets.md")["data"], lumigraph.Collection)
+
+
+def test_layers_of_rays():
+    after = execute("docs/layers.md")
+    batch, scene = after["batch"], after["scene"]
+    assert batch.extra["depth"].shape[0] == len(batch.rays.image_index) == 4096
+    assert (after["exposure"] == scene.about["exposure"][batch.rays.image_index]).all()
+
+
+def test_a_cloud_is_cleaned():
+    scene = tiny.scene()
+    given = {"gaussians": soiled(), "cameras": scene.cameras, "frame": scene.frame}
+    part = execute("docs/cleaning.md", **given)["part"]
+    assert 0 < len(part) < len(given["gaussians"])
+
+
+def test_a_method_is_thinned():
+    names = {"InstantNGP": InstantNGP, "Stored": Stored, "importance": importance, "most_important": most_important}
+    (source,) = blocks()["docs/compress.md"]
+    exec(f"class Shown(InstantNGP):\n{indent(source, '    ')}", names)
+    scene = tiny.scene()
+    method = build(names["Shown"], scene.frame, InstantNGP.smallest(), torch.device("cpu"), 0)
+    assert method.storage().keys() <= method.state_dict().keys()
+    shares = method.importance(scene.cameras[0])
+    with torch.no_grad():
+        before = (method.network.table != 0).any(-1).sum()
+        method.thin(shares, 0.5)
+    assert (method.network.table != 0).any(-1).sum() < before
+
+
+def test_structure_from_motion_has_the_names_it_is_called_by():
+    sfm = pytest.importorskip("pycolmap")
+    (source,) = blocks()["docs/methods/gaussian_splatting.md"]
+    names = re.findall(r"\bsfm\.(\w+)(?:\.(\w+))?", source)
+    assert len(names) > 5 and all(
+        hasattr(sfm, one) and (not two or hasattr(getattr(sfm, one), two)) for one, two in names
+    )
+    settings = sfm.FeatureExtractionOptions()
+    assert hasattr(settings.sift, "max_num_features") and hasattr(sfm.ImageReaderOptions(), "camera_params")
