@@ -330,7 +330,7 @@ def test_colours_are_compared_up_to_light(generator):
 
 
 def test_codes_are_found_from_refined_cameras(monkeypatch):
-    """Of training photographs from where the method moved them, of held-out ones from where they are found."""
+    """Codes of training photographs are found from refined cameras, those of held-out ones from cameras found."""
     scene = tiny.scene()
     kind = methods.find("instant-ngp")
     config = changed(kind.smallest(), refine_cameras=True, exposure_correction="yes")

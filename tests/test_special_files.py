@@ -1,4 +1,4 @@
-"""Where a file is read, a device or a pipe is refused, and nothing waits for it or reads without end."""
+"""Devices and pipes in place of files are refused: nothing waits for them or reads without end."""
 
 from __future__ import annotations
 

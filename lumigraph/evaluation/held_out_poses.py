@@ -106,10 +106,9 @@ def pose_scores(method: Method, scene: Scene) -> list[Score]:
     """Errors of rotation (degrees) and position (percent of the box of interest) against true poses, aligned; medians
     over training photographs. Empty where the true poses are unknown, or the refined ones of blocks, and for so few
     photographs that any alignment would fit them."""
-    learnt = scene.splits["train"]
-    cameras = scene.cameras[learnt].to("cpu")
-    if TRUE_POSE not in scene.about or len(learnt) < MIN_ALIGNED:
+    if TRUE_POSE not in scene.about or len(learnt := scene.splits["train"]) < MIN_ALIGNED:
         return []
+    cameras = scene.cameras[learnt].to("cpu")
     if can(method, RefinesPoses) and method.refined(cameras) is cameras:
         return []
     to_scene = Similarity.of(scene.frame.source_from_scene).inverse

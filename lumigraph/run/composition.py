@@ -118,7 +118,7 @@ class Composition(Opened):
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
     def _open(self, source: str, open_part: Callable[[Path, Nesting], Opened], inner: Nesting) -> Opened:
-        """What a part names, as it was opened before if it was."""
+        """The scene that a part names; each is opened once."""
         place = self.path.parent / files.expanded(source)
         if not files.exists(place):
             raise LumigraphError(f"{self.path} names {source} as a part, but there is no {place}; correct its path")
