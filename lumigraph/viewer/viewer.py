@@ -26,6 +26,7 @@ from .turns import Turns
 from .visitor import Visitor
 
 UPDATE_SECONDS = 1.0  # seconds between updates
+WAKE_SECONDS = 0.5  # seconds of sleep: a signal just before it begins does not end it
 FORGET_SECONDS = 2.0  # seconds after the last client has left, at which memory is given back
 CURVE_POINTS = 200  # of the curve
 INK = "#5686d6"
@@ -209,7 +210,7 @@ class Viewer:
     def serve(self) -> None:
         """Wait for Ctrl-C, which raises KeyboardInterrupt."""
         while True:
-            time.sleep(3600)
+            time.sleep(WAKE_SECONDS)
 
     def stop(self) -> None:
         """End the server and disconnect every client."""
