@@ -152,7 +152,7 @@ def test_a_run_names_photographs_that_it_cannot_render(learnt):
 
 def test_the_worst_photographs_stand_in_the_report(learnt):
     run, _, wrong = learnt
-    found = examine(run, run.method(), wrong)
+    found = examine(run, run.method(), wrong).findings
     checked = examined(run)
     assert checked is not None and checked.findings == found and len(checked.residuals) == len(wrong)
     page = write_report(run).read_text()
