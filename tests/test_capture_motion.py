@@ -269,6 +269,15 @@ def test_stopped_and_gone_on(tmp_path):
         reconstruct([other], scene)
 
 
+def test_rows_are_counted_by_a_relative_path(tmp_path):
+    """People name folders from where they are."""
+    pycolmap.Database.open(tmp_path / "database.db").close()
+    command = [sys.executable, "-P", str(worker.COUNTER), "database.db", "keypoints"]
+    with subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as counter:
+        assert counter.stdout.readline() == "0\n"
+        counter.stdin.close()
+
+
 def test_the_worker_ends_when_nobody_listens(tmp_path):
     """As after a kill of the process that started it."""
     write_views(tmp_path / "images", 3)

@@ -19,7 +19,7 @@ POLL_SECONDS = 0.2  # between reads of the database
 
 def watch(database: str, table: str) -> None:
     """Print the number of rows, for ever."""
-    where = f"{Path(database).as_uri()}?mode=ro"
+    where = f"{Path(database).absolute().as_uri()}?mode=ro"
     while True:
         time.sleep(POLL_SECONDS)
         try:
