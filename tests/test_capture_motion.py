@@ -578,7 +578,7 @@ def test_exposure_rotation_and_reasons():
     assert diagnosis.about_rotation(10.0, replace(matches, turned=1)) == []
     assert "one place" in diagnosis.about_rotation(0.5, replace(matches, turned=0))[0]
     placed = ["a", "b", "c"]
-    assert why_not("d", placed, [], matches, False) == "in another group of 2, which shares too little with the rest"
+    assert why_not("d", placed, [], matches, False).startswith("in another group of 2, which shares too little")
     assert why_not("f", placed, [], matches, False).startswith("matches a (20 details)")
     assert "too few details (3 found): blurred" == why_not("g", placed, [], matches, True)
     assert "another group of 3" in why_not("f", placed, [["f", "x", "y"]], matches, False)
