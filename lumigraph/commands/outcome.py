@@ -83,14 +83,14 @@ def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str
     worst: names of held-out photographs, lowest PSNR first
     """
     priors = [name for part in method.parts for name in part.few_view_priors]
-    applied = f"although {' and '.join(priors)} supervised it" if priors else "and nothing else supervised it"
+    applied = f"although priors were on ({', '.join(priors)})" if priors else "and no prior for few photographs was on"
     near = f", first from near {' and '.join(worst[:WORST_VIEWS])}" if worst else ""
     steps = [f"more photographs help more than time{near}"]
     if run.settings.config.get("few_views") not in (None, "yes") and not priors:
         steps.append("try --few-views yes")
     other = next(name for name in OTHER_METHODS if name != run.method_name)
     steps.append(f"compare: {typed('train', other, run.settings.scene.source)}")
-    text = f"it has memorised the training photographs, {gap:.1f} dB better than held-out ones"
+    text = f"held-out photographs are {gap:.1f} dB worse: it has memorised the others"
     return f"{text}, {applied}; {'; '.join(steps)}"
 
 
