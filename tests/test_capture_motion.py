@@ -269,13 +269,17 @@ def test_stopped_and_gone_on(tmp_path):
         reconstruct([other], scene)
 
 
-def test_rows_are_counted_by_a_relative_path(tmp_path):
-    """People name folders from where they are."""
-    pycolmap.Database.open(tmp_path / "database.db").close()
-    command = [sys.executable, "-P", str(worker.COUNTER), "database.db", "keypoints"]
-    with subprocess.Popen(command, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as counter:
-        assert counter.stdout.readline() == "0\n"
-        counter.stdin.close()
+@pytest.mark.parametrize(("since", "counts"), [("ever", "01"), ("begin", "00")])
+def test_rows_are_counted_by_a_relative_path(tmp_path, since, counts):
+    """People name folders from where they are. A second pass adds rows to those of the first."""
+    for name, count in zip(("empty.db", "full.db"), counts, strict=True):
+        with closing(pycolmap.Database.open(tmp_path / name)) as opened:
+            if name == "full.db":
+                opened.write_camera(pycolmap.Camera(model="PINHOLE", width=9, height=9, params=[9, 9, 4.5, 4.5]))
+        command = [sys.executable, "-P", str(worker.COUNTER), name, "cameras", since]
+        with subprocess.Popen(command, cwd=tmp_path, stdin=-1, stdout=-1, text=True) as counter:
+            assert counter.stdout.readline() == f"{count}\n"
+            counter.stdin.close()
 
 
 def test_the_worker_ends_when_nobody_listens(tmp_path):
@@ -560,6 +564,8 @@ def test_gaps_around_a_subject():
     assert told.startswith(f"enough for views of one side of an object, from between {names[0]} and {names[6]}")
     assert "take 13 photographs more" in told and "front" in use_of(40.0, side.ends)
     assert use_of(360.0, None) == "enough for views from all sides"
+    sparse = coverage(names[:9], ring(np.arange(0, 360, 40)))  # all around, too far apart
+    assert sparse.ends is None and len(sparse.gaps) == 9 and sparse.advice[0].startswith("1 more from")
 
 
 def test_exposure_rotation_and_reasons():
