@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
+from pathlib import Path
 
 import pytest
 import tiny
@@ -14,7 +16,7 @@ from test_gaussian_splatting import new
 from lumigraph import methods
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.commands.compress import bytes_in
+from lumigraph.commands.compress import bytes_in, verdict
 from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.compress import bytes_of, decibels, rendered, squared_error
 from lumigraph.derive.compression.model import RUNG_POSITIONS, Model, rung_at
@@ -115,6 +117,32 @@ def test_a_size_is_kept_and_without_photographs_it_looks_as_it_did(cloud_run, tm
     made = Compressed.read(tmp_path / "new")
     assert made.bytes_after <= 9000 and made.compared_with == "renderings of the run" and made.psnr_before is None
     assert made.psnr_after > 20 and "2 held-out renderings of the run, for its photographs" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("after", "psnr", "said"),
+    [
+        (5_000, 29.9, "2.0 times smaller, with no visible loss"),
+        (5_000, 29.5, "2.0 times smaller, with a loss that a comparison side by side shows"),
+        (5_000, 28.0, "2.0 times smaller, with a visible loss; for a smaller one give --quality best"),
+        (12_000, 29.0, "worse in every row: keep RUN, or give a larger --max-loss, for example 2.0"),
+        (12_000, 30.1, "no smaller; give a larger --max-loss than the 0.00 dB that were lost"),
+    ],
+    ids=["invisible", "small loss", "visible loss", "worse in every row", "no smaller"],
+)
+def test_the_verdict_in_words(after, psnr, said):
+    made = Compressed("RUN", "m", 10_000, after, 20_000, 20_000, psnr, "photographs", 3, 0.1, 16, 0.1, 1, 9, 1.0, 30.0)
+    assert verdict(made, Path("RUN")).startswith(said)
+
+
+def test_interrupted_it_keeps_nothing_and_says_so(cloud_run, tmp_path, monkeypatch, capsys):
+    def interrupt(*told, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["lumigraph.derive.compression.compress"], "written", interrupt)
+    assert main(["compress", str(cloud_run.folder), "--output", str(tmp_path / "new"), "--steps", "1"]) == 130
+    assert f"Stopped; {cloud_run.folder} is as it was and nothing else is kept" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_each_place_on_the_ladder_is_smaller_than_the_one_before(cloud_run):

@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 import tiny
@@ -13,9 +14,11 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
+from lumigraph.budget import Budget
 from lumigraph.camera import ring
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
+from lumigraph.commands.convert import kept, verdict
 from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logit, teacher_of
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
@@ -29,7 +32,7 @@ from lumigraph.method.capabilities import FromField, HasField, can
 from lumigraph.methods.gaussian_splatting.initialization import rotation_to_normal
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, open_any
-from lumigraph.run.derived import Converted
+from lumigraph.run.derived import Converted, MeasuredModel
 from lumigraph.system.signals import Stopped
 from lumigraph.training import fit
 
@@ -287,6 +290,8 @@ def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monke
     with pytest.raises(Stopped):
         convert(ball_run, "plenoxels", tmp_path / "broken", aim)
     assert Converted.read(tmp_path / "broken") is None and Run(tmp_path / "broken").state.step == 5
+    assert kept(tmp_path / "broken") == "Stopped and saved after step 5 of training; the same command goes on"
+    assert kept(tmp_path / "none") == "Stopped before training, so nothing is kept; the same command begins anew"
     monkeypatch.undo()
     broken = convert(ball_run, "plenoxels", tmp_path / "broken", aim)
     one, other = (Run(tmp_path / name).method().state_dict() for name in ("straight", "broken"))
@@ -294,6 +299,26 @@ def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monke
     assert broken.psnr == straight.psnr and broken.steps == 12
     with pytest.raises(LumigraphError, match="already holds a run"):
         convert(ball_run, "plenoxels", tmp_path / "broken", aim)
+
+
+@pytest.mark.parametrize(
+    ("student", "learnt_from", "said"),
+    [
+        ((500, 0.1, 31.0), "photographs", "better: 2.0 times smaller, 2.0 times faster and 1.00 dB closer to the phot"),
+        ((2000, 0.1, 29.0), "photographs", "better: 2.0 times faster; worse: 2.0 times larger and 1.00 dB farther"),
+        ((2000, 0.4, 29.0), "photographs", "for longer: lumigraph resume OUT --steps 30"),
+        ((2000, 0.4, None), "renderings of the source", "for longer: convert again with a longer --seconds"),
+    ],
+    ids=["better in every row", "both", "worse in every row", "worse without photographs"],
+)
+def test_the_verdict_in_words(student, learnt_from, said, tmp_path):
+    scene = tiny.scene()
+    Run.create(tmp_path / "new", tiny.method(scene.frame), scene, budget=Budget(10).to_json())
+    old, new = MeasuredModel("a", 1000, 0.2, 30.0), MeasuredModel("b", *student)
+    made = Converted("RUN", "field", learnt_from, old, new, 30.0, 2, 1.0, 10, 1.0)
+    told = verdict(made, Path("RUN"), tmp_path / "new").replace(str(tmp_path / "new"), "OUT")
+    assert said in told and told.startswith("better" if "better" in said else "worse in every row: 2.0 times larger")
+    assert "keep RUN" in told or "better" in said
 
 
 REFUSED = {

@@ -18,7 +18,7 @@ from views import FOCAL, HEIGHT, WALL, WIDTH, between, look_at, pattern, write_v
 
 from lumigraph.capture import read_capture
 from lumigraph.capture.coverage import coverage
-from lumigraph.capture.doctor import LACKING, Finding, Residual, deviations, findings, of_residuals
+from lumigraph.capture.doctor import LACKING, Finding, Residual, deviations, findings, grouped, of_residuals
 from lumigraph.commands.cli import main
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.photographs import RESULT_FILE, compare_all, examine, examined
@@ -152,7 +152,7 @@ def test_a_run_names_photographs_that_it_cannot_render(learnt):
 
 def test_the_worst_photographs_stand_in_the_report(learnt):
     run, _, wrong = learnt
-    found = examine(run, run.method(), wrong)
+    found = examine(run, run.method(), wrong).findings
     checked = examined(run)
     assert checked is not None and checked.findings == found and len(checked.residuals) == len(wrong)
     page = write_report(run).read_text()
@@ -198,3 +198,12 @@ def test_lacking_directions_are_findings(clean):
     found = [f for f in findings(replace(capture, shots=shots), {}) if f.fault == LACKING]
     assert len(found) == 2 and all(f.photograph == "" and isinstance(f, Finding) for f in found)
     assert "260 of 360 degrees" in found[0].evidence and "between view11.jpg and view00.jpg" in found[0].advice
+
+
+def test_photographs_with_the_same_fault_stand_in_one_line():
+    found = [Finding(name, "left out", "in another group of 2", "retake it") for name in ("a.jpg", "b.jpg")]
+    found += [Finding("c.jpg", "left out", "black", "retake it"), Finding("", "floaters", "3 of 9", "")]
+    assert grouped(found) == {
+        "left out": ["a.jpg, b.jpg: in another group of 2; retake it", "c.jpg: black; retake it"],
+        "floaters": ["3 of 9"],
+    }

@@ -32,7 +32,7 @@ def test_a_log_hears_of_work_before_its_first_item_is_done(hurried, capsys):
     for _ in track(range(2), "Comparing [views] {x}", 2):
         time.sleep(0.25)
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "Comparing [views] {x}: 0 of 2"
+    assert lines[0] == "Comparing [views] {x}: 0 of 2, 0:00 so far"
     assert re.fullmatch(r"Comparing \[views\] \{x\}: 1 of 2, 50 %, about 0:0\d left", lines[-2])
     assert lines[-1] == "Comparing [views] {x}: took 0:00"
     assert 4 <= len(lines) <= 12  # ever more rarely
@@ -55,7 +55,7 @@ def test_a_stage_within_another_is_not_shown_and_a_fault_is_not_called_done(hurr
             time.sleep(0.1)
         raise ValueError
     lines = capsys.readouterr().err.splitlines()
-    assert lines and set(lines) == {"Outer: 0 of 3"} and ProgressStage._shown is None
+    assert lines and set(lines) == {"Outer: 0 of 3, 0:00 so far"} and ProgressStage._shown is None
 
 
 def test_lines_come_soon_and_then_rarely():
@@ -97,4 +97,4 @@ def test_colours_that_a_log_is_told_to_have_make_no_terminal_of_it(hurried, caps
     with counting("Filming", 3):
         time.sleep(0.1)
     told = capsys.readouterr().err
-    assert told.startswith("Filming: 0 of 3\n") and "\x1b" not in told
+    assert told.startswith("Filming: 0 of 3, ") and "\x1b" not in told

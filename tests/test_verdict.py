@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny
@@ -10,8 +12,17 @@ from budgets import budget
 
 from lumigraph import methods
 from lumigraph.budget import Budget
-from lumigraph.commands.eval import beside_training
-from lumigraph.commands.outcome import advice, more_time, next_commands, photographed, seen
+from lumigraph.commands.outcome import (
+    advice,
+    beside_training,
+    more_time,
+    next_commands,
+    photographed,
+    seen,
+    show_outcome,
+)
+from lumigraph.datasets.images import ImageStore
+from lumigraph.methods.gaussian_splatting.few_views import FewViewNumbers, FewViews
 from lumigraph.metrics.rows import last_psnr
 from lumigraph.run import Run, build
 from lumigraph.training import fit
@@ -139,8 +150,34 @@ def test_next_commands_name_the_run(tmp_path):
     assert photographed(Run(run.folder), tiny.scene())
 
 
-def test_what_is_known_by_heart_is_said():
+def test_memorised_photographs_are_said_with_what_was_applied_and_what_is_next(tmp_path):
+    run, method = tiny.new_run(tmp_path / "a"), tiny.method(tiny.scene().frame)
     views = [{"name": name, "psnr": value} for name, value in (("a", 22.0), ("b", 16.0), ("c", 19.0))]
-    told = beside_training(25.0, {"psnr": 19.0, "views": views})
-    assert "memorised" in told and told.endswith("first from near b and c")
-    assert beside_training(25.0, {"psnr": 24.0}) == "25.00 dB while training"
+    told = beside_training(25.0, {"psnr": 19.0, "views": views}, run, method)
+    assert "6.0 dB worse" in told and "first from near b and c" in told and "no prior for few photographs" in told
+    assert "compare: lumigraph train instant-ngp 'in memory'" in told
+    assert beside_training(25.0, {"psnr": 24.0}, run, method) == "25.00 dB while training"
+
+
+def test_priors_for_few_photographs_are_named():
+    few = FewViews(FewViewNumbers("yes"))
+    few.surface = torch.zeros(2, 3)
+    assert few.few_view_priors == ("dropout of Gaussians", "smooth depth", "plane-sweep surfaces at unobserved views")
+    assert FewViews(FewViewNumbers("auto")).few_view_priors == ()
+
+
+def test_the_verdict_compares_held_out_photographs(tmp_path, capsys, monkeypatch):
+    """Held-out photographs that show something else are rendered worse, and the advice follows."""
+    scene = tiny.scene()
+    method = tiny.method(scene.frame, learning_rate=0.02, rays=1024)
+    run = Run.create(tmp_path / "a", method, scene, budget=Budget(100).to_json())
+    outcome = fit(method, scene, run, steps=100, log_every=2, show=False, rehearsal=False)
+    monkeypatch.setattr(type(method), "steps_for", lambda *_: 1)
+    show_outcome(run, outcome, method, scene)
+    said = capsys.readouterr().out
+    assert "held-out photographs" in said and "memorised" not in said
+    pictures = [scene.images[i].byte().numpy() for i in range(len(scene))]
+    for i in scene.splits["test"].tolist():
+        pictures[i] = np.random.default_rng(i).integers(0, 255, pictures[i].shape, np.uint8)
+    show_outcome(run, outcome, method, replace(scene, images=ImageStore.from_arrays(pictures)))
+    assert "memorised" in capsys.readouterr().out

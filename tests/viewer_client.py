@@ -52,6 +52,18 @@ class Client:
         message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
         self.socket.send(msgspec.msgpack.encode(message))
 
+    def click(self, place) -> None:
+        """Click in the scene at a place of the window, (x, y) in [0, 1]."""
+        message = {
+            "type": "ScenePointerMessage",
+            "event_type": "click",
+            "ray_origin": (0.0, 0.0, 0.0),
+            "ray_direction": (0.0, 0.0, 1.0),
+            "screen_pos": [place],
+            "modifier": None,
+        }
+        self.socket.send(msgspec.msgpack.encode(message))
+
     def drag(self, handle, position) -> None:
         """Drag arrows in the scene to a place, as its browser would."""
         message = {

@@ -16,7 +16,7 @@ Place = tuple[float, float, float]
 
 MAX_GAP_ANGLE = 30.0  # degrees between neighbouring viewing directions
 ADVISED_STEP = 20.0  # degrees between photographs that fill a gap
-MIN_ORBIT = 180.0  # degrees covered, from which on gaps and elevations are judged
+MIN_ORBIT = 180.0  # degrees between the outermost photographs, from which on gaps and elevations are judged
 STEP_ELEVATION = 10.0  # degrees of elevation that count as a step higher or lower
 MIN_BAND = 15.0  # degrees between the lowest and the highest tenth of the elevations; less is a single round
 ROUND_ELEVATION = 25.0  # degrees above or below the first round that a second one is advised at
@@ -35,12 +35,12 @@ class Gap:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Angle of the subject that photographs cover. Gaps and advice only for more than half of the circle.
+    """Angle of the subject that photographs cover. Gaps and advice only where they span more than half of the circle.
 
     elevations: lowest and highest camera, degrees above the horizontal through the subject
     advice:     photographs to add, one sentence part each: "4 more from behind, between a.jpg and b.jpg"
     places:     positions of these photographs, in the frame of the cameras
-    ends:       first and last photograph, from left to right, if these cover at most half of the circle
+    ends:       first and last photograph, from left to right, if these span at most half of the circle
     """
 
     degrees: float
@@ -84,7 +84,7 @@ def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Cov
     wide = [i for i in np.argsort(-steps).tolist() if steps[i] > MAX_GAP_ANGLE]
     degrees = float(360 - steps[wide].sum())
     band = float(elevation.min()), float(elevation.max())
-    if degrees <= MIN_ORBIT:
+    if steps.max() >= 360 - MIN_ORBIT:
         last, first = order[wide[0]], order[(wide[0] + 1) % len(order)]
         return Coverage(degrees, [], band, ends=(names[first], names[last]))
     gaps, advice, places, usual = [], [], [], float(np.median(elevation))

@@ -335,8 +335,12 @@ def deviations(values: Array, least: float) -> Array:
 
 
 def grouped(found: Sequence[Finding]) -> dict[str, list[str]]:
-    """Lines for display, by fault."""
-    lines: dict[str, list[str]] = {}
+    """Lines for display, by fault; photographs with the same evidence and advice in one line."""
+    lines: dict[str, dict[Finding, list[str]]] = {}
     for finding in found:
-        lines.setdefault(finding.fault, []).append(str(finding))
-    return lines
+        alike = lines.setdefault(finding.fault, {})
+        alike.setdefault(replace(finding, photograph=""), []).append(finding.photograph)
+    return {
+        fault: [str(replace(finding, photograph=", ".join(filter(None, names)))) for finding, names in alike.items()]
+        for fault, alike in lines.items()
+    }

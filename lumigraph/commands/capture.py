@@ -14,6 +14,7 @@ from ..files.ranges import Count, between
 from .common import finding_rows, lines, say, scene_name, show, typed
 from .options import needed, option
 
+MAX_NAMED_GAPS = 2  # gaps around the subject that are named
 GENERIC_FOLDERS = "images", "photos", "photographs", "pictures", "input", "frames"  # named after their contents
 
 
@@ -142,7 +143,7 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
         found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
         found["around"] += ", from {:.0f} to {:.0f} degrees above the subject".format(*coverage["elevations"])
         gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]
-        gap = f"no photograph from {', '.join(gaps)}"
+        gap = f"no photograph from {', '.join(gaps)}" if len(gaps) <= MAX_NAMED_GAPS else f"{len(gaps)} gaps"
         found["around"] += f"; {gap if gaps else use_of(coverage['degrees'], coverage.get('ends'))}"
     if result["gps"] and result["gps"]["used"]:
         found["place"] = result["gps"]["say"]

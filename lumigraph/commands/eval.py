@@ -11,9 +11,6 @@ from ..system.console import bold
 from .common import choose_device, show
 from .options import DeviceOption, Overwrite, RunOption, Set, controlled, option
 
-WORST_VIEWS = 2  # held-out views that are named
-MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
-
 
 @dataclass(frozen=True)
 class Eval:
@@ -50,7 +47,7 @@ class Eval:
         from ..metrics.lpips import load_lpips, named_files
         from ..metrics.rows import last_psnr
         from ..run import open_run
-        from .outcome import next_commands
+        from .outcome import beside_training, next_commands
 
         run = open_run(self.run_folder)
         claim_evaluation(run, self.split, self.save_images, self.overwrite)
@@ -73,20 +70,9 @@ class Eval:
         rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
         learnt = last_psnr(run.metrics())
         if learnt is not None and self.split != "train" and "psnr" in result:
-            rows["photographs learnt from"] = beside_training(learnt, result)
+            rows["photographs learnt from"] = beside_training(learnt, result, run, method)
         show(rows | next_commands(run, "eval"))
         return 0
-
-
-def beside_training(learnt: float, result: dict[str, Any]) -> str:
-    """PSNR of the training photographs as text, the meaning of a gap to held-out ones, and views that lack others."""
-    text, better = f"{learnt:.2f} dB while training", learnt - result["psnr"]
-    if better > MEMORISED_DB:
-        worst = sorted(result.get("views", []), key=lambda view: view["psnr"])[:WORST_VIEWS]
-        where = " and ".join(view["name"] for view in worst)
-        text += f", {better:.1f} dB better: it has memorised them, so more photographs would help more than time"
-        text += f"; first from near {where}" if where else ""
-    return text
 
 
 def compared(result: dict[str, Any]) -> dict[str, str]:

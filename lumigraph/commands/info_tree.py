@@ -27,7 +27,7 @@ from ..metrics.rows import last_psnr
 from ..run import Run
 from ..run.derived import Compressed, Converted, Inferred
 from ..system.console import bold, dim
-from ..training.display import learner, pixel_sizes
+from ..training.display import extent, pixel_sizes
 from ..training.verdict import cameras_moved
 
 MAX_MEMBERS = 12  # shapes that are listed
@@ -92,11 +92,13 @@ def run_rows(run: Run) -> dict[str, Any]:
     rows: dict[str, Any] = {}
     if run.has_state:
         with contextlib.suppress(LumigraphError):
-            rows["model"] = learner(run.method_name, run.method("cpu")).partition(", ")[2]
+            count, unit = extent(run.method("cpu"))
+            rows["model"] = f"{count:,} {unit}"
         rows["on disk"] = f"{size(run.model_bytes)} the model, {size(folder_bytes(run.folder))} the whole run"
-        rows["training"] = f"{run.state.step:,} steps in {run.state.seconds:.0f} s"
     if run.photographed and len(cameras := run.cameras()["train"]):
         rows["photographs"] = f"{len(cameras):,} of {pixel_sizes(cameras.size)} pixels"
+    if run.has_state:
+        rows["training"] = f"{run.state.step:,} steps in {run.state.seconds:.0f} s"
     if (psnr := last_psnr(run.metrics())) is not None:
         rows["PSNR of training photographs"] = f"{psnr:.2f} dB"
     scores = {f"{score.name} of the evaluation": str(score) for score in scores_of(run.evaluation() or {})}

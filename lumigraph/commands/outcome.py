@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from ..budget import QUALITIES, Budget
 from ..datasets.scene import Scene
@@ -11,14 +12,22 @@ from ..errors import LumigraphError
 from ..method import Method, RayMethod
 from .common import finding_rows, say, show, typed
 
+if TYPE_CHECKING:
+    from ..evaluation.photographs import Examined
+
 SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
 FULL_SIZE_SHARE = 0.45  # share of training below which a trend spans less than its second half
 MIN_GROWTH = 2.5  # times the budget so far that a suggestion has at least
+MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
+WORST_VIEWS = 2  # held-out views that are named
+OTHER_METHODS = "instant-ngp", "gaussian-splatting"  # of which the other is suggested for comparison
+ABOUT_RESIDUALS = "small renderings, each after a gain and an offset per colour"
 NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "export": "make a page to share"}
 
 
 def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Print the state of a Run after an Outcome, and the next commands."""
+    from ..evaluation.photographs import RESULT_FILE
     from ..metrics.rows import last_psnr
     from ..training.verdict import cameras_moved, loss_trend
 
@@ -44,21 +53,54 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
         rows["cameras moved by"] = str(moved)
     enough = state.step >= method.steps_for("draft", data)
     more = more_time(run.folder, budget) if enough else typed("resume", run.folder, "--quality", "draft")
+    checked, gap = examined(run, method, data), 0.0
+    learnt, held_out = ([one.psnr for one in checked.of(split)] for split in ("train", "test"))
+    if learnt and held_out and not method.moves_cameras:  # poses of held-out photographs are not learnt
+        psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
+        rows["held-out photographs"] = f"{other:.1f} dB, training photographs {psnr:.1f} dB ({ABOUT_RESIDUALS})"
+        gap = psnr - other
     rows["advice"] = advice(trend, enough, more, photographed(run, data))
-    show(rows | photograph_rows(run, method, data) | next_commands(run))
+    if enough and gap > MEMORISED_DB:
+        rows["advice"] = memorised(gap, run, method, [one.photograph for one in checked.of("test")])
+    show(rows | finding_rows(checked.findings, str(run.folder / RESULT_FILE)) | next_commands(run))
 
 
-def photograph_rows(run: Any, method: Method, data: Any) -> dict[str, str]:
+def examined(run: Any, method: Method, data: Any) -> Examined:
     """Findings on the photographs of a run, which are written into it; a fault of their files is a warning."""
-    from ..evaluation.photographs import RESULT_FILE, examine
+    from ..evaluation.photographs import Examined, examine
 
-    if not isinstance(data, Scene):
-        return {}
     try:
-        return finding_rows(examine(run, method, data), str(run.folder / RESULT_FILE))
+        return examine(run, method, data) if isinstance(data, Scene) else Examined()
     except LumigraphError as fault:
         say(f"warning: the photographs could not be examined: {fault}")
-        return {}
+        return Examined()
+
+
+def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str:
+    """Advice in one sentence for a run that renders held-out photographs worse: priors that were on, what to do next.
+
+    gap:   dB by which training photographs are better
+    worst: names of held-out photographs, lowest PSNR first
+    """
+    priors = [name for part in method.parts for name in part.few_view_priors]
+    applied = f"although priors were on ({', '.join(priors)})" if priors else "and no prior for few photographs was on"
+    near = f", first from near {' and '.join(worst[:WORST_VIEWS])}" if worst else ""
+    steps = [f"more photographs help more than time{near}"]
+    if run.settings.config.get("few_views") not in (None, "yes") and not priors:
+        steps.append("try --few-views yes")
+    other = next(name for name in OTHER_METHODS if name != run.method_name)
+    steps.append(f"compare: {typed('train', other, run.settings.scene.source)}")
+    text = f"held-out photographs are {gap:.1f} dB worse: it has memorised the others"
+    return f"{text}, {applied}; {'; '.join(steps)}"
+
+
+def beside_training(learnt: float, result: dict[str, Any], run: Any, method: Method) -> str:
+    """PSNR of the training photographs as text, and the meaning of a gap to held-out ones. result: of an evaluation"""
+    text, gap = f"{learnt:.2f} dB while training", learnt - result["psnr"]
+    if gap > MEMORISED_DB:
+        worst = sorted(result.get("views", []), key=lambda view: view["psnr"])
+        text += f": {memorised(gap, run, method, [view['name'] for view in worst])}"
+    return text
 
 
 def seen(passes: float, what: str) -> str:

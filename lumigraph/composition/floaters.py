@@ -16,7 +16,7 @@ from ..gaussians import Gaussians
 from ..gaussians.cloud import ISOLATION_NEIGHBOURS, gaps
 from ..gaussians.splatting import render
 from ..geometry import evenly
-from ..system.progress import track
+from ..system.progress import counting
 
 STRENGTH = 0.4  # default share of the slider: Gaussians with a score above 1 - STRENGTH are removed
 CANDIDATE_COLOUR = (1.0, 0.1, 0.8)  # of floaters that are shown
@@ -71,6 +71,7 @@ def floaters(
 
 
 @torch.no_grad()
+@counting("Looking for floaters")
 def evidence(gaussians: Gaussians, cameras: Camera | None, frame: Frame) -> FloaterEvidence:
     """Evidence on each Gaussian of a cloud.
 
@@ -127,7 +128,7 @@ def nearness(gaussians: Gaussians, cameras: Camera, seen: Camera, frame: Frame) 
 
 def depth_maps(gaussians: Gaussians, cameras: Camera, frame: Frame) -> Iterator[DepthMap]:
     """Depth maps of a cloud, one after the other, at most 200 pixels long."""
-    for i in track(range(len(cameras)), "Looking for floaters", len(cameras)):
+    for i in range(len(cameras)):
         camera = cameras[i].resized(min(1.0, MAX_SIDE / int(cameras[i].size.max())))
         near = NEAR_PLANE_SCALE * frame.near
         rendering = render(gaussians, camera.to(gaussians.means.device), frame.background, near)

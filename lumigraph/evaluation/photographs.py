@@ -58,10 +58,14 @@ class Examined:
     findings: list[Finding] = field(default_factory=list)
     residuals: list[Residual] = field(default_factory=list)
 
+    def of(self, split: str) -> list[Residual]:
+        """Residuals of a split, lowest PSNR first."""
+        return sorted((one for one in self.residuals if one.split == split), key=lambda one: one.psnr)
 
-def examine(run: Run, method: Method, scene: Scene) -> list[Finding]:
-    """Findings on the photographs of a run, worst first; written to RUN/photographs.json, the five worst photographs
-    with rendering, error and depth to RUN/photographs.png.
+
+def examine(run: Run, method: Method, scene: Scene) -> Examined:
+    """Findings on the photographs of a run, worst first, and residuals; written to RUN/photographs.json, the
+    five worst photographs with rendering, error and depth to RUN/photographs.png.
 
     Raises LumigraphError where the source's files have become unreadable.
     """
@@ -75,12 +79,13 @@ def examine(run: Run, method: Method, scene: Scene) -> list[Finding]:
     else:
         found = of_residuals(residuals, (), set())
     found += of_floaters(run, method, scene)
-    write_json(run.folder / RESULT_FILE, asdict(Examined(found, residuals)), ours=True)
+    result = Examined(found, residuals)
+    write_json(run.folder / RESULT_FILE, asdict(result), ours=True)
     if compared:
         save_picture(
             run.folder / SHEET_FILE, sheet(method, scene, worst(compared, found), found, len(compared)), ours=True
         )
-    return found
+    return result
 
 
 def of_floaters(run: Run, method: Method, scene: Scene) -> list[Finding]:

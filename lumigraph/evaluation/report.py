@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import math
@@ -17,16 +18,19 @@ from .. import __version__, methods
 from ..budget import Budget
 from ..capture.doctor import grouped
 from ..capture.pictures import readable
+from ..errors import LumigraphError
 from ..figures.charts import STYLE as CHARTS
 from ..figures.charts import Series, bar_chart, line_chart
 from ..files import claim, write_bytes
 from ..metrics import scores_of
-from ..metrics.rows import of_final_size
+from ..metrics.rows import last_psnr, of_final_size
 from ..run import Run
 from ..system.progress import clock, short
+from ..training.display import extent, pixel_sizes
 from ..training.verdict import cameras_moved
 from .photographs import SHEET_FILE, examined
 
+THIN_SPACE = "\u202f"
 MAX_FILM_BYTES = 12 << 20  # bytes; larger ones are named instead of embedded
 STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 
@@ -63,6 +67,20 @@ def page(title: str, body: str, footer: str) -> bytes:
 
 def header(run: Run, evaluation: dict[str, Any] | None) -> str:
     figures: list[tuple[str, str, str]] = []
+    if run.has_state:
+        with contextlib.suppress(LumigraphError):
+            count, unit = extent(run.method("cpu"))
+            figures.append((f"{count:,}".replace(",", THIN_SPACE), "", unit))
+        figures.append((f"{run.model_bytes / 1e6:.3g}", "MB", "model"))
+    if run.photographed and len(cameras := run.cameras()["train"]):
+        figures.append((pixel_sizes(cameras.size), "pixels", "of a photograph"))
+    if run.has_state:
+        state = run.state
+        lasted = (f"{state.seconds:.0f}", "s") if state.seconds < 1000 else (clock(state.seconds), "min")
+        figures.append((*lasted, "of training"))
+        figures.append((f"{state.step:,}".replace(",", THIN_SPACE), "", "steps"))
+    if (psnr := last_psnr(run.metrics())) is not None:
+        figures.append((f"{psnr:.2f}", "dB", "PSNR of training photographs"))
     if evaluation:
         protocol = evaluation["protocol"]
         what = "views" if "views" in protocol else "shapes"
@@ -73,11 +91,6 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
             value = f"{score.value:.{min(score.digits, 3)}f}"
             compared = "" if i else f", {count} {split} {what}".replace("  ", " ")
             figures.append((value, score.unit, score.name + compared))
-    if run.has_state:
-        state = run.state
-        figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))
-        figures.append((f"{state.step:,}".replace(",", "\u202f"), "", "steps"))
-        figures.append((f"{run.model_bytes / 1e6:.3g}", "MB", "model"))
     if evaluation and "seconds_per_view" in evaluation:
         figures.append((f"{evaluation['seconds_per_view']:.2f}", "s", "to render a view"))
     sentence = f"{run.method_name}, trained on {counted(run)}"

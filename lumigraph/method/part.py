@@ -49,6 +49,11 @@ class Part(nn.Module):
         """Storage of the part's tensors in a compressed run, by their names in the part."""
         return {}
 
+    @property
+    def few_view_priors(self) -> tuple[str, ...]:
+        """Names of the priors that supervised places which photographs leave open, for the verdict on a run."""
+        return ()
+
     # Rendering
 
     def moved(self, rays: Rays) -> Rays:

@@ -101,7 +101,7 @@ class ProgressStage:
             return f"{self.description}: {clock(self.seconds)} so far"
         told = f"{self.description}: {self.count} of {self.total}"
         if not self.count or not self.total:
-            return told
+            return f"{told}, {clock(self.seconds)} so far"
         left = self.seconds * (self.total - self.count) / self.count
         return f"{told}, {100 * self.count / self.total:.0f} %, about {clock(left)} left"
 

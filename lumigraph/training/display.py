@@ -204,10 +204,16 @@ def pixel_sizes(of: Int[Tensor, "photograph 2"]) -> str:
 
 
 def learner(name: str, method: Any) -> str:
-    """A method's name and how large it is: Gaussians, or numbers that it learns."""
+    """A method's name and how large it is."""
+    count, unit = extent(method)
+    return f"{name}, {count:,} {unit}"
+
+
+def extent(method: Any) -> tuple[int, str]:
+    """Number of Gaussians, or of numbers that a method learns, and their name."""
     if can(method, HasGaussians):
-        return f"{name}, {len(method.gaussians()):,} Gaussians"
-    return f"{name}, {sum(x.numel() for x in method.parameters() if x.requires_grad):,} numbers to learn"
+        return len(method.gaussians()), "Gaussians"
+    return sum(x.numel() for x in method.parameters() if x.requires_grad), "numbers to learn"
 
 
 def machine(device: torch.device) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -23,6 +24,8 @@ HANDLE = 0.25  # length of a handle's arrows, in radii of the subject
 CIRCLE_SEGMENTS = 64  # pieces of a drawn circle
 NUMBER_STEP = 0.001  # scene units: step of the numbers
 STRENGTH_STEP = 0.02
+DOUBLE_CLICK_SECONDS = 0.5  # seconds between two clicks that are a double click, at most
+DOUBLE_CLICK_SHIFT = 0.02  # distance between them, as a share of the window
 REMOVE, RESTORE = "Remove floaters", "Bring floaters back"
 
 
@@ -33,6 +36,7 @@ class CropPanel:
     cleaned: whether floaters are left out
     keep:    saves the rest under a name and returns its path; None where nothing can be saved
     notify:  shows the client a title and a text
+    surface: gives the point of the surface at a place in the client's window, (x, y) in [0, 1]; None where nothing is
     """
 
     def __init__(
@@ -42,8 +46,11 @@ class CropPanel:
         changed: Callable[[], None],
         keep: Callable[[str], str] | None,
         notify: Callable[[str, str], None],
+        surface: Callable[[tuple[float, float]], Vector | None],
     ):
         self._client, self._shared, self._changed, self._keep, self._notify = client, shared, changed, keep, notify
+        self._surface = surface
+        self._listening, self._last_click = False, (-math.inf, (0.0, 0.0))  # its time and place
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
         gui, (sphere, (lower, upper)) = client.gui, shared.subject_crops()
@@ -124,7 +131,35 @@ class CropPanel:
                 handle.visible = shown
         self._place_handles()
         self._outline()
+        self._listen(shape != ALL)
         self._changed()
+
+    def _listen(self, wanted: bool) -> None:
+        """Heed clicks in the scene while a crop is shown. viser reports single clicks, and shows a hand meanwhile."""
+        if wanted and not self._listening:
+            self._client.scene.on_click()(self._clicked)
+        elif self._listening and not wanted:
+            self._client.scene.remove_click_callback()
+        self._listening = wanted
+
+    def _clicked(self, event: Any) -> None:
+        """Move the crop's middle to the surface that a double click is on."""
+        now, place = time.monotonic(), event.screen_pos
+        (before, at), self._last_click = self._last_click, (now, place)
+        if now - before > DOUBLE_CLICK_SECONDS or math.dist(place, at) > DOUBLE_CLICK_SHIFT:
+            return
+        self._last_click = -math.inf, place
+        if (middle := self._surface(place)) is None:
+            return
+        shift = np.array(middle) - (np.array(self._lower.value) + self._upper.value) / 2
+        self._following = True
+        try:
+            self._middle.value = middle
+            for corner in (self._lower, self._upper):
+                corner.value = vector(corner.value + shift)
+        finally:
+            self._following = False
+        self._update()
 
     def _place_handles(self) -> None:
         """Arrows to drag: at a box's two corners, or at a sphere's middle."""

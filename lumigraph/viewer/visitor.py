@@ -22,6 +22,7 @@ from .. import kernels
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..datasets.scene import Vector
+from ..depth_maps.depth_map import SURFACE_OPACITY
 from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..gaussians import Gaussians
@@ -29,7 +30,7 @@ from ..geometry import to_matrix, unit
 from ..paths.opening import upright
 from .cameras import Flight, ViewRequest, angle_across, angle_for, pose_of, rows
 from .controls import Controls, MethodControls
-from .crop_panel import CropPanel
+from .crop_panel import CropPanel, vector
 from .export_panel import ExportPanel
 from .modes import along_axis, extra_modes, picture
 from .painter import MOVING_SECONDS, Pace, Painter
@@ -66,7 +67,7 @@ class Visitor:
         self.controls = Controls(client, shared, self.painter.request, self._go_home)
         self.method_controls = MethodControls(client, shared, self.painter.request)
         keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
-        self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify)
+        self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify, self._surface)
         self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
         if shared.subject.exporter is not None:
             about = shared.subject.exporter, shared.subject.title, self.request, self.notify
@@ -130,6 +131,17 @@ class Visitor:
         """Fly to where a photograph was taken, with an angle of view that shows all of it."""
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
+
+    def _surface(self, place: tuple[float, float]) -> Vector | None:
+        """Point of the surface that the client sees at a place in its window, (x, y) in [0, 1]."""
+        request = self.request()
+        rendering, camera = self._render(request, replace(request, longest=DEPTH_SIZE).full, lambda: self._here)
+        height, width = rendering.depth.shape
+        x, y = (min(int(share * side), side - 1) for share, side in zip(place, (width, height), strict=True))
+        if rendering.opacity[y, x] < SURFACE_OPACITY:
+            return None
+        ray = camera.rays(torch.tensor([[x + 0.5, y + 0.5]]))
+        return vector(ray.at(rendering.depth[y, x].view(1))[0])
 
     def _keep(self, name: str) -> str:
         """Save what is left of the cloud. Raises LumigraphError if it cannot be."""

@@ -17,16 +17,18 @@ from pathlib import Path
 POLL_SECONDS = 0.2  # between reads of the database
 
 
-def watch(database: str, table: str) -> None:
-    """Print the number of rows, for ever."""
-    where = f"{Path(database).as_uri()}?mode=ro"
+def watch(database: str, table: str, since: str) -> None:
+    """Print the number of rows, for ever. since: "begin" for rows added from now on, "ever" for all"""
+    where, before = f"{Path(database).absolute().as_uri()}?mode=ro", None if since == "begin" else 0
     while True:
-        time.sleep(POLL_SECONDS)
         try:
             with closing(sqlite3.connect(where, uri=True)) as connection:
-                print(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0], flush=True)
+                count = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+            before = count if before is None else before
+            print(count - before, flush=True)
         except sqlite3.OperationalError:  # COLMAP is writing just now, or has not begun to
-            continue
+            pass
+        time.sleep(POLL_SECONDS)
 
 
 def end_with_input() -> None:

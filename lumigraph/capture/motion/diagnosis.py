@@ -211,6 +211,9 @@ def diagnose(
     )
 
 
+APART = "in another group of {}, which shares too little with the rest: another place, or views between are missing"
+
+
 def why_not(
     name: str, registered: Sequence[str], others: Sequence[Sequence[str]], matches: Matches, blurred: bool
 ) -> str:
@@ -221,13 +224,13 @@ def why_not(
         return f"too few details ({features} found): {fault}"
     for model in others:
         if name in model:
-            return f"in another group of {len(model)}, which shares too little with the rest"
+            return APART.format(len(model))
     neighbour, most = matches.best(name)
     if not most:
         return "shares too few details with any other photograph"
     group = next(group for group in matches.groups() if name in group)
     if group.isdisjoint(registered):
-        return f"in another group of {len(group)}, which shares too little with the rest"
+        return APART.format(len(group))
     return f"matches {neighbour} ({most} details), but its place could not be told"
 
 

@@ -302,9 +302,8 @@ class Reconstruction:
             named = [(a, b) for a, b in named if a in among or b in among]
         listed = self.work / "pairs.txt"
         write_bytes(listed, "".join(f"{a} {b}\n" for a, b in named).encode(), ours=True)
-        self.colmap(
-            "Comparing again" if among else "Comparing pairs", len(named), database, stage="matching", pairs=str(listed)
-        )
+        description, since = ("Comparing again", "begin") if among else ("Comparing pairs", "ever")
+        self.colmap(description, len(named), database, stage="matching", pairs=str(listed), since=since)
 
     def place(self, key: str) -> None:
         """By the mapper that was asked for; by the other where it finds no model. One by one needs a pair that tells

@@ -280,14 +280,14 @@ def main() -> None:
     if table is None:
         run(job)
         return
-    with counting(job["database"], table):
+    with counting(job["database"], table, job.get("since", "ever")):
         run(job)
 
 
 @contextmanager
-def counting(database: str, table: str) -> Iterator[None]:
-    """Meanwhile another process reports how many rows a table has."""
-    command = [sys.executable, "-P", str(COUNTER), database, table]
+def counting(database: str, table: str, since: str) -> Iterator[None]:
+    """Meanwhile another process reports how many rows a table has; see `counter.watch`."""
+    command = [sys.executable, "-P", str(COUNTER), database, table, since]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=REPORT, stderr=subprocess.DEVNULL) as counter:
         try:
             yield

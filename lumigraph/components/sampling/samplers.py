@@ -175,6 +175,11 @@ class ProposalSampler(Sampler):
     def stands(self) -> Float[Tensor, "camera 3"]:
         return self.surface_from.unique(dim=0)
 
+    @property
+    def few_view_priors(self) -> tuple[str, ...]:
+        air = ("clear air between cameras",) if self.numbers.air_weight else ()
+        return ("plane-sweep depth", *air) if len(self.surface) else ()
+
     # Training
 
     def compile_begin(self) -> None:

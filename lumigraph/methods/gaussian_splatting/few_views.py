@@ -78,6 +78,13 @@ class FewViews(Addition):
     def base_colours(self) -> bool:  # type: ignore[override]
         return bool(self.plain)
 
+    @property
+    def few_view_priors(self) -> tuple[str, ...]:
+        numbers, known = self.numbers, len(self.surface) > 0
+        depth = ("smooth depth",) if numbers.depth_weight else ()
+        surface = ("plane-sweep surfaces at unobserved views",) if numbers.surface_weight and known else ()
+        return ("dropout of Gaussians", *depth, *surface) if self.active else ()
+
     def begin_scene(self, data: Scene, sweep: Callable[[], Points]) -> None:
         """Decide whether the capture is sparse, and keep what plane sweeps have found."""
         count = len(data.splits["train"])
