@@ -146,3 +146,13 @@ def test_a_run_opens_the_same_scales_again(folder, tmp_path):
     run = Run.create(tmp_path / "run", tiny.method(scene.frame), scene, options={"scales": 2})
     assert Run(run.folder).scene().names == scene.names
     assert len(run.cameras()["train"]) == len(scene.splits["train"])
+
+
+@pytest.mark.parametrize(("size", "halves", "part"), [(20, True, "the right half of ball_0"), (10, False, "ball_0")])
+def test_photographs_smaller_than_a_window_of_ssim_are_refused(size, halves, part):
+    scene = tiny.made(8, size, 1.25 * size)
+    method = tiny.method(scene.frame)
+    with pytest.raises(LumigraphError, match=f"11 x 11 pixels, and {part}, of {size}x{size} pixels, has fewer across"):
+        evaluate(method, scene, right_halves=halves)
+    enough = tiny.made(8, size + 1, 1.25 * size)
+    assert len(evaluate(method, enough, views=1, right_halves=halves).views) == 1

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera.rays import Look, Rays, Rendering
@@ -30,7 +31,7 @@ from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ...method import FieldMethod
 from ...volume import composite
-from .patch_flow import SIDE, PatchFlow
+from .patch_flow import SIDE, PatchFlow, backdrops
 
 
 @dataclass(frozen=True)
@@ -181,10 +182,9 @@ class RegNeRF(FieldMethod):
         passes, terms = self.learn_along(rays, generator)
         opaque = self.sampler.is_open if c.field == "hash" else c.random_backdrop and self.frame.is_open
         background = backdrop(batch, self.background, generator, opaque=opaque)
-        # Of a patch, the picture before the scene's own background is judged.
         behind = background.expand(len(batch), 3)
         if unseen is not None:
-            behind = torch.cat([behind, self.background.expand(len(unseen), 3)])
+            behind = torch.cat([behind, self._behind_patches(unseen, batch.alpha is not None, generator)])
         for each in passes:
             if not (weight := self.pass_weights.get(each.name, 1.0)):
                 continue
@@ -204,6 +204,13 @@ class RegNeRF(FieldMethod):
         if c.occlusion_weight:
             terms["occlusion"] = c.occlusion_weight * self._before_cameras(rays, look)
         return terms
+
+    def _behind_patches(self, unseen: Rays, random: bool, generator: torch.Generator) -> Float[Tensor, "ray 3"]:
+        """Colours behind unobserved patches: the scene's own, or where photographs have alpha a random one for each
+        patch, as behind the patches that the flow learnt from. Before the scene's own, matter of its colour is free."""
+        if not random:
+            return self.background.expand(len(unseen), 3)
+        return backdrops(len(unseen) // SIDE**2, generator).repeat_interleave(SIDE**2, 0).to(self.device)
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
         """Loss terms of unobserved patches: roughness of their depth, negative log likelihood of their colours."""
