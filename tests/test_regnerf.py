@@ -131,6 +131,28 @@ def test_it_tells_photographs_from_noise(monkeypatch):
     assert flow(known).median() < flow(shuffled).median() - 0.5
 
 
+def test_the_flow_learns_from_patches_before_random_colours(monkeypatch):
+    """Of photographs with alpha, what is behind an object is of any colour; of others nothing is behind."""
+    from lumigraph.methods.regnerf import patch_flow
+
+    monkeypatch.setattr(patch_flow, "PATCHES", 2048)
+    known = photographed(tiny.scene(), chance()).flatten(1, 2)
+    empty = known[(known - known[:, :1]).abs().amax((1, 2)) < 1e-6, 0]
+    assert len(empty) > 100 and float(empty.mean()) == pytest.approx(0.5, abs=0.1)
+    assert float(empty.std(0).mean()) == pytest.approx(12**-0.5, abs=0.05)  # uniform in [0, 1]
+    assert len(empty.unique(dim=0)) == len(empty)
+
+
+def test_matter_of_the_background_s_colour_is_seen_in_unobserved_patches():
+    """White matter before white is likely; before one random colour for each patch it has another colour than air."""
+    scene = tiny.scene()
+    method = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
+    unseen = method.batch(scene, chance()).unseen
+    assert torch.equal(method._behind_patches(unseen, False, chance()), torch.ones(2 * SIDE**2, 3))
+    behind = method._behind_patches(unseen, True, chance()).view(2, SIDE**2, 3)
+    assert torch.equal(behind, behind[:, :1].expand_as(behind)) and not torch.equal(behind[0], behind[1])
+
+
 def test_a_flow_stops_when_its_seconds_are_over(monkeypatch):
     from lumigraph.methods.regnerf import patch_flow
 

@@ -25,7 +25,14 @@ from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_f
 from ...components.sampling.spaces import NDC, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.regularizers import near_thickness, normalized_distance, patches, roughness, unseen_cameras
+from ...components.training.regularizers import (
+    near_thickness,
+    normalized_distance,
+    opacity_entropy,
+    patches,
+    roughness,
+    unseen_cameras,
+)
 from ...components.training.schedules import BandSchedule, falling, held, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -51,6 +58,7 @@ class Config:
     depth_weight_start: NonNegative = 400.0  # weight of that roughness at first, which falls to depth_weight
     depth_settling: Share = 512 / 69_768  # share of the budget in which it falls
     likelihood_weight: NonNegative = 1e-3  # weight of the patches' negative log likelihood, eq. 8; 0: no flow
+    opacity_weight: NonNegative = 0.0  # weight of the patches' entropy of opacity before objects; higher: less fog
     flow_steps: Steps = 400  # steps that train the normalising flow of eq. 8, of 512 patches each
     coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels are added; 0: at once
     occlusion_weight: NonNegative = 0.0  # weight of density right before cameras (Yang 2023, eq. 5); 0: off
@@ -220,6 +228,8 @@ class RegNeRF(FieldMethod):
             if self._progress < c.depth_settling:
                 weight += (c.depth_weight_start - weight) * (1 - self._progress / c.depth_settling)
             terms["smoothness"] = weight * self._roughness(seen)
+        if c.opacity_weight and not self.frame.is_open:
+            terms["opacity"] = c.opacity_weight * opacity_entropy(seen.opacity)
         if self.flow:
             terms["likelihood"] = c.likelihood_weight * self.flow(seen.rgb.view(-1, SIDE, SIDE, 3)).mean()
         return terms
