@@ -237,8 +237,8 @@ def check_sizes(scene: Scene, compared: list[int], halves: bool) -> None:
         if min(width - width // 2 if halves else width, height) < WINDOW:
             part = f"the right half of {scene.names[index]}" if halves else scene.names[index]
             raise LumigraphError(
-                f"SSIM compares {WINDOW} x {WINDOW} pixels, and {part}, of {resolution(width, height)} pixels, has fewer "
-                "across; train and evaluate with larger photographs or a lower --downscale"
+                f"SSIM compares {WINDOW} x {WINDOW} pixels, and {part}, of {resolution(width, height)} pixels, has "
+                "fewer across; train and evaluate with larger photographs or a lower --downscale"
             )
 
 

@@ -78,7 +78,7 @@ def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
 
 
 def opacity_entropy(opacity: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
-    """Binary entropy of each ray's opacity, mean of all (Sun 2022, eq. 13): 0 where rays pass or end, not in between."""
+    """Binary entropy of each ray's opacity, mean of all (Sun 2022, eq. 13): 0 where rays pass or end."""
     a = opacity.clamp(1e-6, 1 - 1e-6)
     return -(a * a.log() + (1 - a) * (1 - a).log()).mean()
 
