@@ -104,7 +104,8 @@ def smaller_batch(config: Any, evaluations: int) -> dict[str, int]:
         few = {"members_per_step": 1, "rays_per_member": evaluations // 128}
     else:
         few = {"samples_per_step": evaluations, "pixels_per_step": evaluations, "occupancy_resolution": 32}
-    return {key: value for key, value in (few | {"unseen_patches": 1}).items() if holds(config, key)}
+    few |= {"unseen_patches": 1, "sparsity_points": evaluations}
+    return {key: value for key, value in few.items() if holds(config, key)}
 
 
 def parts(values: list[float]) -> list[float]:

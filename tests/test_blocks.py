@@ -23,6 +23,7 @@ from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
 
+from lumigraph import methods
 from lumigraph.budget import Budget
 from lumigraph.capture import Places, open_scene, places_of, read_capture
 from lumigraph.commands.cli import main
@@ -470,6 +471,20 @@ def test_a_worker_that_is_killed_loses_nothing(street, tmp_path):
     for name in "012":
         one, other = (load_file(Run(tmp_path / run / "blocks" / name)._checkpoints.weights) for run in RUNS)
         assert one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
+
+
+@kept(lambda: [*of_blocks(), Path(methods.__file__)])
+def test_workers_load_the_file_of_a_method(street, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    monkeypatch.setattr(methods, "_registered", {})
+    monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache"))
+    file = tmp_path / "mine.py"
+    file.write_text((Path(__file__).parent / "methods" / "voxel_grid.py").read_text().replace("VoxelGrid", "MyGrid"))
+    (name,) = methods.load(file)
+    (tmp_path / "cache" / methods.LOADED_FILE).unlink()
+    plan = planned(street, tmp_path / "big", method=name)
+    found = training.conduct(tmp_path / "big", plan, Workers(count=1), show=False)
+    assert sorted(found.done) == ["0", "1", "2"] and not found.failed
 
 
 def listing(folder: Path) -> dict[str, tuple[int, bytes]]:

@@ -146,3 +146,13 @@ def test_a_run_opens_the_same_scales_again(folder, tmp_path):
     run = Run.create(tmp_path / "run", tiny.method(scene.frame), scene, options={"scales": 2})
     assert Run(run.folder).scene().names == scene.names
     assert len(run.cameras()["train"]) == len(scene.splits["train"])
+
+
+@pytest.mark.parametrize(("downscale", "halves"), [(2, True), (3, False)])
+def test_photographs_smaller_than_a_window_of_ssim_are_refused(folder, downscale, halves):
+    scene, larger = (open_scene(folder, downscale=x) for x in (downscale, downscale - 1))
+    method = tiny.method(scene.frame)
+    size, part = 24 // downscale, "the right half of " if halves else ""
+    with pytest.raises(LumigraphError, match=rf"11 x 11 pixels, and {part}\S+, of {size}x{size} pixels, has fewer"):
+        evaluate(method, scene, right_halves=halves)
+    assert len(evaluate(method, larger, views=1, right_halves=halves).views) == 1

@@ -11,6 +11,9 @@ import tiny
 from budgets import budget
 
 from lumigraph import methods
+from lumigraph.benchmark.cell import Cell, CellSettings, row_of
+from lumigraph.benchmark.conduct import launch
+from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
@@ -128,3 +131,14 @@ def test_files_that_hold_no_method_are_refused_in_a_sentence(tmp_path, capsys, t
 def test_the_list_of_methods_has_those_of_a_file(own, capsys):
     assert main(["methods", "--method-file", str(own)]) == 0
     assert "my-grid" in capsys.readouterr().out
+
+
+def test_processes_of_a_benchmark_load_the_file(own, tmp_path):
+    """Also where the cache that remembers loaded files is empty; the row's command names the file."""
+    methods.load(own)
+    (tmp_path / "cache" / methods.LOADED_FILE).unlink()
+    assert launch(["methods"], tmp_path / "log") == 0
+    assert "my-grid" in (tmp_path / "log").read_text()
+    cell = Cell("my-grid", "ball", "procedural:still-life", Budget(4, None))
+    row = row_of(cell, tmp_path, CellSettings(), "not trained")
+    assert row["command"] == "lumigraph train my-grid procedural:still-life --steps 4 --seed 0 --method-file mine.py"

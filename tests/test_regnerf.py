@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -19,6 +20,7 @@ from lumigraph.components.training.regularizers import (
     roughness,
     unseen_cameras,
 )
+from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
@@ -129,6 +131,30 @@ def test_it_tells_photographs_from_noise(monkeypatch):
     known = photographed(scene, chance(1))
     shuffled = known.flatten(1)[:, torch.randperm(192, generator=chance(2))].view_as(known)
     assert flow(known).median() < flow(shuffled).median() - 0.5
+
+
+def test_the_flow_learns_from_patches_before_random_colours(monkeypatch):
+    """Of photographs with alpha: a transparent one is of any colour, the same in all of a patch."""
+    from lumigraph.methods.regnerf import patch_flow
+
+    monkeypatch.setattr(patch_flow, "PATCHES", 2048)
+    scene = tiny.scene()
+    clear = ImageStore.from_arrays([np.zeros((tiny.SIZE, tiny.SIZE, 4), np.uint8)] * len(scene))
+    known = photographed(replace(scene, images=clear), chance()).flatten(1, 2)
+    assert torch.equal(known, known[:, :1].expand_as(known))
+    deviation = 12**-0.5  # of uniform numbers in [0, 1]
+    torch.testing.assert_close(known[:, 0].mean(0), torch.full((3,), 0.5), atol=0.05, rtol=0)
+    torch.testing.assert_close(known[:, 0].std(0), torch.full((3,), deviation), atol=0.02, rtol=0)
+
+
+def test_matter_of_the_background_s_colour_is_seen_in_unobserved_patches():
+    """White matter before white is likely; before one random colour for each patch it has another colour than air."""
+    scene = tiny.scene()
+    method = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
+    unseen = method.batch(scene, chance()).unseen
+    assert torch.equal(method._behind_patches(unseen, False, chance()), torch.ones(2 * SIDE**2, 3))
+    behind = method._behind_patches(unseen, True, chance()).view(2, SIDE**2, 3)
+    assert torch.equal(behind, behind[:, :1].expand_as(behind)) and not torch.equal(behind[0], behind[1])
 
 
 def test_a_flow_stops_when_its_seconds_are_over(monkeypatch):

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from .. import files
+from .. import files, methods
 from ..budget import Budget
 from ..capture import requested
 from ..errors import LumigraphError
@@ -254,14 +254,15 @@ class Results:
 
 def row_of(cell: Cell, output: Path, settings: CellSettings, failure: str | None) -> Row:
     """A cell's figures out of its run's folder, under the names that eval.json has for them; or why there are none."""
-    folder = output / "runs" / cell.name
+    folder, file = output / "runs" / cell.name, methods.file_of(methods.find(cell.method))
+    own = [methods.METHOD_FILE, Path(file).name] if file else []
     row: Row = {
         "method": cell.method,
         "scene": cell.scene,
         "views": cell.views,
         "budget": {name: value for name, value in asdict(cell.budget).items() if value is not None},
         "seed": cell.seed,
-        "command": shlex.join(["lumigraph", *train_command(public(cell), settings)]),
+        "command": shlex.join(["lumigraph", *train_command(public(cell), settings), *own]),
         "run": f"runs/{cell.name}",
         "failed": failure,
         "collection": cell.collection,

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from .. import files
+from .. import files, methods
 from ..capture.pictures import readable
 from ..errors import LumigraphError
 from ..evaluation import file_name
@@ -40,11 +40,13 @@ POLL_SECONDS = 0.2  # seconds between looks at whether to stop
 
 
 def launch(arguments: Sequence[str], log: Path) -> int:
-    """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count.
+    """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count. Files of
+    methods that were loaded here are loaded there.
 
     Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It does so too
     when this process is killed. It stands apart from the terminal, which would send it Ctrl-C a second time.
     """
+    arguments = [*arguments, *(word for file in methods.loaded_here() for word in (methods.METHOD_FILE, file))]
     with files.explained(log):
         log.parent.mkdir(parents=True, exist_ok=True)
         out = open(log, "ab")

@@ -125,7 +125,6 @@ COMMANDS: dict[str, type] = {
     "methods": Methods,
     "bench": Bench,
 }
-METHOD_FILE = "--method-file"  # an option of every command
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 
   lumigraph demo                        run every step on a procedural scene, in a few minutes
@@ -186,10 +185,10 @@ def without_method_files(arguments: list[str]) -> list[str]:
     rest, words = list[str](), iter(arguments)
     for word in words:
         name, equals, file = word.partition("=")
-        if name != METHOD_FILE:
+        if name != methods.METHOD_FILE:
             rest.append(word)
         elif not (path := file if equals else next(words, "")):
-            raise LumigraphError(f"{METHOD_FILE} names no file; give it the Python file of a method")
+            raise LumigraphError(f"{methods.METHOD_FILE} names no file; give it the Python file of a method")
         else:
             methods.load(path)
     return rest

@@ -189,10 +189,12 @@ def evaluate(
     if views is not None and views < 1:
         raise LumigraphError(f"{views} views cannot be compared; give --views a number above 0")
     compared = evenly(chosen.tolist(), views or len(chosen))
+    by_halves = judged_by_halves(method)
+    check_sizes(scene, compared, by_halves or right_halves)
     method.eval()
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
-    spread, by_halves = set(evenly(compared, SHEET_VIEWS)), judged_by_halves(method)
+    spread = set(evenly(compared, SHEET_VIEWS))
     found = held_out_poses(method, scene)
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
@@ -226,6 +228,18 @@ def evaluate(
     stated = protocol(scene, split, compared, lpips, method, right_halves) | ({"poses": PROTOCOL} if found else {})
     poses = tuple(pose_scores(method, scene))
     return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
+
+
+def check_sizes(scene: Scene, compared: list[int], halves: bool) -> None:
+    """Raise LumigraphError for a photograph that is smaller than a window of SSIM, or whose right half is."""
+    for index in compared:
+        width, height = scene.cameras.size[index].tolist()
+        if min(width - width // 2 if halves else width, height) < WINDOW:
+            part = f"the right half of {scene.names[index]}" if halves else scene.names[index]
+            raise LumigraphError(
+                f"SSIM compares {WINDOW} x {WINDOW} pixels, and {part}, of {resolution(width, height)} pixels, has "
+                "fewer across; train and evaluate with larger photographs or a lower --downscale"
+            )
 
 
 def compare(

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import files
+from .. import files, methods
 from ..budget import Budget
 from ..capture import Places
 from ..components.fields.appearance import Appearance
@@ -177,7 +177,8 @@ def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
         feasible(ray.nodes(), workers)
         demand = {"num_cpus": workers.cpus, "num_gpus": workers.gpus, "memory": workers.memory}
         remote = ray.remote(**demand, max_retries=MAX_LOSSES)(on_worker)
-        waiting = {remote.remote(str(folders[name].resolve())): name for name in in_order(folders)}
+        own = methods.loaded_here()
+        waiting = {remote.remote(str(folders[name].resolve()), own): name for name in in_order(folders)}
         done: dict[str, Done] = {}
         failed: dict[str, str] = {}
         told_at = 0.0
@@ -205,10 +206,15 @@ def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
     return Conducted(done, failed, interrupt.signal)
 
 
-def on_worker(folder: str) -> Done | str | None:
-    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped."""
+def on_worker(folder: str, method_files: Sequence[str] = ()) -> Done | str | None:
+    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped.
+
+    method_files: of methods from elsewhere, on storage that all machines share
+    """
     with contextlib.redirect_stderr(sys.stdout):
         try:
+            for file in method_files:
+                methods.load(file)
             writable(Path(folder))
             return train_block(Path(folder)).done
         except LumigraphError as fault:

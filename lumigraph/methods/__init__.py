@@ -34,6 +34,8 @@ COLOURED = ("gaussian-splatting", "instant-ngp", "mip-nerf", "nerf", "fourier-fe
 
 
 _registered: dict[str, type[Any]] = {}  # methods from elsewhere, by name
+METHOD_FILE = "--method-file"  # an option of every command
+MODULE_PREFIX = "lumigraph_method_"  # of the modules of loaded files
 
 
 def available() -> list[str]:
@@ -78,7 +80,7 @@ def load(path: Path | str) -> list[str]:
 
     path = Path(path).expanduser().resolve()
     data = files.read_bytes(path)
-    module_name = f"lumigraph_method_{re.sub(r'[^a-zA-Z0-9_]', '_', path.stem)}"
+    module_name = f"{MODULE_PREFIX}{re.sub(r'[^a-zA-Z0-9_]', '_', path.stem)}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
         raise LumigraphError(f"{path} is no Python file; name one that ends in .py")
@@ -123,6 +125,12 @@ def file_of(kind: type[Any]) -> str | None:
     module = sys.modules.get(kind.__module__)
     file = getattr(module, "__file__", None)
     return None if file is None else str(Path(file).resolve())
+
+
+def loaded_here() -> list[str]:
+    """The files that `load` has registered methods from in this process, for other processes to load."""
+    here = (kind for kind in _registered.values() if kind.__module__.startswith(MODULE_PREFIX))
+    return sorted({file for kind in here if (file := file_of(kind))})
 
 
 def colour(name: str) -> int:

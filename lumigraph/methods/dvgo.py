@@ -21,6 +21,7 @@ from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbe
 from ..components.sampling.samplers import ProposalNumbers, sampler_for
 from ..components.sampling.spaces import NDC, Space, space_of
 from ..components.training.photometric import backdrop, residuals
+from ..components.training.regularizers import opacity_entropy
 from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
@@ -208,8 +209,7 @@ class DVGO(FieldMethod):
         if weight := c.point_weight if fine else c.coarse_point_weight:
             terms["points"] = weight * point_error(look, batch.before(self.background))
         if weight := c.entropy_weight if fine else c.coarse_entropy_weight:
-            a = rendering.opacity.clamp(1e-6, 1 - 1e-6)
-            terms["entropy"] = weight * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
+            terms["entropy"] = weight * opacity_entropy(rendering.opacity)
         if self.sampler.is_open and step % c.tv_interval == 0 and len(look.samples):
             assert isinstance(samples.features, Tensor)
             weights = {"tv_density": c.tv_density_weight, "tv_feature": c.tv_feature_weight}

@@ -77,6 +77,12 @@ def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
     return torch.log1p(2 * density.square()).sum() / max(rays, 1)
 
 
+def opacity_entropy(opacity: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
+    """Binary entropy of each ray's opacity, mean of all (Sun 2022, eq. 13): 0 where rays pass or end."""
+    a = opacity.clamp(1e-6, 1 - 1e-6)
+    return -(a * a.log() + (1 - a) * (1 - a).log()).mean()
+
+
 ASTRAY = 0.125  # deviation of the point that an unseen camera looks at, of the distance to it (section 3.3)
 
 

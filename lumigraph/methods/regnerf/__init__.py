@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera.rays import Look, Rays, Rendering
@@ -24,13 +25,20 @@ from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_f
 from ...components.sampling.spaces import NDC, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.regularizers import near_thickness, normalized_distance, patches, roughness, unseen_cameras
+from ...components.training.regularizers import (
+    near_thickness,
+    normalized_distance,
+    opacity_entropy,
+    patches,
+    roughness,
+    unseen_cameras,
+)
 from ...components.training.schedules import BandSchedule, falling, held, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ...method import FieldMethod
 from ...volume import composite
-from .patch_flow import SIDE, PatchFlow
+from .patch_flow import SIDE, PatchFlow, backdrops
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,7 @@ class Config:
     depth_weight_start: NonNegative = 400.0  # weight of that roughness at first, which falls to depth_weight
     depth_settling: Share = 512 / 69_768  # share of the budget in which it falls
     likelihood_weight: NonNegative = 1e-3  # weight of the patches' negative log likelihood, eq. 8; 0: no flow
+    opacity_weight: NonNegative = 0.0  # weight of the patches' entropy of opacity before objects; higher: less fog
     flow_steps: Steps = 400  # steps that train the normalising flow of eq. 8, of 512 patches each
     coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels are added; 0: at once
     occlusion_weight: NonNegative = 0.0  # weight of density right before cameras (Yang 2023, eq. 5); 0: off
@@ -181,10 +190,9 @@ class RegNeRF(FieldMethod):
         passes, terms = self.learn_along(rays, generator)
         opaque = self.sampler.is_open if c.field == "hash" else c.random_backdrop and self.frame.is_open
         background = backdrop(batch, self.background, generator, opaque=opaque)
-        # Of a patch, the picture before the scene's own background is judged.
         behind = background.expand(len(batch), 3)
         if unseen is not None:
-            behind = torch.cat([behind, self.background.expand(len(unseen), 3)])
+            behind = torch.cat([behind, self._behind_patches(unseen, batch.alpha is not None, generator)])
         for each in passes:
             if not (weight := self.pass_weights.get(each.name, 1.0)):
                 continue
@@ -205,6 +213,13 @@ class RegNeRF(FieldMethod):
             terms["occlusion"] = c.occlusion_weight * self._before_cameras(rays, look)
         return terms
 
+    def _behind_patches(self, unseen: Rays, random: bool, generator: torch.Generator) -> Float[Tensor, "ray 3"]:
+        """Colours behind unobserved patches: the scene's own, or where photographs have alpha a random one for each
+        patch, as behind the patches that the flow learnt from. Before the scene's own, matter of its colour is free."""
+        if not random:
+            return self.background.expand(len(unseen), 3)
+        return backdrops(len(unseen) // SIDE**2, generator).repeat_interleave(SIDE**2, 0).to(self.device)
+
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
         """Loss terms of unobserved patches: roughness of their depth, negative log likelihood of their colours."""
         c, terms = self.config, {}
@@ -213,6 +228,8 @@ class RegNeRF(FieldMethod):
             if self._progress < c.depth_settling:
                 weight += (c.depth_weight_start - weight) * (1 - self._progress / c.depth_settling)
             terms["smoothness"] = weight * self._roughness(seen)
+        if c.opacity_weight and not self.frame.is_open:
+            terms["opacity"] = c.opacity_weight * opacity_entropy(seen.opacity)
         if self.flow:
             terms["likelihood"] = c.likelihood_weight * self.flow(seen.rgb.view(-1, SIDE, SIDE, 3)).mean()
         return terms

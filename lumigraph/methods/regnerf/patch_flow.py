@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ...color.blending import before
 from ...datasets.scene import Scene
 
 SIDE = 8  # pixels along a patch's side (section 3.4)
@@ -99,19 +100,27 @@ class PatchFlow(nn.Module):
         self.requires_grad_(False)
 
 
+def backdrops(count: int, generator: torch.Generator) -> Float[Tensor, "patch 3"]:
+    """A random colour behind each patch where photographs have alpha."""
+    return torch.rand(count, 3, generator=generator)
+
+
 def photographed(scene: Scene, generator: torch.Generator) -> Float[Tensor, "patch side side 3"]:
-    """Random patches of the training photographs before the scene's background, each photograph in several sizes."""
+    """Random patches of the training photographs, each photograph in several sizes; each patch of photographs with
+    alpha is before a random colour."""
     train, found = scene.splits["train"].tolist(), []
     for index in train:
         shot = scene.photograph(index)
         for factor in SIZES:
             if min(shot.camera.size[0].tolist()) < SIDE * factor:
                 continue
-            small = (shot if factor == 1 else shot.reduced(factor)).before(scene.frame.background)
-            height, width = small.shape[:2]
+            small = shot.reduced(factor)
+            height, width = small.rgb.shape[:2]
             each = math.ceil(PATCHES / (len(train) * len(SIZES)))
             y = torch.randint(height - SIDE + 1, (each,), generator=generator)
             x = torch.randint(width - SIDE + 1, (each,), generator=generator)
             steps = torch.arange(SIDE)
-            found.append(small[(y[:, None] + steps)[:, :, None], (x[:, None] + steps)[:, None]])
+            pixels = (y[:, None] + steps)[:, :, None], (x[:, None] + steps)[:, None]
+            alpha = None if small.alpha is None else small.alpha[pixels]
+            found.append(before(small.rgb[pixels], alpha, backdrops(each, generator)[:, None, None]))
     return torch.cat(found)
