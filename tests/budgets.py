@@ -2,8 +2,10 @@
 
 What counts is the lesser of a test's seconds and its processors' seconds, without what Numba compiled for the first
 time: so neither a busy machine nor a fresh clone makes a file costly. It is divided by how slow the machine proves to
-be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond four times its share
-ends the session with code 1: less than that is within what one machine differs from another.
+be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond TOO_MUCH times its share
+ends the session with code 1. In two runs of all 4700 tests no file took more than 1.5 times its present share,
+and the costliest took 0.9 to 1.4 times as much in one run as in the other: 1.5 * 1.4 is 2.1, and TOO_MUCH is a fifth
+above that.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ BUDGETS: dict[str, float] = {
 }
 GROUP, EACH = "capture", 5.0  # of a file without a mark
 PER_METHOD = 4.0  # seconds of the contract for each method, beside the method's own file
-MUCH, TOO_MUCH = 1.5, 4.0  # times its share: what is told, and what fails
+MUCH, TOO_MUCH = 1.5, 2.5  # times its share: what is told, and what fails
 CALIBRATION = 0.021  # processor seconds that `probe` takes on the machine that the budgets were set on
 
 

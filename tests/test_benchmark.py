@@ -25,7 +25,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.evaluation.halves import LEFT_HALVES, RIGHT_HALVES
 from lumigraph.run import Run
 
-pytestmark = budget("runs", 20)
+pytestmark = budget("runs", 40)
 
 SETTINGS = CellSettings(device="cpu", eval_views=2)
 

@@ -43,7 +43,7 @@ from lumigraph.run import Run, open_any
 from lumigraph.run.opening import SplatFile
 from lumigraph.training import fit
 
-pytestmark = budget("runs", 15)
+pytestmark = budget("runs", 25)
 
 STEPS = 6  # of each block
 

@@ -25,7 +25,7 @@ from lumigraph.run import Run, build
 from lumigraph.run.derived import Compressed
 from lumigraph.training import fit
 
-pytestmark = budget("runs", 15)
+pytestmark = budget("runs", 25)
 
 
 @pytest.fixture(scope="module")

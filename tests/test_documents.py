@@ -20,7 +20,7 @@ from lumigraph.exchange.packing import Stored, most_important
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.run import build
 
-pytestmark = budget("runs")
+pytestmark = budget("runs", 12)
 
 ROOT = PACKAGE.parent
 SECONDS = {"seconds=30.0": "steps=2"}  # of the block of docs/convert.md

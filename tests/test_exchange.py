@@ -24,7 +24,7 @@ from lumigraph.exchange.codes import morton_order
 from lumigraph.exchange.spz import gzipped
 from lumigraph.gaussians import Gaussians, turned
 
-pytestmark = budget("exports")
+pytestmark = budget("exports", 10)
 
 C0 = math.sqrt(1 / (4 * math.pi))
 HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # between the axes of .spz and those of .ply

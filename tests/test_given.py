@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph import synthetic as procedural
@@ -34,6 +35,8 @@ from lumigraph.run import Run, build
 from lumigraph.synthetic.scenes import swing
 from lumigraph.training import fit
 from lumigraph.volume import composite
+
+pytestmark = budget("capture", 10)
 
 SMALL = changed(
     Config(),

@@ -15,7 +15,7 @@ from conftest import JIT, PACKAGE, checked_modules, module_name
 import lumigraph
 
 ROOT = PACKAGE.parent
-pytestmark = budget("house")
+pytestmark = budget("house", 10)
 
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.

@@ -25,7 +25,7 @@ from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.volume import composite
 
-pytestmark = budget("methods")
+pytestmark = budget("methods", 8)
 
 NETWORK = {
     "field": "network", "depth": 2, "skip_layer": 1, "coarse_samples": 8, "fine_samples": 8, "rays_per_step": 64,

@@ -15,7 +15,7 @@ from budgets import budget
 from conftest import PACKAGE, module_name
 from test_house import imported
 
-pytestmark = budget("house")
+pytestmark = budget("house", 8)
 
 ROOT = PACKAGE.parent
 Sources = dict[str, str]  # module names, and the text of each

@@ -44,7 +44,12 @@ def option_group(name: str) -> str:
 def method_config(command: Any, name: str) -> Any:
     """A method's Config, which the command line adds as another field; see `with_options_of`."""
     given = getattr(command, option_group(name), None)
-    return given or methods.find(name).preset(preset_device(command.device, command.preset))
+    return given or default_config(type(command), methods.find(name), preset_device(command.device, command.preset))
+
+
+def default_config(command: type, kind: Any, device: Any) -> Any:
+    """A method's Config where the user chose none: for a command that starts from another method, that for this."""
+    return (kind.taught_preset if getattr(command, "taught", False) else kind.preset)(device)
 
 
 def preset_device(device: str, preset: str) -> Any:

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional
 
@@ -34,6 +34,8 @@ class Convert:
     same command continues. `lumigraph convert RUN METHOD --help` adds the method's own options.
     """
 
+    taught: ClassVar[bool] = True  # the method's defaults are those that follow another method
+
     source: Annotated[Positional[Path | None], needed("RUN_OR_FILE")] = None
     """Folder of a run, which does not change, or a splat file."""
     method: Annotated[Positional[str | None], needed("METHOD")] = None
@@ -42,7 +44,7 @@ class Convert:
     """New folder for the run."""
     list: bool = False
     """Print the table of possible conversions, and exit."""
-    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
+    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}, or the steps of the method")] = None
     """Training time in seconds after initialisation; longer improves the new method."""
     steps: StepsOption = None
     quality: Annotated[Quality | None, QUALITY] = None
@@ -66,12 +68,13 @@ class Convert:
             return 0
         if self.source is None or self.method is None or self.output is None:
             raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")
-        given_budget(self.steps, self.seconds, self.quality)
+        named = given_budget(self.steps, self.seconds, self.quality) or self.quality
         name, device = methods.check(self.method), choose_device(self.device)
-        counted = self.steps is not None or self.quality is not None
+        steps = self.steps if named else methods.find(name).taught_steps
+        counted = steps is not None or self.quality is not None
         aim = ConversionTarget(
             config=method_config(self, name),
-            steps=self.steps,
+            steps=steps,
             seconds=None if counted else self.seconds or DEFAULT_SECONDS,
             quality=self.quality,
             distil=self.distil,
@@ -87,7 +90,7 @@ class Convert:
         console().print(table(made))
         took = f"{made.taking_over:.1f} s to take over, {made.steps} steps in {made.seconds:.1f} s to learn on"
         rows = {"alike": f"{made.psnr:.2f} dB, the mean of {made.views} held-out views", "by": f"{made.how}; {took}"}
-        rows |= {"learnt from": made.learnt_from, "saved": str(self.output)}
+        rows |= {"cost": cost(made), "learnt from": made.learnt_from, "saved": str(self.output)}
         show(rows | {"verdict": verdict(made, self.source, self.output), "next": typed("view", self.output)})
         return 0
 
@@ -99,6 +102,13 @@ def kept(output: Path) -> str:
     if not (output / "config.json").exists() or not (run := Run(output)).has_state:
         return "Stopped before training, so nothing is kept; the same command begins anew"
     return f"Stopped and saved after step {run.state.step} of training; the same command goes on"
+
+
+def cost(made: Any) -> str:
+    """PSNR lost, bytes of the model and seconds of the conversion."""
+    old, new = made.teacher, made.student
+    lost = f"{old.psnr - new.psnr:.2f} dB, " if old.psnr is not None and new.psnr is not None else ""
+    return f"{lost}{size(new.bytes)} instead of {size(old.bytes)}, {made.taking_over + made.seconds:.0f} s"
 
 
 def verdict(made: Any, source: Path, output: Path) -> str:

@@ -20,6 +20,7 @@ from .capture import posed
 from .common import (
     about_quality,
     choose_device,
+    default_config,
     exit_code,
     given_budget,
     method_config,
@@ -289,7 +290,8 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
     if in_blocks:
         blocks = derived(BlockOptions, kind.Config, {})
         extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
-    extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], kind.preset(preset_device(device, preset))
+    default = default_config(command, kind, preset_device(device, preset))
+    extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], default
     return derived(command, kind.Config, extra)
 
 

@@ -154,7 +154,7 @@ def about_time(aim: ConversionTarget, distil: bool) -> str:
 
 def new_student(kind: type[Method], teacher: Method, aim: ConversionTarget, device: torch.device) -> Method:
     """A method in the teacher's frame, before it has learnt anything."""
-    config = kind.preset(device) if aim.config is None else aim.config
+    config = kind.taught_preset(device) if aim.config is None else aim.config
     return build(kind, teacher.frame, config, device, getattr(config, "seed", aim.seed), learning=True)
 
 

@@ -60,6 +60,7 @@ class Method(nn.Module, ABC):
     in_blocks: ClassVar[bool] = False  # whether `train` divides a large scene into blocks, each a run of its own
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
+    taught_steps: ClassVar[int | None] = None  # default steps after another method's field; None: by seconds
     _place: Tensor
 
     def __init__(self, frame: Frame, config: Any):
@@ -78,6 +79,11 @@ class Method(nn.Module, ABC):
     def cpu_preset(cls) -> Any:
         """Numbers that learn most in a minute on a CPU; the paper's by default."""
         return cls.Config()
+
+    @classmethod
+    def taught_preset(cls, device: torch.device) -> Any:
+        """The Config of a method that begins as another one's field, where the user chose none."""
+        return cls.preset(device)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -128,6 +128,11 @@ class PlenOctrees(FieldMethod):
         return replace(c, teacher_share=0.5, octree_depth=8, leaf_points=8)
 
     @classmethod
+    def taught_preset(cls, device: torch.device) -> Any:
+        """As deep as the paper's octree, where photographs have so many pixels: coarser leaves lose detail for good."""
+        return replace(cls.preset(device), octree_depth=cls.Config.octree_depth)
+
+    @classmethod
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
         occupancy = OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16)

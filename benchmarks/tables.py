@@ -1,0 +1,171 @@
+"""Tables of methods in README.md and docs/, made of benchmarks/results/methods-cpu.json.
+
+    python benchmarks/tables.py                                             write the tables anew
+    python benchmarks/tables.py --collect OUTPUT OUTPUT --commit COMMIT     collect the figures first
+
+OUTPUT is a folder of `lumigraph bench methods`, COMMIT the one it ran. A table is between two comments of a page:
+`table: methods` has a row for each method, `table: cells` one for each training. Names of methods behind that word
+choose rows; `<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lumigraph import methods
+from lumigraph.benchmark.table import protocol, published, size, trained_for
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
+TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
+SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Options:
+    collect: tuple[Path, ...] = ()  # outputs of `lumigraph bench methods`
+    commit: str = ""  # that they ran
+
+    def run(self) -> None:
+        if self.collect:
+            RESULTS.write_text(json.dumps(collected(self.collect, self.commit), indent=1) + "\n", "utf-8")
+        results = json.loads(RESULTS.read_text("utf-8"))
+        for page in pages():
+            text = page.read_text("utf-8")
+            if (new := filled(text, page, results)) != text:
+                page.write_text(new, "utf-8")
+                print(page.relative_to(ROOT))
+
+
+def pages() -> list[Path]:
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def collected(outputs: Iterable[Path], commit: str) -> dict[str, Any]:
+    """Results of several benchmarks of one commit and machine in one. Scenes are called by their name, without their
+    folder. Raises SystemExit where a cell failed, or machines differ."""
+    cells: list[Row] = []
+    for output in outputs:
+        found = json.loads((output / "results.json").read_text("utf-8"))
+        for row in found["cells"]:
+            words = shlex.split(row["command"])
+            words[SOURCE] = Path(words[SOURCE]).name
+            told = {name: found["settings"][name] for name in ("downscale", "eval_views")}
+            cells.append({"source": words[SOURCE], **told} | row | {"command": shlex.join(words)})
+    machines = {row["trained_on"] for row in cells if not row["failed"]}
+    if not commit or len(machines) != 1 or any(row["failed"] for row in cells):
+        raise SystemExit(f"One commit, one machine and no failed cell are needed; this is {commit!r} on {machines}")
+    return {"commit": commit, "machine": machines.pop(), "commands": commands(cells), "cells": cells}
+
+
+def commands(cells: Sequence[Row]) -> list[str]:
+    """Commands that measure these cells and no others: one for scenes of the same settings, methods and seconds."""
+    alike: dict[tuple[Any, ...], dict[str, list[str]]] = {}
+    for row in cells:
+        key = row["budget"]["seconds"], row["downscale"], row["eval_views"]
+        alike.setdefault(key, {}).setdefault(row["source"], []).append(row["method"])
+    scenes: dict[tuple[Any, ...], list[str]] = {}
+    for key, sources in alike.items():
+        for source, names in sources.items():
+            scenes.setdefault((*key, *names), []).append(source)
+    found = []
+    for (seconds, downscale, views, *names), sources in scenes.items():
+        words = f"--methods {' '.join(names)} --scenes {' '.join(sources)} --seconds {seconds:g}"
+        told = "".join(f" --{n} {x}" for n, x in (("downscale", downscale), ("eval-views", views)) if x)
+        found.append(f"lumigraph bench methods {words}{told} --output OUTPUT")
+    return found
+
+
+def filled(text: str, page: Path, results: dict[str, Any]) -> str:
+    """A page with its tables made of these results."""
+
+    def table(match: re.Match[str]) -> str:
+        names = match[3].split()
+        if match[2] not in KINDS or not {*names} <= {*methods.available()}:
+            raise SystemExit(f"{page.name}: `{match[0].splitlines()[0]}` names an unknown table or method")
+        cells = [row for row in results["cells"] if not names or row["method"] in names]
+        if not cells:
+            return f"{match[1]}Not measured.\n"
+        rows = KINDS[match[2]](cells, page)
+        about = f"Commit `{results['commit']}`; {results['machine'].removeprefix('cpu, ')}, no GPU. {scenes_of(cells)}"
+        return "\n".join([match[1].rstrip(), *rows, "", about, "", "```", *commands(cells), "```", ""])
+
+    return TABLE.sub(table, text)
+
+
+def by_method(cells: Sequence[Row], page: Path) -> list[str]:
+    """PSNR of each method on each scene; the highest is bold."""
+    columns = list(dict.fromkeys((row["scene"], trained_for(row)) for row in cells))
+    found = {(row["method"], row["scene"], trained_for(row)): row for row in cells}
+    best = {column: max(row["psnr"] for key, row in found.items() if key[1:] == column) for column in columns}
+    last = columns[-1] if len(columns) == 1 else next((c for c in columns if c[0] == "lego"), columns[-1])
+    rows = [["method", "paper", *(", ".join(c) for c in columns), f"s/view, {last[0]}", f"model, {last[0]}"]]
+    for name in dict.fromkeys(row["method"] for row in cells):
+        line = [link(name, page), paper(name)]
+        for column in columns:
+            row = found.get((name, *column))
+            value = f"{row['psnr']:.1f}" if row else ""
+            line.append(f"**{value}**" if row and row["psnr"] == best[column] else value)
+        row = found[name, *last]
+        rows.append([*line, f"{row['seconds_per_view']:.2g}", size(row["model_bytes"])])
+    return markdown(rows)
+
+
+CELL: dict[str, Callable[[Row], str]] = {
+    "trained for": trained_for,
+    "PSNR": lambda row: f"{row['psnr']:.2f}",
+    "SSIM": lambda row: f"{row['ssim']:.3f}",
+    "steps": lambda row: str(row["steps"]),
+    "s/view": lambda row: f"{row['seconds_per_view']:.2g}",
+    "memory": lambda row: size(row["peak_memory"]),
+    "model": lambda row: size(row["model_bytes"]),
+    "published PSNR": published,
+}
+
+
+def by_cell(cells: Sequence[Row], page: Path) -> list[str]:
+    """Figures of each training."""
+    names = [name for name in ("scene", "method") if len({row[name] for row in cells}) > 1]
+    rows = [[*names, *CELL]]
+    for row in cells:
+        own = {"scene": row["scene"], "method": link(row["method"], page)}
+        rows.append([*(own[name] for name in names), *(value(row) for value in CELL.values())])
+    return markdown(rows)
+
+
+KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {"methods": by_method, "cells": by_cell}
+
+
+def scenes_of(cells: Sequence[Row]) -> str:
+    """Protocol of each scene, as a sentence."""
+    return "; ".join(dict.fromkeys(f"{row['scene']}: {protocol(row)}" for row in cells)) + "."
+
+
+def link(name: str, page: Path) -> str:
+    """Name of a method, which leads to its page unless it is on that."""
+    target = ROOT / "docs" / "methods" / f"{name.replace('-', '_')}.md"
+    return name if target == page else f"[{name}]({Path(os.path.relpath(target, page.parent)).as_posix()})"
+
+
+def paper(name: str) -> str:
+    """Authors and year, as a method's file names them."""
+    found = re.search(r"\(([^()]*\d{4}), arXiv", methods.summary(name))
+    return found[1] if found else ""
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(row)} |" for row in (rows[0], ["---"] * len(rows[0]), *rows[1:])]
+
+
+if __name__ == "__main__":
+    import tyro
+
+    tyro.cli(Options, description=__doc__).run()
