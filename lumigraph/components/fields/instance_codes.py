@@ -28,7 +28,8 @@ class InstanceCodes(nn.Module):
         """Raises LumigraphError for more members than rows."""
         if members > len(self.rows):
             raise LumigraphError(
-                f"{source} has {members} members, and there is room for {len(self.rows)} codes; give --members {members}"
+                f"{source} has {members} members, and there is room for {len(self.rows)} codes; "
+                f"give --members {members}"
             )
 
     @torch.no_grad()
@@ -81,7 +82,7 @@ class InstanceCodes(nn.Module):
         return torch.lerp(a, b, share)
 
     def control(self, found: bool) -> Control:
-        """Control of the instance that is shown. found: whether there is a code of evidence, which is then the default"""
+        """Control of the instance that is shown. found: whether there is a code of evidence, then the default"""
         choices = (*([FOUND] if found else []), AVERAGE, *self.names)
         about = "Which object is shown: the one that was found or drawn, a member of the collection by its number, or "
         about += "the average of all."
