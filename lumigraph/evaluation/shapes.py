@@ -17,7 +17,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
-from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find_surface, make_grid
+from ..export.mesh import POINTS_PER_CHUNK, extract_mesh, find_surface, from_distance, make_grid
 from ..figures import Row, contact_sheet
 from ..geometry import evenly
 from ..method import Method
@@ -122,6 +122,10 @@ def evaluate_shapes(
     if most is not None and most < 1:
         raise LumigraphError(f"{most} shapes cannot be compared; give --views a number above 0")
     compared = evenly(chosen.tolist(), most or len(chosen))
+    if partial := next((shapes.members[i].name for i in compared if shapes.members[i].partial), None):
+        raise LumigraphError(
+            f"{partial} is a scan of some sides, which is no whole shape to compare with; name the whole one"
+        )
     method.eval()
     shown, scores = set(evenly(compared, SHEET_SHAPES)), []
     pictured: dict[str, list[Tensor]] = {}
@@ -165,10 +169,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     if not can(method, HasDistance):
         return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
 
-    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        return (-distances(method, points) / (TRUNCATION_CELLS * cell)).clamp(-1, 1)
-
-    vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, value, -1.0)
+    vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, from_distance(method, cell), -1.0)
     if not len(faces):
         raise LumigraphError("The learnt distance is nowhere zero, so there is no surface to compare; train for longer")
     return Mesh(vertices, faces, np.full((len(vertices), 3), 160, np.uint8))

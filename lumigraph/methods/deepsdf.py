@@ -225,6 +225,14 @@ class DeepSDF(SurfaceMethod):
             told._find(one.members[0])
         return told
 
+    def drawn(self, seed: int) -> Method:
+        """A shape that nobody has modelled: a code from the Gaussian that fits the learnt ones."""
+        told = super().given()
+        assert isinstance(told, DeepSDF)
+        told.found = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None])
+        told.settings.pop("instance", None)
+        return told
+
     def _observed(self, shape: Shape) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Points and their distance to the surface, as far as a new shape says. Raises LumigraphError for points
         without normals."""
@@ -265,9 +273,8 @@ class DeepSDF(SurfaceMethod):
         self.found = Kept(code[None])
         whole = Similarity.make(float(scale), None, shift.cpu().double())
         back = (shape.frame.to_source @ whole.inverse).rows
-        self.frame = replace(
-            shape.frame, bounds=CUBE.bounds if shape.is_cloud else shape.frame.bounds, source_from_scene=back
-        )
+        bounds = CUBE.bounds if shape.partial else shape.frame.bounds
+        self.frame = replace(shape.frame, bounds=bounds, source_from_scene=back)
 
     def _start(self, shape: Shape, error: Any) -> Float[Tensor, " unknown"]:
         """The learnt code, or the average, and the place of a scan that agree best with a new shape."""

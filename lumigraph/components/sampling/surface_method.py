@@ -17,7 +17,7 @@ from ...method import RayMethod
 from ...method.controls import Control
 from .sphere_trace import Crossings, March, sphere_trace
 
-SHADINGS = ("normals", "grey")  # normals as colours; a grey surface lit from the camera
+SHADINGS = ("grey", "normals")  # a grey surface lit from the camera; normals as colours
 AMBIENT, DIFFUSE = 0.25, 0.65  # of the grey surface
 
 
@@ -67,5 +67,5 @@ class SurfaceMethod(RayMethod):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        about = "Colours of the surface: its normals, or grey in light from the camera."
+        about = "Colours of the surface: grey in light from the camera, or its normals."
         return (*super().controls, Control("shading", SHADINGS[0], choices=SHADINGS, about=about))

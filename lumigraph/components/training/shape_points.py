@@ -21,9 +21,7 @@ class PointNumbers:
 
     pool_points: Annotated[int, between(64, 1 << 26)] = 500_000  # points sampled of each shape; more cost memory
     near_share: Share = 0.94  # share of the points close to the surface; more sharpen it, and leave space unsure
-    near_spread: NonNegative = (
-        0.05  # deviation of half of these from the surface, scene units; larger: smoother
-    )
+    near_spread: NonNegative = 0.05  # deviation of half of these from the surface, scene units; larger: smoother
     fine_spread: NonNegative = 0.0158  # deviation of the other half, scene units; smaller gives finer detail
 
 
