@@ -35,7 +35,8 @@ class ExportMesh:
     """Export a triangle mesh with vertex colours, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
-    with distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene is meshed.
+    with distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene
+    is meshed.
     Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 

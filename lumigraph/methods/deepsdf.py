@@ -15,10 +15,8 @@ from torch.nn.utils.parametrizations import weight_norm
 from ..components.fields.appearance import fitted
 from ..components.fields.coordinate_network import SkipNetwork
 from ..components.fields.encodings import FrequencyEncoding
-from ..components.fields.instance_codes import FOUND, InstanceCodes
-from ..components.fields.kept_photographs import Kept
 from ..components.fields.layers import Dense, in_chunks
-from ..components.sampling.surface_method import SurfaceMethod
+from ..components.sampling.coded_surface import CodedSurface
 from ..components.training.schedules import falling
 from ..components.training.shape_points import PointNumbers, PointPools, sampled
 from ..datasets.scene import Frame
@@ -26,8 +24,6 @@ from ..datasets.shapes import CUBE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
 from ..files.ranges import Count, Depth, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ..geometry import Similarity
-from ..method import Method
-from ..method.controls import Control, Value
 
 Tally = Annotated[int, between(0, 100_000)]
 
@@ -109,11 +105,12 @@ class Decoder(SkipNetwork):
                 module.generator = generator
 
 
-class DeepSDF(SurfaceMethod):
+class DeepSDF(CodedSurface):
     """Learns a code for each shape of Shapes, and the distance that a code means; `given` another shape, or a scan of
     some sides of it, it finds the code that agrees best."""
 
-    Config, accepts = Config, (Shapes,)
+    Config = Config
+    taken_kinds = ("mesh", "half scan")
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -121,8 +118,6 @@ class DeepSDF(SurfaceMethod):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             self.decoder = Decoder(c)
-        self.codes = InstanceCodes(c.members, c.code)
-        self.found = Kept(torch.empty(0, c.code))  # the code of a shape that was given
         self.pools = PointPools("deepsdf", c.points, c.seed)
 
     @classmethod
@@ -193,45 +188,7 @@ class DeepSDF(SurfaceMethod):
         """Signed distance of the instance that is shown, clamped to delta."""
         return self._clamped(self.code[None].expand(len(points), -1), points)
 
-    @property
-    def code(self) -> Float[Tensor, " code"]:
-        """The code of the instance that is shown; of a single shape, its own."""
-        if len(self._instances) < 2:
-            return self.codes.average
-        others = {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
-        return self.codes.code_of(str(self.control("instance")), **others)
-
-    @property
-    def _instances(self) -> tuple[str, ...]:
-        return (*([FOUND] if len(self.found.rows) else []), *self.codes.names)
-
-    @property
-    def controls(self) -> tuple[Control, ...]:
-        instance = [self.codes.control(len(self.found.rows) > 0)] if len(self._instances) > 1 else []
-        return (*instance, *super().controls)
-
     # A new shape
-
-    def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The shape of which a mesh, a cloud of points with normals, or a scan of some sides is told: the code is found
-        that agrees best with it (section 4.2, eq. 10)."""
-        shapes = [piece for piece in evidence if isinstance(piece, Shapes)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, Shapes)), **controls)
-        assert isinstance(told, DeepSDF)
-        for one in shapes[-1:]:
-            if len(one) != 1:
-                raise LumigraphError(f"{one.source} holds {len(one)} shapes, and deepsdf completes one; name its file")
-            told.settings.pop("instance", None)
-            told._find(one.members[0])
-        return told
-
-    def drawn(self, seed: int) -> Method:
-        """A shape that nobody has modelled: a code from the Gaussian that fits the learnt ones."""
-        told = super().given()
-        assert isinstance(told, DeepSDF)
-        told.found = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None])
-        told.settings.pop("instance", None)
-        return told
 
     def _observed(self, shape: Shape) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"]]:
         """Points and their distance to the surface, as far as a new shape says. Raises LumigraphError for points
@@ -251,8 +208,9 @@ class DeepSDF(SurfaceMethod):
         points, ahead = torch.cat([scan.points + off, scan.points - off]), torch.full((len(off),), self.config.offset)
         return points.to(self.device), torch.cat([ahead, -ahead]).to(self.device)
 
-    def _find(self, shape: Shape) -> None:
-        """The code of a new shape, and the frame that it is shown in."""
+    def find(self, evidence: Any) -> Float[Tensor, " code"]:
+        """The code that agrees best with a mesh, a cloud of points with normals, or a scan of some sides (eq. 10)."""
+        shape: Shape = evidence
         c, width = self.config, self.config.code
         points, distance = self._observed(shape)
         generator = self.random(3)
@@ -270,11 +228,11 @@ class DeepSDF(SurfaceMethod):
         unknown = fitted(start, error, c.code_steps, c.fit_learning_rate)
         code, place = unknown.split([width, 4])
         scale, shift = placed(place if shape.partial else 0 * place)
-        self.found = Kept(code[None])
-        whole = Similarity.make(float(scale), None, shift.cpu().double())
-        back = (shape.frame.to_source @ whole.inverse).rows
-        bounds = CUBE.bounds if shape.partial else shape.frame.bounds
-        self.frame = replace(shape.frame, bounds=bounds, source_from_scene=back)
+        if shape.partial:
+            whole = Similarity.make(float(scale), None, shift.cpu().double())
+            back = (shape.frame.to_source @ whole.inverse).rows
+            self.frame = replace(shape.frame, bounds=CUBE.bounds, source_from_scene=back)
+        return code
 
     def _start(self, shape: Shape, error: Any) -> Float[Tensor, " unknown"]:
         """The learnt code, or the average, and the place of a scan that agree best with a new shape."""

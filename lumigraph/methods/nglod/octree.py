@@ -72,7 +72,7 @@ class Cells(nn.Module):
 
 
 class Level(nn.Module):
-    """Cells of one level, features at their corners, and a decoder from summed features and the point to its distance."""
+    """Cells of one level, features at their corners, and a decoder of summed features and points to distances."""
 
     grows: ClassVar[tuple[str, ...]] = ("features",)
 
