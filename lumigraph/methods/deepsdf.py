@@ -123,8 +123,8 @@ class DeepSDF(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller network that takes waves, without dropout and weight normalisation."""
-        c = Config(PointNumbers(200_000), depth=6, hidden_width=128, skip_layer=3, octaves=4, weight_norm=False)
-        c = replace(c, dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=2048)
+        c = Config(PointNumbers(80_000), depth=6, hidden_width=128, skip_layer=3, octaves=4, weight_norm=False)
+        c = replace(c, dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024)
         return replace(c, learning_rate=2e-3, code_learning_rate=4e-3, code_steps=300)
 
     @classmethod

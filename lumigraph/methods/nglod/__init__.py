@@ -63,6 +63,7 @@ class NGLOD(SurfaceMethod):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             self.octree = CodeOctree(1 << c.base_level, c.levels, c.features, c.hidden_width)
+        self.levels = c.levels
         self.pools = PointPools("nglod", c.points, c.seed)
 
     @classmethod

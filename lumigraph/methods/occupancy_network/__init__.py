@@ -19,10 +19,10 @@ from ...components.training.schedules import falling
 from ...components.training.shape_points import PointNumbers, PointPools
 from ...datasets.scene import Frame, Photograph
 from ...datasets.shapes import PointBatch, Shape, Shapes
+from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Seed, Width, between
 from .networks import VOXELS, OccupancyDecoder, PictureEncoder, PointEncoder, VoxelEncoder
-from .pictures import picture_of
 
 Input = Literal["points", "voxels", "picture"]
 
@@ -91,7 +91,7 @@ class OccupancyNetwork(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller networks, points close to the surface too, and waves."""
-        c = Config(points=PointNumbers(200_000, near_share=0.6), picture_size=64, code=128, encoder_width=64)
+        c = Config(points=PointNumbers(80_000, near_share=0.6), picture_size=64, code=128, encoder_width=64)
         c = replace(c, hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=4)
         return replace(c, points_per_shape=1024, learning_rate=3e-3, final_learning_rate=3e-4)
 
@@ -179,17 +179,20 @@ class OccupancyNetwork(CodedSurface):
 
     @torch.no_grad()
     def find(self, evidence: Any) -> Float[Tensor, " code"]:
-        """The code of a cloud or mesh, or of a picture. Raises LumigraphError for evidence of another kind than the
-        training's."""
+        """The code of a cloud or mesh, or of a picture; from a mesh the picture is made that training would show. Raises
+        LumigraphError for evidence of another kind than the training's."""
         c = self.config
         if c.input == "picture":
             if not isinstance(evidence, Photograph):
-                raise LumigraphError(
-                    f"This run of occupancy-network learnt from pictures, and {evidence.name} is none; name a picture, "
-                    "or train with --input points"
-                )
+                if evidence.is_cloud:
+                    raise LumigraphError(
+                        f"This run of occupancy-network learnt from pictures, and {evidence.name} is a cloud of points; "
+                        "name a picture, or train with --input points"
+                    )
+                camera = ring(evidence.frame.bounds, size=c.picture_size)[1]
+                evidence = picture_of(evidence, camera, self.random(2))
             encoded = F.interpolate(grey(evidence)[None, None], (c.picture_size,) * 2, mode="area")[0]
-            return self.encoder.eval()(encoded.to(self.device))[0]
+            return self.encoder(encoded.to(self.device))[0]
         if isinstance(evidence, Photograph):
             raise LumigraphError(
                 f"This run of occupancy-network learnt from {c.input}, and a picture was named; name a mesh or a cloud "

@@ -1,12 +1,12 @@
-"""Pictures of shapes to learn from, and pictures in files as evidence."""
+"""Pictures of shapes: their surface in grey light from a camera."""
 
 from __future__ import annotations
 
 import torch
 
 from ...camera import Camera
-from ...datasets.scene import Photograph
-from ...datasets.shapes import Shape
+from ..scene import Photograph
+from . import Shape
 
 SURFACE_POINTS = 60_000  # points of a surface that its picture is made of
 AMBIENT, DIFFUSE = 0.25, 0.65  # of the grey surface in light from the camera
