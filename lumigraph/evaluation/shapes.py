@@ -122,10 +122,6 @@ def evaluate_shapes(
     if most is not None and most < 1:
         raise LumigraphError(f"{most} shapes cannot be compared; give --views a number above 0")
     compared = evenly(chosen.tolist(), most or len(chosen))
-    if partial := next((shapes.members[i].name for i in compared if shapes.members[i].partial), None):
-        raise LumigraphError(
-            f"{partial} is a scan of some sides, which is no whole shape to compare with; name the whole one"
-        )
     method.eval()
     shown, scores = set(evenly(compared, SHEET_SHAPES)), []
     pictured: dict[str, list[Tensor]] = {}

@@ -20,7 +20,7 @@ from ..components.sampling.coded_surface import CodedSurface
 from ..components.training.schedules import falling
 from ..components.training.shape_points import PointNumbers, PointPools, sampled
 from ..datasets.scene import Frame
-from ..datasets.shapes import CUBE, PointBatch, Shape, Shapes
+from ..datasets.shapes import CUBE, HALF_SIDE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
 from ..files.ranges import Count, Depth, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ..geometry import Similarity
@@ -59,7 +59,7 @@ class Config:
 
 FIRST_OUTPUT = 0.03  # deviation of the network's first outputs: beyond delta the clamped error has no gradient
 OBSERVED_POINTS = 1 << 14  # points of a new shape that its code is fitted to
-MAX_CANDIDATES = 64  # learnt codes at most that a fit may begin with
+MAX_CANDIDATES, MAX_PLACED_CANDIDATES = 64, 16  # learnt codes at most that a fit may begin with; at each place
 PLACE_STEP = 0.1  # scene units, and share of the size, that a step of 1 moves a scan in the fit
 PLACES, SIZES = (-1.0, 0.0, 1.0), (0.7, 0.85, 1.0)  # of a scan in the whole, at which a fit may begin
 
@@ -221,7 +221,7 @@ class DeepSDF(CodedSurface):
             some = torch.randint(len(points), (count,), generator=generator).to(self.device)
             moved = scale * points[some] + shift
             off = self._error(code.expand(count, -1), moved, scale * distance[some])
-            return off + c.fit_weight * code.square().sum()
+            return off / scale + c.fit_weight * code.square().sum()  # in units of the scan, or it would shrink
 
         with torch.no_grad():
             start = self._start(shape, partial(error, count=256))
@@ -237,15 +237,15 @@ class DeepSDF(CodedSurface):
     def _start(self, shape: Shape, error: Any) -> Float[Tensor, " unknown"]:
         """The learnt code, or the average, and the place of a scan that agree best with a new shape."""
         known = self.codes.rows.detach()[self.codes.learnt]
-        some = torch.randperm(len(known), generator=self.random(4))[:MAX_CANDIDATES]
+        most = MAX_PLACED_CANDIDATES if shape.partial else MAX_CANDIDATES
+        some = torch.randperm(len(known), generator=self.random(4))[:most]
         codes = torch.cat([self.codes.average[None], known[some.to(known.device)]])
         places = codes.new_zeros(1, 4)
         if shape.partial:
             grid = torch.cartesian_prod(*[torch.tensor(PLACES)] * 3, torch.tensor(SIZES))
-            shift = grid[:, :3] * (1 - grid[:, 3:])  # to the sides of the cube that the whole fills
-            places = torch.cat([shift / PLACE_STEP, grid[:, 3:].log() / PLACE_STEP], -1).to(codes)
-            order = torch.stack([error(torch.cat([codes[0], place])) for place in places]).argsort()
-            places = places[order[:3]]
+            half = torch.from_numpy(shape.mesh.vertices).abs().amax(0).float()
+            shift = grid[:, :3] * (HALF_SIDE - grid[:, 3:] * half).clamp_min(0)  # to the sides that the whole reaches
+            places = (torch.cat([shift, grid[:, 3:].log()], -1) / PLACE_STEP).to(codes)
         tried = [torch.cat([code, place]) for place in places for code in codes]
         return tried[int(torch.stack([error(one) for one in tried]).argmin())]
 

@@ -179,15 +179,17 @@ class OccupancyNetwork(CodedSurface):
 
     @torch.no_grad()
     def find(self, evidence: Any) -> Float[Tensor, " code"]:
-        """The code of a cloud or mesh, or of a picture; from a mesh the picture is made that training would show. Raises
-        LumigraphError for evidence of another kind than the training's."""
+        """The code of a cloud or mesh, or of a picture, which is made of a mesh as in training.
+
+        Raises LumigraphError for evidence of another kind than the training's.
+        """
         c = self.config
         if c.input == "picture":
             if not isinstance(evidence, Photograph):
                 if evidence.is_cloud:
                     raise LumigraphError(
-                        f"This run of occupancy-network learnt from pictures, and {evidence.name} is a cloud of points; "
-                        "name a picture, or train with --input points"
+                        f"This run of occupancy-network learnt from pictures, and {evidence.name} is a cloud of "
+                        "points; name a picture, or train with --input points"
                     )
                 camera = ring(evidence.frame.bounds, size=c.picture_size)[1]
                 evidence = picture_of(evidence, camera, self.random(2))
