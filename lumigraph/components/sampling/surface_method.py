@@ -15,7 +15,7 @@ from ...camera.rays import Rays, Rendering
 from ...datasets.shapes import Shapes
 from ...method import RayMethod
 from ...method.controls import Control
-from .sphere_trace import Crossings, March, sphere_trace
+from .sphere_trace import March, sphere_trace
 
 SHADINGS = ("grey", "normals")  # a grey surface lit from the camera; normals as colours
 AMBIENT, DIFFUSE = 0.25, 0.65  # of the grey surface
@@ -35,10 +35,20 @@ class SurfaceMethod(RayMethod):
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """A function of points in scene units that is zero at the surface and negative inside."""
 
-    def crossings(self, rays: Rays) -> Crossings:
-        """First crossings of rays with the surface inside the box of interest."""
+    def met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
+        """Distance at which each ray meets the surface inside the box of interest, infinity where it does not, and the
+        unit normal there, zero where it does not."""
         box = torch.tensor(self.frame.bounds, device=self.device)
-        return sphere_trace(self.distance, rays, box, self.march, self.frame.near)
+        return self.with_normals(rays, sphere_trace(self.distance, rays, box, self.march, self.frame.near).t)
+
+    def with_normals(
+        self, rays: Rays, t: Float[Tensor, " ray"]
+    ) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
+        """Distances with the normals there."""
+        normals, there = torch.zeros_like(rays.directions), t.isfinite().nonzero()[:, 0]
+        if len(there):
+            normals[there] = self.normals(rays[there].at(t[there]))
+        return t, normals
 
     def normals(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """Unit gradients of the function."""
@@ -48,13 +58,10 @@ class SurfaceMethod(RayMethod):
         return normalize(gradient, dim=-1)
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        found = self.crossings(rays)
-        normals, rgb = torch.zeros_like(rays.directions), background.expand(len(rays), 3).clone()
-        there = found.hit.nonzero()[:, 0]
-        if len(there):
-            normals[there] = self.normals(rays[there].at(found.t[there]))
-            rgb[there] = self.shaded(normals[there], rays.directions[there])
-        return Rendering(rgb, found.t, found.hit.float(), {"normals": normals})
+        t, normals = self.met(rays)
+        hit = t.isfinite()
+        rgb = torch.where(hit[:, None], self.shaded(normals, rays.directions), background)
+        return Rendering(rgb, t, hit.float(), {"normals": normals})
 
     def shaded(
         self, normals: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]

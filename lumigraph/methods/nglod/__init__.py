@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ... import kernels
 from ...camera.rays import Rays
-from ...components.sampling.sphere_trace import Crossings
 from ...components.sampling.surface_method import SurfaceMethod
 from ...components.training.row_optimizers import LazyAdam
 from ...components.training.schedules import exponential_decay
@@ -23,6 +23,7 @@ from ...errors import LumigraphError
 from ...files.ranges import LearningRate, NonNegative, Seed, Width, between
 from ...kernels.octree_cells import MAX_LEVELS, Crossed
 from ...method.controls import Control
+from .loops import trace
 from .octree import CodeOctree
 
 
@@ -142,36 +143,49 @@ class NGLOD(SurfaceMethod):
 
     # Along rays
 
-    def crossings(self, rays: Rays) -> Crossings:
+    def met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
         """Sphere tracing inside of the cells that rays cross (section 3.3); a ray skips what lies between them."""
-        tree = self.octree.levels[self.level[0]].cells.made[2]
+        number, share = self.level
+        tree = self.octree.levels[number].cells.made[2]
         nothing = torch.zeros(tree.count, device=self.device)
         origins = (0.5 * rays.origins + 0.5).contiguous()
         found = kernels.octree_cells(origins, rays.directions.contiguous(), tree, nothing, 0.5 * self.frame.near)
+        if self.device.type == "cpu" and not share:
+            return self._traced_by_loops(rays, found)
         with torch.no_grad():
-            return self._traced(rays, found)
+            return self.with_normals(rays, self._traced(rays, found))
 
-    def _traced(self, rays: Rays, found: Crossed) -> Crossings:
+    def _traced_by_loops(self, rays: Rays, found: Crossed) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
+        c, number = self.config, self.level[0]
+        t, normals = torch.empty(len(rays)), torch.zeros(len(rays), 3)
+        first, second = (x.detach().t().contiguous() for x in self.octree.levels[number].decoder.weights)
+        spans = 2 * found.t_start, 2 * found.t_end, found.ray_starts
+        given = [x.contiguous().numpy() for x in (rays.origins, rays.directions, *spans)]
+        weights = first.numpy(), second[:, 0].contiguous().numpy()
+        tables, limits = self.octree.tables(number), (np.float32(c.hit_distance), c.max_steps)
+        trace(*given, number, 1 << c.base_level, *tables, *weights, *limits, t.numpy(), normals.numpy())
+        return t, normals
+
+    def _traced(self, rays: Rays, found: Crossed) -> Float[Tensor, " ray"]:
+        """Distances to the surface along rays that cross these cells."""
         c, spans = self.config, Spans(found)
         t = torch.full((len(rays),), torch.inf, device=self.device)
         row = (found.ray_starts.diff() > 0).nonzero()[:, 0]
-        first = found.ray_starts[row]
-        place = 2 * found.t_start[first]
-        closest = torch.zeros_like(t).index_copy(0, row, place)
+        place = 2 * found.t_start[found.ray_starts[row]]
         before, ahead = place, torch.zeros_like(place)  # 0: no value in front of it
         for _ in range(c.max_steps):
             if not len(row):
                 break
             value = self.distance(rays[row].at(place))
             met = value < c.hit_distance
-            share = torch.where(ahead > 0, ahead / (ahead - value).clamp_min(1e-9), 1.0).clamp(max=1.0)
+            share = torch.where(ahead > 0, ahead / (ahead - value).clamp_min(1e-9), 1.0)
             t[row[met]] = torch.where(value < 0, before + share * (place - before), place)[met]
             before, ahead = place, value
             place, inside, jumped = spans.enter(row, place + value.clamp_min(c.hit_distance))
             ahead = torch.where(jumped, 0.0, ahead)
             stays = ~met & inside
             row, place, before, ahead = row[stays], place[stays], before[stays], ahead[stays]
-        return Crossings(t, t.isfinite(), torch.where(t.isfinite(), t, closest))
+        return t
 
 
 class Spans:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -172,6 +173,15 @@ class CodeOctree(nn.Module):
         x, y, z = (self.levels[number + 1].cells.place(points) & 1).unbind(-1)
         bits = cells.rows[cells.row(points), 1].long() >> (4 * x + 2 * y + z)
         return 1.0 - 2.0 * (bits & 1)
+
+    def tables(self, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the levels up to one, end to end: rows of corners with the start of each level, then the start of each
+        level's features with these; see `loops.trace`."""
+        levels = [*self.levels][: last + 1]
+        indices = [level.cells.made[1].index.flatten().numpy() for level in levels]
+        features = [level.features.detach().numpy() for level in levels]
+        starts, offsets = (np.cumsum([0, *map(len, parts)]) for parts in (indices, features))
+        return np.concatenate(indices), starts, offsets, np.concatenate(features)
 
     def bytes_at(self, last: int) -> int:
         """Bytes of what a level needs: cells and features up to it, and its decoder."""
