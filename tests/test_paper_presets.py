@@ -294,6 +294,50 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "hyper_layers": 2,
         "hidden_width": 64,
     },
+    "deepsdf": {  # facebookresearch/DeepSDF, examples/chairs/specs.json
+        "depth": 8,
+        "hidden_width": 512,
+        "skip_layer": 4,
+        "octaves": 0,
+        "weight_norm": True,
+        "dropout": 0.2,
+        "code": 256,
+        "code_deviation": 0.01,  # section 4.2
+        "code_weight": 1e-4,
+        "clamp_distance": 0.1,
+        "shapes_per_step": 8,
+        "points_per_shape": 16_384,
+        "points.pool_points": 500_000,  # section 5
+        "points.near_spread": 0.05,  # the supplement: variances of 0.0025 and 0.00025. From memory
+        "points.fine_spread": 0.0158,
+        "learning_rate": 5e-4,
+        "code_learning_rate": 1e-3,
+    },
+    "nglod": {  # nv-tlabs/nglod, sdf-net/lib/options.py
+        "features": 32,
+        "hidden_width": 128,
+        "base_level": 2,  # feature-size 4
+        "levels": 5,  # the paper's table 1. From memory
+        "points.pool_points": 500_000,  # num-samples 100 000 in each of five modes
+        "points.near_share": 0.8,  # sample-mode rand near near trace trace
+        "points.fine_spread": 0.0,
+        "points_per_step": 512,
+        "learning_rate": 1e-3,
+    },
+    "occupancy-network": {  # autonomousvision/occupancy_networks, configs/default.yaml
+        "code": 512,
+        "picture_size": 224,
+        "views": 24,
+        "shapes_per_step": 64,
+        "cloud_points": 300,  # section 4.3. This and what follows from memory
+        "points_per_shape": 2048,
+        "points.near_share": 0.0,
+        "encoder_width": 512,
+        "hidden_width": 256,
+        "blocks": 5,
+        "threshold": 0.2,
+        "learning_rate": 1e-4,
+    },
 }
 
 

@@ -50,7 +50,7 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
     """Open a source of any kind as a dataset.
 
     wanted:  the kind to open it as, where it can be several: Scene, Shapes or Collection; see `kind_of`
-    options: those of `open_scene` for photographs, also for those in a collection
+    options: those of `open_scene` for photographs, also for those in a collection; `partial` of `read_shapes`
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
     kind, path = kind_of(source, wanted), expanded(source)
@@ -58,10 +58,11 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
         many = sources_of(source)
         return Collection.of({name: partial(open_dataset, one, **options) for name, one in many.items()}, str(source))
     if kind is Shapes:
+        some_sides = bool(options.pop("partial", None))
         told = [name for name, value in options.items() if value not in (None, 1)]
         if told:
             raise LumigraphError(f"{source} holds shapes, and --{told[0]} is about photographs; leave it out")
-        return meshes.read_shapes(path)
+        return meshes.read_shapes(path, some_sides)
     return open_scene(source, **options)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,10 @@ def is_mesh(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 
-def read_shapes(path: Path) -> Shapes:
+def read_shapes(path: Path, partial: bool = False) -> Shapes:
     """The shape in a file, or the shapes in a folder and in the folders below it, each normalised by itself.
 
+    partial: whether they are scans of some sides, see `Shape`
     Of many, every 8th by name is for testing. What the Shapes should tell its user is a LumigraphWarning too.
     Raises LumigraphError for files that hold no surface and no points.
     """
@@ -44,7 +46,8 @@ def read_shapes(path: Path) -> Shapes:
     files = sorted(found, key=lambda file: natural(file.as_posix()))
     if not files:
         raise LumigraphError(f"{path} holds no meshes; name a file or a folder of {', '.join(SUFFIXES)}")
-    members = [read_shape(file, name_of(file, path)) for file in track(files, "Reading meshes", len(files))]
+    read = [read_shape(file, name_of(file, path)) for file in track(files, "Reading meshes", len(files))]
+    members = [replace(shape, partial=partial) for shape in read]
     shapes = Shapes(members, splits_of(len(members)), str(path))
     for warning in shapes.warnings:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera import Camera
 from ..camera.lens import Pinhole
+from ..datasets.scene import Photograph
 from ..errors import LumigraphError
 from .capture import Capture, Shot
 from .pictures import IMAGE_SUFFIXES, check_downscale, read_image, reduced, upright_size
@@ -54,3 +56,13 @@ def read(path: Path, downscale: int | None = None) -> Capture:
     ]
     corner = (width / longest, BOX_THICKNESS, height / longest)
     return Capture(str(path), shots, bounds=((-corner[0], -corner[1], -corner[2]), corner), reach=1.0)
+
+
+def photograph(path: Path) -> Photograph:
+    """The picture with its alpha, and the camera straight before it, as evidence of the object that it shows."""
+    shot = read(path).shots[0]
+    assert isinstance(shot.image, np.ndarray)
+    pixels = torch.from_numpy(shot.image.astype(np.float32) / 255)
+    height, width = pixels.shape[:2]
+    camera = Camera(torch.from_numpy(CAMERA_POSE).float()[None], shot.lens, torch.tensor([[width, height]]))
+    return Photograph(camera, pixels[..., :3], pixels[..., 3] if pixels.shape[-1] == 4 else None)

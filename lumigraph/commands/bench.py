@@ -1,4 +1,4 @@
-"""`lumigraph bench`: the speed of kernels, the quality of methods, and PSNR against the number of photographs."""
+"""`lumigraph bench`: the speed of kernels, the quality of methods, PSNR against the number of photographs; shapes."""
 
 from __future__ import annotations
 
@@ -262,6 +262,78 @@ class BenchViews(Cells):
         return [None if views == "all" else views for views in self.views if views not in left_out]
 
 
+@dataclass(frozen=True, kw_only=True)
+class BenchShapes:
+    """Train methods on shapes, and measure levels of detail and completions of held-out shapes.
+
+    A mesh is learnt by itself: OUTPUT/shapes.md has IoU, chamfer distance, normal consistency, bytes and the time of a
+    picture, at each level of detail. A folder of meshes is a collection: each method completes its held-out members
+    from the evidence that it takes (the whole mesh, one side's scan, 300 points, one picture), beside retrieval of the
+    training member that fits best. Ctrl-C stops; the same command continues.
+    """
+
+    methods: Annotated[
+        tuple[str, ...], needed("METHOD ...", "Methods to train (default: those that learn shapes).")
+    ] = ()
+    shapes: Annotated[tuple[str, ...], needed("MESH ...")]
+    """Meshes, and folders of meshes, as for `lumigraph train`."""
+    output: Annotated[Path, needed("OUTPUT")]
+    """Folder for runs and tables."""
+    runs: Annotated[tuple[Path, ...], option("RUN ...", "none")] = ()
+    """Further trained runs of the same shapes to measure, for example of --input picture."""
+    seconds: Annotated[Seconds | None, option("S", "60")] = None
+    """Training time in seconds."""
+    steps: StepsOption = None
+    seed: Annotated[Seed, option("N")] = 0
+    """Seed of all random choices."""
+    members: Annotated[Count, option("N")] = 8
+    """Number of held-out members of a collection, evenly spread."""
+    points: Annotated[Count, option("N")] = 100_000
+    """Points that are compared in the volume and on each surface; fewer are faster, and noisier."""
+    cells: Annotated[Count, option("N")] = 128
+    """Cells along the longest side of the grid that surfaces are found with; more are finer, and slower."""
+    device: DeviceOption = "auto"
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """Defaults of the methods' options: the papers', or those tuned for a CPU; auto decides by --device."""
+
+    def run(self) -> int:
+        from ..benchmark.cell import Cell, CellSettings
+        from ..benchmark.conduct import conduct
+        from ..benchmark.shapes import measure
+        from ..datasets.shapes import Shapes
+
+        (budget,) = budgets(given(self.seconds), given(self.steps))
+        choose_device(self.device)
+        names = [methods.check(name) for name in self.methods] or methods.learning_from(Shapes)
+        for name in ("shapes.json", "shapes.md"):
+            claim(self.output / name, "benchmark")
+        settings = CellSettings(preset=self.preset, device=self.device, eval_views=self.members)
+        cells = [
+            Cell(name, scene_name(place), place, budget, self.seed)
+            for place in map(place_of, self.shapes)
+            for name in names
+            if not (is_folder(place) and learns_one(name))
+        ]
+        if code := conduct(cells, settings, self.output, say):
+            return code
+        there = [self.output / "runs" / cell.name for cell in cells]
+        measured = [*filter(lambda folder: (folder / "config.json").exists(), there), *self.runs]
+        measure(measured, self.members, self.points, self.cells, self.output, say)
+        show({"table": str(self.output / "shapes.md"), "figures": str(self.output / "shapes.json")})
+        return 0
+
+
+def is_folder(place: str) -> bool:
+    return Path(place).is_dir()
+
+
+def learns_one(name: str) -> bool:
+    """True if a method of shapes learns a single one."""
+    from ..components.sampling.coded_surface import CodedSurface
+
+    return not issubclass(methods.find(name), CodedSurface)
+
+
 def learns_across(name: str) -> bool:
     """True if a method learns from collections and takes a scene as input."""
     from ..datasets.collection import Collection
@@ -277,12 +349,13 @@ What = (
     Annotated[BenchKernels, subcommand("kernels")]
     | Annotated[BenchMethods, subcommand("methods")]
     | Annotated[BenchViews, subcommand("views")]
+    | Annotated[BenchShapes, subcommand("shapes")]
 )
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Benchmark kernels on this machine, or methods on scenes."""
+    """Benchmark kernels on this machine, methods on scenes, or methods on shapes."""
 
     what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 

@@ -1,4 +1,4 @@
-"""`lumigraph infer`: reconstruct a scene from a few photographs with a prior."""
+"""`lumigraph infer`: reconstruct a scene from a few photographs, or a shape from a scan, with a prior."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from .options import DeviceOption, ReaderOption, needed, option
 
 @dataclass(frozen=True)
 class Infer:
-    """Reconstruct a scene from a few photographs with a trained prior.
+    """Reconstruct a scene from a few photographs, or a shape from a scan, with a trained prior.
 
     A prior is a run of a method that learns from a collection: lumigraph train pixelnerf procedural:toys. Inference
     takes seconds: pixelnerf encodes the photographs once, hyp-nerf optimises a code for them. The new run stores the
     result, and evaluates, renders, exports and opens in the viewer like any other. With --seed instead of a scene,
-    hyp-nerf samples a new object.
+    hyp-nerf samples a new object. Priors of shapes (deepsdf, occupancy-network) take a mesh, a cloud of points or, as
+    they were trained, one picture.
     """
 
     prior: Annotated[Positional[Path], needed("PRIOR")]
     """Folder of the prior's run."""
     scene: Annotated[Positional[str | None], option("SCENE", "none, with --seed")] = None
-    """A folder of photographs with poses, or procedural:NAME."""
+    """A folder of photographs with poses, or procedural:NAME; for a prior of shapes a mesh, a cloud or a picture."""
     seed: Annotated[Seed | None, option("N")] = None
     """Sample a new object instead of a scene; each number gives another one."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
@@ -37,6 +38,9 @@ class Infer:
     held out unless the source names its test photographs."""
     downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce photographs by this whole number; a larger one is faster and loses detail."""
+    partial: bool = False
+    """The scan shows some sides alone: find its place and size in the whole as well, instead of fitting it to the
+    box."""
     reader: ReaderOption = None
     device: DeviceOption = "auto"
 
@@ -55,7 +59,8 @@ class Infer:
         output = self.output or next_free(f"runs/{what}-{made_by.method_name}")
         check_new(output)
         if self.seed is None:
-            run, of = self._inferred(made_by, prior, output)
+            infer = self._completed if prior.of_shapes else self._inferred
+            run, of = infer(made_by, prior, output)
         else:
             run, of = draw(made_by, prior, self.seed, output), {"made of": f"seed {self.seed}"}
         commands = next_commands(run) if self.seed is None else next_commands(run, "eval")
@@ -102,3 +107,27 @@ class Infer:
         if set(scene.splits["test"].tolist()) <= set(scene.splits["train"].tolist()):
             rows["held out"] = "none, so lumigraph eval scores the input photographs"
         return run, rows
+
+    def _completed(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
+        """The run of a shape, and rows about it to print."""
+        from ..capture import open_dataset, single_image
+        from ..datasets.dataset import check_kind
+        from ..datasets.scene import Photograph
+        from ..datasets.shapes import CUBE, Shapes
+        from ..run.derived import Pictured, infer
+
+        assert self.scene is not None
+        name, path = made_by.method_name, Path(self.scene).expanduser()
+        told = [x for x in ("views", "downscale", "reader") if getattr(self, x) is not None]
+        if told:
+            raise LumigraphError(f"{name} is a prior of shapes, and --{told[0]} is about photographs; leave it out")
+        if single_image.recognises(path):
+            if Photograph not in prior.method.takes:
+                raise LumigraphError(f"{name} takes a mesh or a cloud of points, and {path} is a picture; name one")
+            evidence = single_image.photograph(path)
+            data = Pictured(str(path), CUBE)
+            return infer(made_by, prior, data, output, {}, evidence), {"made of": "a picture"}
+        options = {"partial": True} if self.partial else {}
+        shapes = open_dataset(self.scene, Shapes, **options)
+        check_kind(f"infer by {name}", Shapes, type(shapes), self.scene)
+        return infer(made_by, prior, shapes, output, options), {"made of": "a scan" if self.partial else "a shape"}

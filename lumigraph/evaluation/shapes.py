@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -17,7 +17,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
-from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find_surface, make_grid
+from ..export.mesh import POINTS_PER_CHUNK, extract_mesh, find_surface, from_distance, make_grid
 from ..figures import Row, contact_sheet
 from ..geometry import evenly
 from ..method import Method
@@ -138,7 +138,7 @@ def evaluate_shapes(
     return ShapesEvaluation(scores, protocol(shapes, split, compared, points, cells), pictured)
 
 
-def compare_shapes(true: Shape, learnt: Shape, method: Method, points: int) -> ShapeScore:
+def compare_shapes(true: Shape, learnt: Shape, method: object, points: int) -> ShapeScore:
     """A shape and what was learnt of it. Where the method knows distances, they say what is inside."""
     generator = torch.Generator().manual_seed(0)
     a, b = learnt.surface(points, generator), true.surface(points, generator)
@@ -165,10 +165,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     if not can(method, HasDistance):
         return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
 
-    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        return (-distances(method, points) / (TRUNCATION_CELLS * cell)).clamp(-1, 1)
-
-    vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, value, -1.0)
+    vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, from_distance(method, cell), -1.0)
     if not len(faces):
         raise LumigraphError("The learnt distance is nowhere zero, so there is no surface to compare; train for longer")
     return Mesh(vertices, faces, np.full((len(vertices), 3), 160, np.uint8))
@@ -180,17 +177,25 @@ def distances(method: Any, points: Float[Tensor, "point 3"]) -> Float[Tensor, " 
 
 
 def portrait(shape: Shape, camera: Camera) -> Float[Tensor, "height width 3"]:
-    """The normals of a surface as colours, found by walking along rays as far as nothing can be (Hart 1996)."""
-    rays, (width, height) = camera.rays(camera.pixels()), camera.size[0].tolist()
+    """The normals of a surface as colours."""
+    width, height = camera.size[0].tolist()
+    points, hit = seen_points(shape, camera)
+    rgb = torch.ones(len(hit), 3)
+    rgb[hit] = 0.5 + 0.5 * shape.normals_near(points)
+    return rgb.reshape(height, width, 3)
+
+
+def seen_points(shape: Shape, camera: Camera) -> tuple[Float[Tensor, "hit 3"], Bool[Tensor, " pixel"]]:
+    """The points of a surface that a camera sees, by sphere tracing (Hart 1996), and the pixels that see one."""
+    rays = camera.rays(camera.pixels())
     depth, walking = torch.zeros(len(rays)), torch.arange(len(rays))
     for _ in range(STEPS):
         away = shape.distance(rays[walking].at(depth[walking])).abs()
         depth[walking] += away
         walking = walking[(away > TOUCHING_DISTANCE) & (depth[walking] < MAX_OVERSHOOT)]
     depth[walking] = MAX_OVERSHOOT  # rays along the surface, undecided
-    rgb, hit = torch.ones(len(rays), 3), (depth < MAX_OVERSHOOT).nonzero()[:, 0]
-    rgb[hit] = 0.5 + 0.5 * shape.normals_near(rays[hit].at(depth[hit]))
-    return rgb.reshape(height, width, 3)
+    hit = depth < MAX_OVERSHOOT
+    return rays[hit].at(depth[hit]), hit
 
 
 def protocol(shapes: Shapes, split: str, compared: list[int], points: int, cells: int) -> dict[str, Any]:

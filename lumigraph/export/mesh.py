@@ -1,4 +1,4 @@
-"""A mesh of what a method has learnt: from its density where it has one, otherwise from the depth that it renders."""
+"""A mesh of what a method has learnt: from its distance or density, otherwise from the depth that it renders."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..datasets.scene import Frame
 from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, render_depth_maps
 from ..errors import LumigraphError
 from ..method import Method
-from ..method.capabilities import HasDensity, can, needs
+from ..method.capabilities import HasDensity, HasDistance, can, needs
 from ..system.progress import counting, track
 from ..system.work import at_work
 from .surface import (
@@ -48,7 +48,7 @@ INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which 
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
 
-Way = Literal["auto", "density", "depth"]
+Way = Literal["auto", "distance", "density", "depth"]
 
 
 @torch.no_grad()
@@ -76,7 +76,7 @@ def extract_mesh(
     crop:    what is meshed instead, as far as the scene reaches
     cell:    side of the cubes that are marched through, scene units; None for 1/256 of the box's longest side
     level:   density of the surface, per scene unit; None for that where the cameras see surfaces
-    way:     "density", "depth", or "auto" for density where the method has one
+    way:     "distance", "density", "depth", or "auto" for the first of these that the method has
     smooth:  rounds of smoothing
     faces:   number of triangles to come down to; None for all
     keep:    pieces with less than this share of the largest one's area are dropped
@@ -93,7 +93,9 @@ def extract_mesh(
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
     step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
     seen = from_depth(depth_maps, grid.cell, closed)
-    if way == "depth" or (way == "auto" and not can(method, HasDensity)):
+    if way == "distance" or (way == "auto" and can(method, HasDistance)):
+        value = from_distance(method, grid.cell)
+    elif way == "depth" or (way == "auto" and not can(method, HasDensity)):
         value = seen
     else:
         level = surface_level(method, depth_maps, holds) if level is None else level
@@ -176,6 +178,16 @@ def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Val
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         distance, _, pictured = fused(points)
         return torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), -distance)
+
+    return value
+
+
+def from_distance(method: Method, cell: float) -> Value:
+    """A function of points: 0 at the zero level of the method's distance, 1 well inside, -1 well outside."""
+
+    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        distance = needs(method, HasDistance).distance(points.to(method.device)).cpu().float()
+        return (-distance / (TRUNCATION_CELLS * cell)).clamp(-1, 1)
 
     return value
 

@@ -65,6 +65,15 @@ class HasDistance(Protocol):
         """Signed distance to the nearest surface in scene units, negative inside."""
 
 
+class HasLevels(Protocol):
+    """Has levels of detail, by its control `level`, from 1 up to `levels`."""
+
+    levels: int
+
+    def level_bytes(self, level: int) -> int:
+        """Bytes of what a level needs."""
+
+
 class HasGaussians(Protocol):
     """Is a cloud of Gaussians."""
 
@@ -162,6 +171,7 @@ LACKING = {
     HasOctree: "is no octree; `lumigraph convert` makes one of it, as plenoctrees",
     HasAtlas: "is no atlas of baked values; `lumigraph convert` makes one of it, as snerg",
     HasDistance: "holds no distance to surfaces; a method that learns from shapes does",
+    HasLevels: "has no levels of detail; nglod has",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     RefinesPoses: "learns no poses of photographs; give --refine-cameras to a method that can",
     HasVisibility: "does not know which places its photographs saw; block-nerf does",

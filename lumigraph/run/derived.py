@@ -21,7 +21,7 @@ from torch import Tensor
 from .. import files
 from ..camera import Camera
 from ..datasets.dataset import Dataset
-from ..datasets.scene import Frame, Scene
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
 from ..files.ranges import Count, Lasted, Name, Seed, Share, Tally, typed
@@ -164,8 +164,8 @@ class Converted(Record):
 
 @dataclass(frozen=True)
 class Inferred(Origin):
-    """prior: the run that made it; views: photographs in use; seconds: that it took; seed: of the random code of a run
-    without photographs"""
+    """prior: the run that made it; views: photographs or shapes in use; seconds: that it took; seed: of the random code
+    of a run without evidence"""
 
     key = "inferred"
 
@@ -176,17 +176,20 @@ class Inferred(Origin):
 
 
 @at_work()
-def infer(made_by: Run, prior: Prior, scene: Scene, output: Path, options: dict[str, Any]) -> Run:
-    """The run of one scene, in a new or empty folder, that a prior makes of its photographs to learn from.
+def infer(
+    made_by: Run, prior: Prior, data: Dataset, output: Path, options: dict[str, Any], evidence: Any = None
+) -> Run:
+    """The run of one scene or shape, in a new or empty folder, that a prior makes of what is known of it.
 
-    options: what `open_dataset` was told of the scene, to open it again
+    options:  what `open_dataset` was told of the data, to open them again
+    evidence: what the prior is given, where that is not the data themselves
     """
     check_new(output)
     begin = time.perf_counter()
-    method = prior.infer(scene)
+    method = prior.infer(data if evidence is None else evidence)
     seconds = time.perf_counter() - begin
-    said = Inferred(str(made_by.folder.resolve()), len(scene.splits["train"]), round(seconds, 3))
-    return kept(output, method, scene, made_by.settings.seed, said, options)
+    said = Inferred(str(made_by.folder.resolve()), len(data.splits.get("train", ())), round(seconds, 3))
+    return kept(output, method, data, made_by.settings.seed, said, options)
 
 
 def draw(made_by: Run, prior: Prior, seed: int, output: Path) -> Run:
@@ -213,6 +216,12 @@ class Drawn:
 
     def preview(self) -> Camera | None:
         return None
+
+
+class Pictured(Drawn):
+    """The Dataset of a shape of which a picture alone is known."""
+
+    kind: ClassVar[str] = "a picture"
 
 
 def kept(

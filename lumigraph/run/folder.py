@@ -190,6 +190,10 @@ class Run(Trained):
                 f"there are {', '.join(KINDS)}"
             )
         options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
+        if options.get("partial"):
+            raise LumigraphError(
+                f"{source} is a scan of some sides, which is no whole shape to compare with or learn from"
+            )
         if self.photographed:
             names = read_cameras(self._cameras).names
             options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())

@@ -23,7 +23,7 @@ BYTES_FACTOR = 4  # copies of a parameter: itself, its gradient, and the two mom
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options of a run for `open_dataset`: see `capture.open_scene`."""
+    """Options of a run for `open_dataset`: see `capture.open_scene`, and `meshes.read_shapes` for shapes."""
 
     downscale: Downscale | None = None
     reader: str | None = None
@@ -31,6 +31,7 @@ class SourceOptions:
     scales: Scales | None = None
     whole: bool | None = None
     part: CapturePart | None = None
+    partial: bool | None = None
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,17 @@ class PointBatch:
         )
         return PointBatch(self.points.to(device), self.member.to(device), distance, occupancy, normals)
 
+    def __getitem__(self, index: Tensor) -> PointBatch:
+        """The points that a mask or index tensor picks."""
+        known = (self.distance, self.occupancy, self.normals)
+        return PointBatch(self.points[index], self.member[index], *(None if x is None else x[index] for x in known))
+
+    @property
+    def signed(self) -> Float[Tensor, " point"]:
+        """Distance, negative where occupied: also of a surface with holes, by its winding number."""
+        assert self.distance is not None and self.occupancy is not None
+        return self.distance.abs() * (1 - 2 * self.occupancy)
+
     @staticmethod
     def cat(parts: list[PointBatch]) -> PointBatch:
         """One batch from several; what one of them lacks, all lack."""
@@ -67,12 +78,14 @@ class Shape:
 
     frame:   where it is, and the way back to its file
     normals: of a cloud's points, where the file has them
+    partial: whether it is a scan of some sides, so that the place and size of the whole are unknown
     """
 
     name: str
     mesh: Mesh
     frame: Frame = Frame()
     normals: Float[np.ndarray, "vertex 3"] | None = None
+    partial: bool = False
 
     @property
     def is_cloud(self) -> bool:
@@ -91,10 +104,14 @@ class Shape:
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """To the nearest point of the surface, in scene units: signed, negative inside, if it is closed."""
+        away = self._away(points)
+        return torch.where(self.inside(points), -away, away) if self.closed else away
+
+    def _away(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Unsigned distance."""
         places = points.detach().cpu().double().numpy()
         away = self._cloud.query(places)[0] if self.is_cloud else self._triangles.nearest(places)[0]
-        distance = torch.from_numpy(away).float()
-        return torch.where(self.inside(points), -distance, distance) if self.closed else distance
+        return torch.from_numpy(away).float()
 
     def inside(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
         """True for points with a winding number above a half. Nothing is inside of a point cloud."""
@@ -104,8 +121,10 @@ class Shape:
 
     def known(self, points: Float[Tensor, "point 3"], member: int = 0) -> PointBatch:
         """Points with their distance and occupancy."""
-        occupancy = None if self.is_cloud else self.inside(points).float()
-        return PointBatch(points, torch.full((len(points),), member), self.distance(points), occupancy)
+        inside, away = self.inside(points), self._away(points)
+        distance = torch.where(inside, -away, away) if self.closed else away
+        occupancy = None if self.is_cloud else inside.float()
+        return PointBatch(points, torch.full((len(points),), member), distance, occupancy)
 
     def surface(self, count: int, generator: torch.Generator, member: int = 0) -> PointBatch:
         """Random points of the surface, evenly by its area, with their normals; of a cloud, random ones of its points.

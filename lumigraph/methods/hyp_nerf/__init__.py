@@ -17,6 +17,7 @@ from ...camera.rays import Look, Rays, Rendering
 from ...capture.up import common_up
 from ...components.fields.appearance import fitted
 from ...components.fields.hash_field import HashNumbers
+from ...components.fields.instance_codes import FOUND, InstanceCodes
 from ...components.fields.kept_photographs import Kept, chance, photographed, rays_through
 from ...components.sampling.occupancy import OccupancyGrid, visual_hull
 from ...components.sampling.occupancy_sampler import reached
@@ -32,7 +33,7 @@ from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .networks import AVERAGE, HashInstance, HashShape, HyperNetwork, InstanceCodes, PictureDenoiser
+from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
 
 Tally = Annotated[int, between(0, 100_000)]
 
@@ -119,7 +120,6 @@ GRID_UPDATES = 6  # of the occupancy grid of a field that is rendered
 EMPTY_LENGTH = 1 / 16  # scene units over which density in empty space absorbs light
 RAYS_PER_STEP = 1024  # rays of a step that fits a code or tunes a field
 MAX_CANDIDATES = 64  # learnt codes at most that a fit may begin with
-FOUND = "found"
 ELEVATIONS = 0.35, 0.8  # radians above the horizon, of views that are denoised
 
 Seen = Callable[[int, torch.Generator], Evidence]  # so many random rays of what is known of a scene
@@ -180,11 +180,7 @@ class HypNeRF(RayMethod):
     # Learning
 
     def begin(self, data: Collection, seconds: float = math.inf) -> None:
-        if len(data) > self.config.members:
-            raise LumigraphError(
-                f"{data.source} has {len(data)} members, and there is room for {self.config.members} codes; "
-                f"give --members {len(data)}"
-            )
+        self.codes.check_room(len(data), data.source)
         self.codes.begin(data.splits["train"], self.config.code_deviation, self.random(1))
         _, first = next(data.members())
         scene = photographed(first, "hyp-nerf")
@@ -334,11 +330,7 @@ class HypNeRF(RayMethod):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        first = (FOUND,) if len(self.found.rows) else ()
-        choices = (*first, AVERAGE, *self.codes.names)
-        about = "Which object is shown: the one that was found or drawn, a member of the collection by its number, or "
-        about += "the average of all."
-        return (Control("instance", choices[0], choices=choices, about=about, blends=True),)
+        return (self.codes.control(bool(len(self.found.rows))),)
 
     # One scene
 

@@ -1,4 +1,4 @@
-"""Networks of HyP-NeRF: the hypernetwork, the field of an instance, the denoiser of pictures, the codes of members."""
+"""Networks of HyP-NeRF: the hypernetwork, the field of an instance, the denoiser of pictures."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ... import kernels
-from ...components.fields.appearance import axes_of
 from ...components.fields.hash_field import HashNumbers, side_by_side
 from ...components.fields.layers import truncated_exp
 from ...method import Field
-from ...method.controls import blend
 from ...method.field import Colours, Densities, Directions, Points
 
 TABLE, CALM = 1e-4, 0.1  # of a table's first entries; of what codes change at first, beside what all have in common
@@ -131,67 +128,3 @@ class PictureDenoiser(nn.Module):
             coarse = coarse + F.relu(layer(coarse))
         above = F.interpolate(self.up(coarse), fine.shape[-2:], mode="bilinear", align_corners=False)
         return pictures + self.last(F.relu(fine + above))
-
-
-AVERAGE = "average"
-
-
-class InstanceCodes(nn.Module):
-    """Numbers of each member, zeros of those that are not learnt from.
-
-    most:  members that there are room for
-    width: numbers of a code
-    """
-
-    def __init__(self, most: int, width: int):
-        super().__init__()
-        self.rows = nn.Parameter(torch.zeros(most, width))
-
-    @torch.no_grad()
-    def begin(self, members: Int[Tensor, " member"], deviation: float, generator: torch.Generator) -> None:
-        """Random codes for the members to learn from."""
-        drawn = deviation * torch.randn(len(members), self.rows.shape[1], generator=generator)
-        self.rows[members.to(self.rows.device)] = drawn.to(self.rows.device)
-
-    def forward(self, members: Int[Tensor, " member"]) -> Float[Tensor, "member code"]:
-        return self.rows[members]
-
-    @property
-    def learnt(self) -> Bool[Tensor, " member"]:
-        """The members whose codes were learnt."""
-        return (self.rows != 0).any(-1)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Numbers of the members whose codes were learnt, as text."""
-        return tuple(str(number) for number in self.learnt.nonzero()[:, 0].tolist())
-
-    @property
-    def average(self) -> Float[Tensor, " code"]:
-        """The mean of the codes that were learnt; zeros where none was."""
-        known = self.rows.detach()[self.learnt]
-        return known.mean(0) if len(known) else self.rows.detach()[0]
-
-    @property
-    def axes(self) -> Float[Tensor, "axis code"]:
-        """Along which the codes that were learnt differ, each as long as their deviation along it: `average + w @ axes`
-        is distributed as the Gaussian that fits them, where w is of the standard normal distribution."""
-        return axes_of(self.rows.detach()[self.learnt])
-
-    def along(self, code: Float[Tensor, " code"]) -> Float[Tensor, " axis"]:
-        """Coordinates of a code along the axes, in deviations from the average."""
-        axes = self.axes
-        return (code - self.average) @ axes.T / axes.square().sum(-1)
-
-    def drawn(self, generator: torch.Generator) -> Float[Tensor, " code"]:
-        """A code from the Gaussian that fits those that were learnt."""
-        axes = self.axes
-        return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
-
-    def code_of(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
-        """The code that a control's value stands for: a member's, the average, one of the others by its name, or one
-        between two, as `controls.blend` takes values apart."""
-        known = {AVERAGE: self.average} | others
-        first, second, share = blend(value)
-        a, b = (known[x] if x in known else self.rows.detach()[int(x)] for x in (first, second))
-        return torch.lerp(a, b, share)

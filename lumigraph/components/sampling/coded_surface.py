@@ -1,0 +1,84 @@
+"""CodedSurface: a SurfaceMethod in which a code means a shape: codes of members, and of a shape that is given."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...datasets.scene import Frame, Photograph
+from ...datasets.shapes import Shape, Shapes
+from ...errors import LumigraphError
+from ...method import Method
+from ...method.controls import Control, Value
+from ..fields.instance_codes import FOUND, InstanceCodes
+from ..fields.kept_photographs import Kept
+from .surface_method import SurfaceMethod
+
+Evidence = Literal["mesh", "half scan", "points", "picture"]
+
+
+class CodedSurface(SurfaceMethod):
+    """Learns from several shapes; `given` a further one, or evidence of it, it finds a code. Write `find`.
+
+    codes:       of members
+    found:       code of the shape that was given, or drawn; no row without one
+    taken_kinds: kinds of evidence that it was made for
+    """
+
+    accepts = (Shapes,)
+    taken_kinds: ClassVar[tuple[Evidence, ...]] = ("mesh",)
+
+    def __init__(self, frame: Frame, config: Any):
+        super().__init__(frame, config)
+        self.codes = InstanceCodes(config.members, config.code)
+        self.found = Kept(torch.empty(0, config.code))
+
+    @abstractmethod
+    def find(self, evidence: Shape | Photograph) -> Float[Tensor, " code"]:
+        """The code of a shape of which this is known. It may change `frame`."""
+
+    @property
+    def code(self) -> Float[Tensor, " code"]:
+        """Code of the instance that is shown; that of a single shape without a choice."""
+        if len(self._instances) < 2:
+            return self.codes.average
+        others = {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
+        return self.codes.code_of(str(self.control("instance")), **others)
+
+    @property
+    def _instances(self) -> tuple[str, ...]:
+        return (*([FOUND] if len(self.found.rows) else []), *self.codes.names)
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        instance = [self.codes.control(len(self.found.rows) > 0)] if len(self._instances) > 1 else []
+        return (*instance, *super().controls)
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same weights with the code of a shape of which a mesh, a scan or a picture is given."""
+        taken = [piece for piece in evidence if isinstance(piece, self.takes)]
+        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.takes)), **controls)
+        assert isinstance(told, CodedSurface)
+        for piece in taken[-1:]:
+            if isinstance(piece, Shapes) and len(piece) != 1:
+                raise LumigraphError(f"{piece.source} holds {len(piece)} shapes, and one is completed; name its file")
+            one = piece.members[0] if isinstance(piece, Shapes) else piece
+            if isinstance(one, Shape):
+                told.frame = one.frame
+            told._show(told.find(one))
+        return told
+
+    def drawn(self, seed: int) -> Method:
+        """A shape that nobody has modelled: a code from the Gaussian that fits the learnt ones."""
+        told = super().given()
+        assert isinstance(told, CodedSurface)
+        told._show(self.codes.drawn(torch.Generator().manual_seed(seed)))
+        return told
+
+    def _show(self, code: Float[Tensor, " code"]) -> None:
+        self.found = Kept(code.detach()[None])
+        self.settings.pop("instance", None)

@@ -1,0 +1,222 @@
+"""Occupancy networks: a network says which points are inside of a shape (Mescheder et al. 2019, arXiv 1812.03828)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from ...camera import ring
+from ...color.blending import before
+from ...components.sampling.coded_surface import CodedSurface, Evidence
+from ...components.sampling.sphere_trace import March
+from ...components.training.schedules import falling
+from ...components.training.shape_points import PointNumbers, PointPools
+from ...datasets.scene import Frame, Photograph
+from ...datasets.shapes import PointBatch, Shape, Shapes
+from ...datasets.shapes.pictures import picture_of
+from ...errors import LumigraphError
+from ...files.ranges import Count, Layers, LearningRate, NonNegative, Seed, Width, between
+from .networks import VOXELS, OccupancyDecoder, PictureEncoder, PointEncoder, VoxelEncoder
+
+Input = Literal["points", "voxels", "picture"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers; where it leaves them open, those of the published code (configs/)."""
+
+    input: Input = "points"  # evidence that a shape is encoded from: a cloud of points, voxels, or one picture
+    points: PointNumbers = PointNumbers(100_000, near_share=0.0)
+    cloud_points: Annotated[int, between(8, 65_536)] = 300  # points of a cloud as input, section 4.3
+    cloud_noise: NonNegative = 0.01  # deviation of noise of these points in training, scene units; higher: more robust
+    picture_size: Annotated[int, between(16, 512)] = 224  # pixels a side of a picture as input
+    views: Annotated[int, between(1, 256)] = 24  # pictures of each shape to learn from, around it, section 4.2
+    code: Width = 512  # numbers of a code, appendix A; more hold more shapes
+    encoder_width: Width = 512  # channels of the encoder, appendix A; wider costs time
+    hidden_width: Width = 256  # channels of the decoder, appendix A; wider costs time
+    blocks: Layers = 5  # residual blocks of the decoder, appendix A; more cost time
+    octaves: Annotated[int, between(0, 16)] = 0  # octaves of waves that encode points; more give finer detail, noise
+    threshold: Annotated[float, between(0.001, 0.999)] = 0.2  # probability at the surface, section 3.3; higher: thinner
+    members: Count = 4096  # shapes of a collection at most; the code of each is kept
+    shapes_per_step: Annotated[int, between(1, 1024)] = 64  # shapes in a step, section 4; more reduce noise
+    points_per_shape: Annotated[int, between(1, 1 << 20)] = 2048  # points of each shape in a step, section 3.2
+    learning_rate: LearningRate = 1e-4  # Adam's learning rate at first, appendix A
+    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+VALUE_SCALE = 0.02  # scene units for a logit of 1: about how steep occupancy is at a learnt surface
+STEP = 0.02  # scene units from one look at a ray to the next
+EVALUATED_POINTS = 1 << 14  # points that go through the decoder together, to stay in caches
+
+
+@dataclass(frozen=True)
+class OccupancyLesson:
+    """Points of some members, as many of each, and what each member's code is encoded from."""
+
+    unit: ClassVar[str] = "points"
+
+    points: PointBatch
+    evidence: Float[Tensor, member * evidence]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+class OccupancyNetwork(CodedSurface):
+    """Learns to encode evidence of a shape, and the occupancy of points under the code."""
+
+    Config = Config
+    accepts = (Shapes, Photograph)
+    march = March(max_steps=256, min_step=STEP, max_step=STEP)
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        encoders = {"points": PointEncoder, "voxels": VoxelEncoder, "picture": PictureEncoder}
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            self.encoder = encoders[c.input](c.code, c.encoder_width)
+            self.decoder = OccupancyDecoder(c.code, c.hidden_width, c.blocks, c.octaves)
+        self.codes.rows.requires_grad_(False)  # encoded, not learnt
+        self.pools = PointPools("occupancy-network", c.points, c.seed)
+        self._evidence: dict[int, Tensor] = {}  # voxels or pictures of members, by number
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """Smaller networks, points close to the surface too, and waves."""
+        c = Config(points=PointNumbers(80_000, near_share=0.6), picture_size=64, code=128, encoder_width=64)
+        c = replace(c, hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=4)
+        return replace(c, points_per_shape=1024, learning_rate=3e-3, final_learning_rate=3e-4)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        c = Config(points=PointNumbers(4096, near_share=0.5), cloud_points=32, code=4, encoder_width=8, hidden_width=8)
+        c = replace(c, blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-2)
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """Activations that a step keeps for its gradients."""
+        points = config.shapes_per_step * config.points_per_shape
+        return 4 * points * 4 * config.blocks * config.hidden_width * learning
+
+    # Learning
+
+    def begin(self, data: Shapes, seconds: float = math.inf) -> None:
+        self.codes.check_room(len(data), data.source)
+
+    def steps_per_pass(self, data: Shapes) -> float:
+        return len(data.splits["train"]) / self.config.shapes_per_step
+
+    def batch(self, data: Shapes, generator: torch.Generator) -> OccupancyLesson:  # type: ignore[override]
+        c = self.config
+        points = self.pools.lesson(data, c.shapes_per_step, c.points_per_shape, generator)
+        members = points.member[:: c.points_per_shape].tolist()
+        evidence = torch.stack([self._evidence_of(data.members[i], i, generator) for i in members])
+        return OccupancyLesson(points.to(self.device), evidence.to(self.device))
+
+    def _evidence_of(self, shape: Shape, member: int, generator: torch.Generator) -> Float[Tensor, "*evidence"]:
+        """What a training member is encoded from in a step."""
+        c = self.config
+        if c.input == "points":
+            cloud = shape.surface(c.cloud_points, generator).points
+            return cloud + c.cloud_noise * torch.randn(cloud.shape, generator=generator)
+        if member not in self._evidence:
+            self._evidence[member] = voxels_of(shape) if c.input == "voxels" else self._pictures(shape, member)
+        known = self._evidence[member]
+        return known if c.input == "voxels" else known[int(torch.randint(len(known), (), generator=generator))]
+
+    def _pictures(self, shape: Shape, member: int) -> Float[Tensor, "view height width"]:
+        cameras = ring(shape.frame.bounds, size=self.config.picture_size, count=self.config.views)
+        shots = [picture_of(shape, cameras[i], self.random(1000 + member)) for i in range(len(cameras))]
+        return torch.stack([grey(shot) for shot in shots])
+
+    def loss(self, batch: OccupancyLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
+        """Cross-entropy of occupancy (eq. 3)."""
+        points = batch.points
+        assert points.occupancy is not None
+        codes = self.encoder(batch.evidence)
+        shape = len(codes), -1
+        logits = self.decoder(points.points.view(*shape, 3), codes)
+        with torch.no_grad():
+            self.codes.rows[points.member.view(shape)[:, 0]] = codes
+            self.figures = {"wrong": float(((logits > 0) != (points.occupancy.view(shape) > 0.5)).float().mean())}
+        return {"occupancy": F.binary_cross_entropy_with_logits(logits, points.occupancy.view(shape))}
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        learnt = [*self.encoder.parameters(), *self.decoder.parameters()]
+        return [torch.optim.Adam(learnt, self.config.learning_rate, foreach=True)]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        return falling(self.config.learning_rate, self.config.final_learning_rate, progress)
+
+    # Shapes
+
+    def logits(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Logit of the probability that points are inside of the instance that is shown."""
+        code = self.code[None]
+        return torch.cat([self.decoder(part[None], code)[0] for part in points.split(EVALUATED_POINTS)])
+
+    def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Logit of the threshold less that of points, as long as if occupancy rose by 1 / VALUE_SCALE: it has the sign
+        and the zero level of a distance, and not its length."""
+        level = math.log(self.config.threshold / (1 - self.config.threshold))
+        return VALUE_SCALE * (level - self.logits(points))
+
+    # A new shape
+
+    @property
+    def taken_kinds(self) -> tuple[Evidence, ...]:  # type: ignore[override]
+        kinds: dict[Input, tuple[Evidence, ...]] = {"points": ("points",), "voxels": ("mesh",), "picture": ("picture",)}
+        return kinds[self.config.input]
+
+    @torch.no_grad()
+    def find(self, evidence: Any) -> Float[Tensor, " code"]:
+        """The code of a cloud or mesh, or of a picture, which is made of a mesh as in training.
+
+        Raises LumigraphError for evidence of another kind than the training's.
+        """
+        c = self.config
+        if c.input == "picture":
+            if not isinstance(evidence, Photograph):
+                if evidence.is_cloud:
+                    raise LumigraphError(
+                        f"This run of occupancy-network learnt from pictures, and {evidence.name} is a cloud of "
+                        "points; name a picture, or train with --input points"
+                    )
+                camera = ring(evidence.frame.bounds, size=c.picture_size)[1]
+                evidence = picture_of(evidence, camera, self.random(2))
+            encoded = F.interpolate(grey(evidence)[None, None], (c.picture_size,) * 2, mode="area")[0]
+            return self.encoder(encoded.to(self.device))[0]
+        if isinstance(evidence, Photograph):
+            raise LumigraphError(
+                f"This run of occupancy-network learnt from {c.input}, and a picture was named; name a mesh or a cloud "
+                "of points, or train with --input picture"
+            )
+        if c.input == "voxels":
+            return self.encoder(voxels_of(evidence)[None].to(self.device))[0]
+        cloud = evidence.surface(c.cloud_points, self.random(2)).points
+        return self.encoder(cloud[None].to(self.device))[0]
+
+
+def voxels_of(shape: Shape) -> Float[Tensor, "x y z"]:
+    """Occupancy of voxels in [-1, 1]^3. Raises LumigraphError for a cloud, which has none."""
+    if shape.is_cloud:
+        raise LumigraphError(
+            f"{shape.name} has points and no faces, so its voxels are unknown; name a mesh, or train with "
+            "--input points"
+        )
+    middle = (torch.arange(VOXELS) + 0.5) * (2 / VOXELS) - 1
+    return shape.inside(torch.cartesian_prod(middle, middle, middle)).float().view(VOXELS, VOXELS, VOXELS)
+
+
+def grey(picture: Photograph) -> Float[Tensor, "height width"]:
+    """A picture before white, in grey."""
+    return before(picture.rgb, picture.alpha, (1.0, 1.0, 1.0)).mean(-1)

@@ -1,0 +1,128 @@
+"""Occupancy networks: encoders, conditional normalisation, the threshold's surface, evidence and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import tiny_shapes
+import torch
+from budgets import budget
+from PIL import Image
+
+from lumigraph.camera import ring
+from lumigraph.capture import single_image
+from lumigraph.datasets.shapes import Shapes
+from lumigraph.datasets.shapes.pictures import picture_of
+from lumigraph.errors import LumigraphError
+from lumigraph.methods.occupancy_network import VALUE_SCALE, OccupancyNetwork, voxels_of
+from lumigraph.methods.occupancy_network.networks import ConditionalNorm, PointEncoder
+from lumigraph.metrics import intersection_over_union
+
+pytestmark = budget("methods", 12)
+BOTH = {"train": torch.tensor([0, 1]), "test": torch.tensor([0, 1])}
+
+
+def single(shape) -> Shapes:
+    return Shapes([shape], {"train": torch.tensor([0])}, shape.name)
+
+
+@pytest.fixture(scope="module", params=["points", "voxels", "picture"])
+def learnt(request) -> OccupancyNetwork:
+    """Small networks that have learnt to tell a ball from a box."""
+    shapes = replace(tiny_shapes.several(), splits=BOTH)
+    c = replace(OccupancyNetwork.smallest(), input=request.param, encoder_width=16, hidden_width=24, code=8)
+    c = replace(c, picture_size=32, views=4, shapes_per_step=4, points_per_shape=256)
+    method = OccupancyNetwork(shapes.frame, c).train()
+    (adam,) = method.optimizers()
+    method.begin(shapes)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(150):
+        adam.param_groups[0]["lr"] = 2e-2 * 0.05 ** (step / 150)
+        adam.zero_grad()
+        torch.stack([*method.loss(method.batch(shapes, generator), step).values()]).sum().backward()
+        adam.step()
+    return method.eval()
+
+
+def agreement(method, shape) -> float:
+    points = 2 * torch.rand(6000, 3, generator=torch.Generator().manual_seed(1)) - 1
+    with torch.no_grad():
+        return intersection_over_union(method.distance(points) < 0, shape.inside(points))
+
+
+def test_evidence_is_told_apart(learnt):
+    """A ball is a ball and a box a box, from points, voxels or a picture of it."""
+    ball, box = tiny_shapes.ball(), tiny_shapes.box()
+    for shape, other in ((ball, box), (box, ball)):
+        told = learnt.given(single(shape))
+        assert agreement(told, shape) > max(0.6, agreement(told, other))
+
+
+def test_points_in_any_order_have_one_code():
+    """The largest features of all points: a PointNet."""
+    encoder, points = PointEncoder(4, 8), torch.randn(2, 20, 3)
+    order = torch.randperm(20)
+    torch.testing.assert_close(encoder(points), encoder(points[:, order]))
+    assert not torch.allclose(encoder(points)[0], encoder(points)[1])
+
+
+def test_normalisation_is_scaled_and_shifted_by_the_code():
+    norm, x, code = ConditionalNorm(3, 5).train(), torch.randn(2, 40, 5) * 3 + 1, torch.randn(2, 3)
+    flat = x.flatten(0, 1)
+    normal = (x - flat.mean(0)) / (flat.var(0, unbiased=False) + 1e-5).sqrt()
+    expected = norm.gamma(code)[:, None] * normal + norm.beta(code)[:, None]
+    torch.testing.assert_close(norm(x, code), expected, atol=1e-5, rtol=1e-4)
+    assert not torch.equal(norm.eval()(x, code), expected)
+
+
+def test_the_surface_is_where_the_threshold_says(learnt):
+    points = 2 * torch.rand(200, 3) - 1
+    with torch.no_grad():
+        probability = learnt.logits(points).sigmoid()
+        for threshold in (0.2, 0.7):
+            learnt.config = replace(learnt.config, threshold=threshold)
+            inside = learnt.distance(points) < 0
+            assert torch.equal(inside, probability > threshold)
+    learnt.config = replace(learnt.config, threshold=0.5)
+    assert VALUE_SCALE > 0
+
+
+def test_a_picture_shows_the_nearest_surface():
+    """Of a ball: a disc that is brightest in its middle, where it faces the camera."""
+    camera = ring(tiny_shapes.ball().frame.bounds, size=48)[0]
+    shot = picture_of(tiny_shapes.ball(), camera, torch.Generator().manual_seed(0))
+    assert shot.alpha is not None and shot.alpha[24, 24] == 1 and shot.alpha[0, 0] == 0
+    disc = (
+        torch.pi * (24 / torch.tan(torch.tensor(25.0).deg2rad()) * torch.tan(torch.asin(torch.tensor(0.9 / 2.6)))) ** 2
+    )
+    assert float(shot.alpha.sum()) == pytest.approx(float(disc), rel=0.05)
+    row = shot.rgb[24, :, 0][shot.alpha[24] > 0]
+    assert row[len(row) // 2] > row[0] + 0.3 and row[len(row) // 2] > row[-1] + 0.3
+
+
+def test_voxels_are_what_is_inside():
+    voxels = voxels_of(tiny_shapes.ball())
+    volume = float(voxels.sum()) * (2 / len(voxels)) ** 3
+    assert volume == pytest.approx(4 / 3 * torch.pi * tiny_shapes.RADIUS**3, rel=0.03)
+
+
+def test_other_evidence_than_the_trainings_is_refused(learnt, tmp_path):
+    path = tmp_path / "one.png"
+    Image.new("RGBA", (40, 30)).save(path)
+    picture = single_image.photograph(path)
+    assert picture.rgb.shape == (30, 40, 3) and picture.alpha is not None
+    bare = replace(tiny_shapes.ball(), mesh=replace(tiny_shapes.ball().mesh, faces=tiny_shapes.ball().mesh.faces[:0]))
+    kind = learnt.config.input
+    if kind == "picture":
+        assert len(learnt.given(picture).found.rows) == 1
+        with pytest.raises(LumigraphError, match="learnt from pictures"):
+            learnt.given(single(bare))
+    else:
+        with pytest.raises(LumigraphError, match=f"learnt from {kind}"):
+            learnt.given(picture)
+    if kind == "voxels":
+        with pytest.raises(LumigraphError, match="no faces"):
+            learnt.given(single(bare))
+    with pytest.raises(LumigraphError, match="holds 2 shapes"):
+        learnt.given(tiny_shapes.several())
