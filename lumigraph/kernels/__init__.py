@@ -23,6 +23,7 @@ from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize
+from .rasterize_mesh import rasterize_mesh as rasterize_mesh
 from .sample_proposals import Resampling as Resampling
 from .sample_proposals import sample_proposals as sample_proposals
 from .sparse_grid import Nodes as Nodes
