@@ -3,6 +3,8 @@
 from ..system import kernel_cache as kernel_cache
 from ._operation import Engine as Engine
 from ._operation import using as using
+from .antialias import antialias as antialias
+from .antialias import neighbours as neighbours
 from .block_march import Blocks as Blocks
 from .block_march import block_march as block_march
 from .composite import composite as composite

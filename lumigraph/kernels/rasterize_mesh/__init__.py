@@ -45,7 +45,8 @@ def rasterize_mesh(
 
 def cases(generator: torch.Generator):
     """Pictures that every engine must agree on, without pixels that an edge or a tie of depths passes too closely."""
-    for count, size, channels in [(0, (5, 3), 2), (5, (1, 1), 3), (8, (9, 7), 1), (40, (31, 40), 5), (400, (40, 37), 3)]:
+    scenes = [(0, (5, 3), 2), (5, (1, 1), 3), (8, (9, 7), 1), (40, (31, 40), 5), (400, (40, 37), 3)]
+    for count, size, channels in scenes:
         yield _steady(*ball(count, size, generator), size, channels, generator)
     corners, faces = ball(20, (24, 20), generator)
     soup = corners[faces.reshape(-1)] * (0.6 + 0.8 * torch.rand(len(faces) * 3, 1, generator=generator))

@@ -11,7 +11,7 @@ FAULTS = {
     "a column of the box left out": ("gpu", "_range", "- first + 1", "- first"),
     "a mean that is not taken off": ("gpu", "_backward", "g, h, q = g - mean", "g, h, q = g"),
     "depth moves no corner": ("gpu", "_pull", "far * share - share", "0 - share"),
-    "attributes of the first corner": ("gpu", "_backward", "d_attributes + l[:, None]", "d_attributes + i[:, None]"),
+    "attributes of the first corner": ("gpu", "_backward", "d_attributes + m[:, None]", "d_attributes + i[:, None]"),
     "one corner's sums": ("cpu", "_gather", "vertex = faces[f, i]", "vertex = faces[f, 0]"),
 }
 

@@ -97,9 +97,7 @@ def _pixel(buffer, P, width):
 
 
 @triton.jit(do_not_specialize=["P", "width"])
-def _fill(
-    corners, attributes, faces, buffer, values, depth, found, P, width, C: tl.constexpr, CHANNELS: tl.constexpr
-):
+def _fill(corners, attributes, faces, buffer, values, depth, found, P, width, C: tl.constexpr, CHANNELS: tl.constexpr):
     p, here = indices(P, PIXELS)
     key = tl.load(buffer + p, mask=here, other=0)
     seen = here & (key > 0)
@@ -153,14 +151,14 @@ def _backward(
     u, v, w = _at(first, x, y), _at(second, x, y), _at(third, x, y)
     z = 1 / tl.where(seen, u + v + w, 1.0)
     u, v, w = u * z, v * z, w * z
-    i, j, l = n[0].to(tl.int64), n[1].to(tl.int64), n[2].to(tl.int64)
+    i, j, m = n[0].to(tl.int64), n[1].to(tl.int64), n[2].to(tl.int64)
     k = tl.arange(0, CHANNELS)[None, :]
     there = seen[:, None] & (k < C)
     grad = tl.load(to_values + p[:, None] * C + k, mask=there, other=0.0).to(tl.float64)
     far = tl.load(to_depth + p, mask=seen, other=0.0).to(tl.float64)
     g = far * a[2] + tl.sum(grad * tl.load(attributes + i[:, None] * C + k, mask=there, other=0.0), 1)
     h = far * b[2] + tl.sum(grad * tl.load(attributes + j[:, None] * C + k, mask=there, other=0.0), 1)
-    q = far * c[2] + tl.sum(grad * tl.load(attributes + l[:, None] * C + k, mask=there, other=0.0), 1)
+    q = far * c[2] + tl.sum(grad * tl.load(attributes + m[:, None] * C + k, mask=there, other=0.0), 1)
     mean = g * u + h * v + q * w
     g, h, q = g - mean, h - mean, q - mean
     pull = (
@@ -170,10 +168,10 @@ def _backward(
     )
     _pull(d_corners, i, u, pull, far, seen)
     _pull(d_corners, j, v, pull, far, seen)
-    _pull(d_corners, l, w, pull, far, seen)
+    _pull(d_corners, m, w, pull, far, seen)
     _add(d_attributes + i[:, None] * C + k, u[:, None] * grad, there)
     _add(d_attributes + j[:, None] * C + k, v[:, None] * grad, there)
-    _add(d_attributes + l[:, None] * C + k, w[:, None] * grad, there)
+    _add(d_attributes + m[:, None] * C + k, w[:, None] * grad, there)
 
 
 def forward(ctx, corners, attributes, faces, size, near):
