@@ -9,7 +9,12 @@ FAULTS = {
     "a slope that moves nothing": ("cpu", "_to_corners", "-= g * slope", "-= 0 * slope"),
     "the picture's other pixel": ("cpu", "_to_picture", "(y, x) if s > 0", "(y, x) if s < 0"),
     "one triangle is not followed on the gpu": ("gpu", "_follow", "(beyond < 0)", "(beyond < 1000000)"),
-    "a way in for a way out": ("gpu", "_leaves", "(slope < 0) & (here + slope < 0)", "(here + slope < 0)"),
+    "an edge for another": (
+        "gpu",
+        "_follow",
+        "least == p, 0, tl.where(least == q, 1, 2)",
+        "least == p, 1, tl.where(least == q, 0, 2)",
+    ),
     "the sign of a change": ("gpu", "_backward", "-s[:, None] * g", "s[:, None] * g"),
     "ends mistaken": ("gpu", "_backward", "i, a, to_s * (1 - share)", "i, a, to_s * share"),
     "depth of an end": ("gpu", "_move", "(along - slope * across)", "along"),
