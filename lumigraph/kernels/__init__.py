@@ -3,6 +3,8 @@
 from ..system import kernel_cache as kernel_cache
 from ._operation import Engine as Engine
 from ._operation import using as using
+from .antialias import antialias as antialias
+from .antialias import neighbours as neighbours
 from .block_march import Blocks as Blocks
 from .block_march import block_march as block_march
 from .composite import composite as composite
@@ -23,6 +25,7 @@ from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize
+from .rasterize_mesh import rasterize_mesh as rasterize_mesh
 from .sample_proposals import Resampling as Resampling
 from .sample_proposals import sample_proposals as sample_proposals
 from .sparse_grid import Nodes as Nodes

@@ -84,7 +84,7 @@ def _measure(
     first, seconds = _time(forward, inputs[0].device, repeats)
     row = {"forward_per_second": count / seconds, "forward_first_seconds": first}
     if wanted:
-        outputs = forward()
+        outputs = tuple(x for x in forward() if x.requires_grad)
         gradients = [torch.randn_like(x) for x in outputs]  # laid out in memory as the outputs are
 
         def backward() -> tuple[Tensor, ...]:
