@@ -13,7 +13,7 @@ from ...datasets.mesh import Mesh, Texture
 from ...errors import LumigraphError
 from ...system.memory import ask_for
 from ...system.progress import counting
-from ..surface import Faces, Vertices, vertex_normals
+from ..surface import Faces, Triangles, Vertices, vertex_normals
 from .atlas import texels_of, unwrap
 from .colours import View as View
 from .colours import blended, collected, gains, spread_to_unseen
@@ -31,7 +31,7 @@ def textured(
     sources: Sequence[Views],
     tolerance: float,
     size: int,
-    detailed: tuple[Vertices, Faces] | None = None,
+    detailed: Triangles | None = None,
     unseen: Colours | None = None,
 ) -> Mesh:
     """The mesh of a surface with a texture.

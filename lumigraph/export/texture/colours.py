@@ -25,8 +25,8 @@ from .atlas import Texels
 RANKS = 6  # views of a texel that are blended
 SHARPNESS = 2.0  # exponent of a view's score in its weight: larger is sharper, with harder transitions
 FEATHER_PIXELS = 12.0  # from an edge of surface, picture or mask, over which trust grows to 1
-EDGE_TRUST = 1e-3  # of pixels at such an edge, which show something else in part
 METHOD_TOLERANCES = 3.0  # tolerances in front of the mesh, at which the method's own depth is something else's
+DIAGONAL = 1.415  # pixels to a diagonal neighbour, up to which interpolation mixes another surface in
 MIN_COSINE = 0.1  # between the normal and the way to the camera
 MIN_OPACITY = 0.98  # of a pixel whose colour is the surface's alone
 OUTLIER_SIGMA = 0.1  # distance of a colour from the blended one at which its weight is 0.6 times as large
@@ -127,7 +127,7 @@ def trust(view: View, depth: Float[np.ndarray, "height width"], tolerance: float
         steps = ndimage.maximum_filter(depth, 3) - ndimage.minimum_filter(depth, 3) > tolerance
     padded = np.pad(good & ~steps, 1)
     inward = ndimage.distance_transform_edt(padded)[1:-1, 1:-1]
-    return np.where(good, ((inward - 1) / FEATHER_PIXELS).clip(EDGE_TRUST, 1), 0).astype(np.float32)
+    return np.where(good, ((inward - DIAGONAL) / FEATHER_PIXELS).clip(loops.EDGE_TRUST, 1), 0).astype(np.float32)
 
 
 def collected(

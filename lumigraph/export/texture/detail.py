@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
 from ...system.threads import processors
-from ..surface import Faces, Vertices, tangents, vertex_normals
+from ..surface import Faces, Triangles, Vertices, tangents, vertex_normals
 from .atlas import Texels
 
 NEIGHBOURS = 4  # vertices of the detailed mesh that the normal of a texel is interpolated between
@@ -19,7 +19,7 @@ def normal_map(
     mesh: tuple[Vertices, Faces],
     uv: Float[np.ndarray, "vertex 2"],
     normals: Vertices,
-    detailed: tuple[Vertices, Faces],
+    detailed: Triangles,
 ) -> UInt8[np.ndarray, "texel 3"]:
     """Normals of a detailed mesh as bytes, 255 (n + 1) / 2, in each texel's frame of tangent, bitangent and normal.
 

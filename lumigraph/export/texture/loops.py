@@ -6,6 +6,7 @@ import math
 
 from numba import njit, prange
 
+EDGE_TRUST = 1e-3  # in pixels at an edge of the surface, the picture or its mask
 INSIDE = -1e-9  # least barycentric coordinate of a point inside a triangle, for shared edges
 
 
@@ -92,11 +93,12 @@ def collect(texels, pixels, away, quality, rgb, depth, trust, tolerance, view, c
         if not sure > 0 or not quality[i] > 0:
             continue
         left, top, right, below, u, v = corners_of(x, y, height, width)
+        if sure < 2 * EDGE_TRUST:  # the pixels around show something else
+            left = right = int(x)
+            top = below = int(y)
         upper = (1 - u) * depth[top, left] + u * depth[top, right]
         lower = (1 - u) * depth[below, left] + u * depth[below, right]
         surface = (1 - v) * upper + v * lower
-        if not math.isfinite(surface):
-            surface = depth[int(y), int(x)]
         if not abs(surface - away[i]) <= tolerance:
             continue
         n, score, worst = texels[i], sure * quality[i], 0
