@@ -21,7 +21,7 @@ from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidde
 from ..errors import LumigraphError
 from ..geometry import evenly
 from ..method import Method
-from ..method.capabilities import HasDensity, HasField, can, needs
+from ..method.capabilities import HasDensity, can, needs
 from ..system.progress import counting, track
 from ..system.work import at_work
 from .surface import (
@@ -37,7 +37,7 @@ from .surface import (
     vertex_normals,
     zero_level,
 )
-from .texture import Colours, Views, check_room, photographed, rendered, textured
+from .texture import Views, check_room, photographed, rendered, textured
 
 DEFAULT_CELLS = 256  # default, along the longest side of the box
 OPEN_BOX = 1.5  # times the box of interest, for rooms and open scenes
@@ -139,8 +139,7 @@ def extract_mesh(
         if photographs is not None:
             chosen = evenly(range(len(cameras)), views)
             sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
-        unseen = field_colours(method) if can(method, HasField) else None
-        return textured((vertices, triangles), sources, HIDDEN_CELLS * grid.cell, texture, detailed, unseen)
+        return textured((vertices, triangles), sources, HIDDEN_CELLS * grid.cell, texture, detailed)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
@@ -234,18 +233,6 @@ def surface_level(method: Method, depth_maps: Sequence[DepthMap], holds: Holds) 
     found = found[:: max(1, len(found) // POINTS_PER_CHUNK)]
     at_depth = float(needs(method, HasDensity).density(found.to(method.device)).median())
     return at_depth * math.log(1 - ONSET_SHARE) / math.log(0.5)
-
-
-def field_colours(method: Method) -> Colours:
-    """A function of points and normals of a surface: the field's colours, seen from straight above."""
-
-    def colours(points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        pairs = zip(points.split(POINTS_PER_CHUNK), normals.split(POINTS_PER_CHUNK), strict=True)
-        field = needs(method, HasField).field
-        found = [field(x.to(method.device), -n.to(method.device))[1].cpu().float() for x, n in pairs]
-        return torch.cat([points[:0], *found])
-
-    return colours
 
 
 def at_probes(value: Value, grid: Grid, step: int) -> Float[Tensor, "i j k"]:

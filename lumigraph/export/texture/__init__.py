@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from ...datasets.mesh import Mesh, Texture
 from ...errors import LumigraphError
@@ -23,7 +21,6 @@ from .detail import normal_map
 
 BYTES_PER_TEXEL = 200  # while a texture is made
 Views = Callable[[float], Iterable[View]]  # pictures, by the length between neighbouring texels in scene units
-Colours = Callable[[Float[Tensor, "point 3"], Float[Tensor, "point 3"]], Float[Tensor, "point 3"]]
 
 
 def textured(
@@ -32,7 +29,6 @@ def textured(
     tolerance: float,
     size: int,
     detailed: Triangles | None = None,
-    unseen: Colours | None = None,
 ) -> Mesh:
     """The mesh of a surface with a texture.
 
@@ -40,8 +36,7 @@ def textured(
     tolerance: depth behind the first surface of a picture at which a texel still counts as seen, scene units
     size:      of the texture, texels a side
     detailed:  the surface before its decimation, for a normal map
-    unseen:    colours by points and normals, where no picture shows the surface; None for those of the nearest texels
-    Raises LumigraphError for a surface without triangles or with vertices that are not finite, and for a texture that
+    Texels that no picture shows take the colours of the nearest in space. Raises LumigraphError for a surface without triangles or with vertices that are not finite, and for a texture that
     does not fit into memory.
     """
     vertices, faces = surface
@@ -63,11 +58,7 @@ def textured(
         if samples.known.any():
             rgb[left], known[left] = blended(samples, gains(samples)), samples.known
     with counting("Colouring what no picture shows"):
-        if unseen is not None:
-            there = (torch.from_numpy(x[~known]) for x in (points, facing))
-            rgb[~known] = unseen(*there).clamp(0, 1).numpy()
-        else:
-            rgb = spread_to_unseen(rgb, points, known)
+        rgb = spread_to_unseen(rgb, points, known)
     with counting("Taking detail from the surface"):
         picture = texels.picture(np.rint(255 * rgb).astype(np.uint8))
         detail = None
