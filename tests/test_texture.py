@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+import plyfile
 import pytest
 import torch
 import trimesh
@@ -21,15 +23,19 @@ from textured import bilinear
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import OpenCV
+from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.scene import Frame, GeographicOrigin
 from lumigraph.depth_maps import DepthMap
 from lumigraph.errors import LumigraphError
+from lumigraph.export.collision import convex_pieces
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.surface import tangents, vertex_normals
 from lumigraph.export.texture import View, textured
 from lumigraph.export.texture.atlas import texels_of, unwrap
 from lumigraph.export.texture.colours import RANKS, Samples, first_surface, gains
 from lumigraph.export.texture.detail import normal_map
+from lumigraph.run import Run
 
 pytestmark = budget("exports", 12)
 
@@ -313,3 +319,58 @@ def test_a_ply_holds_no_texture(detailed_cube, tmp_path):
     with pytest.raises(LumigraphError, match=r"cube\.ply cannot hold a texture"):
         write_mesh(tmp_path / "cube.ply", detailed_cube)
     assert names(tmp_path) == []
+
+
+# The unit of exports, and convex pieces
+
+
+def test_one_known_length_scales_every_export_of_a_run(ball_run, tmp_path, capsys):
+    """Two points 0.5 apart in the photographs' frame, which are 3 m apart; again, and the run is the same."""
+    folder = shutil.copytree(ball_run.folder, tmp_path / "run")
+    options = ["--device", "cpu", "--views", "9"]
+    known = ["--scale-by", "0", "0.1", "0", "0.3", "0.1", "0.4", "3"]
+    plain, metric, again = (tmp_path / name for name in ("plain.ply", "metric.ply", "again.ply"))
+    assert main(["export", "points", str(folder), str(plain), "--count", "300", *options]) == 0
+    for path in (metric, again):
+        assert main(["export", "points", str(folder), str(path), "--count", "300", *known, *options]) == 0
+    a, b, c = (np.asarray(trimesh.load(path).vertices) for path in (plain, metric, again))
+    np.testing.assert_allclose(b, 6 * a, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(b, c)
+    run = Run(folder)
+    assert run.frame.scale == pytest.approx(6) and run.frame.to_source.matrix.equal(ball_run.frame.to_source.matrix)
+    assert len(run.scene()) and Run(folder).frame.scale == pytest.approx(6)  # its photographs still fit
+    assert main(["export", "points", str(folder), str(plain), "--scale-by", *"0 0 0 0 0 0 1".split()]) == 2
+    assert "one point twice" in capsys.readouterr().err
+
+
+def test_a_position_on_earth_is_carried_along(detailed_cube, tmp_path):
+    origin = GeographicOrigin(50.087, 14.421, 230.5)
+    frame = Frame.from_json(json.loads(json.dumps(Frame(origin=origin, scale=2.0).to_json())))
+    assert frame.origin == origin and frame.scale == 2
+    write_mesh(tmp_path / "cube.glb", detailed_cube, origin=origin)
+    about, _ = parts_of(tmp_path / "cube.glb")
+    said = about["nodes"][1]["extras"]
+    assert said["origin"] == origin.to_json() and "WGS 84" in said["reference"]
+    write_mesh(tmp_path / "cube.ply", replace(detailed_cube, texture=None), origin=origin)
+    assert origin.sentence in plyfile.PlyData.read(tmp_path / "cube.ply").comments
+    assert len(trimesh.load(tmp_path / "cube.ply", process=False).faces) == 12
+
+
+def test_convex_pieces_cover_an_angle(tmp_path):
+    """Two boxes at a right angle: two convex pieces, as large as the boxes, beside the mesh in one file."""
+    pytest.importorskip("coacd")
+    outline = np.array([[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], np.float64)
+    vertices = np.concatenate([np.pad(outline, [(0, 0), (0, 1)], constant_values=z) for z in (0, 1)])
+    lid = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    a, b = np.arange(6), np.roll(np.arange(6), -1)
+    sides = np.concatenate([np.stack([a, b, b + 6], -1), np.stack([a, b + 6, a + 6], -1)])
+    mesh = Mesh(vertices, np.concatenate([lid[:, ::-1], lid + 6, sides]), np.full((12, 3), 160, np.uint8))
+    pieces = convex_pieces(mesh, 0.05)
+    hulls = [trimesh.Trimesh(*piece) for piece in pieces]
+    assert len(pieces) == 2 and all(hull.is_convex and hull.is_watertight for hull in hulls)
+    assert sum(hull.volume for hull in hulls) == pytest.approx(5, rel=0.05)
+    assert len(convex_pieces(mesh, 0.05, 1)) == 1
+    write_mesh(tmp_path / "angle.glb", mesh, pieces={f"UCX_source_{i:02}": piece for i, piece in enumerate(pieces)})
+    scene = trimesh.load_scene(tmp_path / "angle.glb", process=False)
+    assert set(scene.graph.nodes_geometry) == {"source", "UCX_source_00", "UCX_source_01"}
+    np.testing.assert_allclose(scene.bounds, [[0, 0, -3], [3, 1, 0]], atol=0.05)  # upright, as the mesh itself

@@ -36,8 +36,8 @@ def textured(
     tolerance: depth behind the first surface of a picture at which a texel still counts as seen, scene units
     size:      of the texture, texels a side
     detailed:  the surface before its decimation, for a normal map
-    Texels that no picture shows take the colours of the nearest in space. Raises LumigraphError for a surface without triangles or with vertices that are not finite, and for a texture that
-    does not fit into memory.
+    Texels that no picture shows take the colours of the nearest in space. Raises LumigraphError for a surface without
+    triangles or with vertices that are not finite, and for a texture that does not fit into memory.
     """
     vertices, faces = surface
     check_surface(vertices, faces)
