@@ -48,6 +48,8 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "export splats, levels of detail": ("export splats gs city --lod", ("city/",)),
     "export snerg": ("export snerg gs atlas", ("atlas/",)),
     "export mesh": ("export mesh ball m.glb", ("m.glb",)),
+    "export mesh, with a texture": ("export mesh ball m.obj --texture", ("m.obj", "m.mtl", "m.png", "m-normals.png")),
+    "export collision": ("export collision ball c.glb", ("c.glb",)),
     "export panorama": ("export panorama ball sphere.png", ("sphere.png",)),
     "export stereo": ("export stereo ball eyes.jpg", ("eyes.jpg",)),
     "clean": ("clean gs --output some.ply", ("some.ply", "some.ply.png")),

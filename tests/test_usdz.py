@@ -13,7 +13,8 @@ from listing import names
 from PIL import Image
 
 from lumigraph.datasets.mesh import Mesh
-from lumigraph.export.mesh_file import ALIGNMENT_BYTES, baked, write_mesh, z_curve
+from lumigraph.export.mesh_file import write_mesh
+from lumigraph.export.usdz import ALIGNMENT_BYTES, baked, z_curve
 
 UP = np.array([0.6, 0.0, 0.8])
 

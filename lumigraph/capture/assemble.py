@@ -101,6 +101,7 @@ def assemble(
         image_count=len(images),
         source_from_scene=tuple((a, b, c, d) for a, b, c, d in np.linalg.inv(matrix).tolist()),
         times=span(cameras.time),
+        origin=capture.origin,
     )
     if frame.is_open and capture.around is None:
         train = splits["train"]

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ..camera.lens import Lens
+from ..datasets.scene import GeographicOrigin
 
 Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha last, colours not multiplied by it
 
@@ -93,6 +94,7 @@ class Capture:
     background: colour behind everything
     up:       which way is up, source's frame, any length
     around:   of a part of a larger capture, centre and half-size of its box of interest, source's frame and units
+    origin:   of the source's frame on Earth; its axes then point east, north and up, in metres
     notes:     what its user should know, one sentence each
     kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
@@ -109,6 +111,7 @@ class Capture:
     background: tuple[float, float, float] | None = None
     up: tuple[float, float, float] | None = None
     around: tuple[tuple[float, float, float], float] | None = None
+    origin: GeographicOrigin | None = None
     notes: list[str] = field(default_factory=list)
     kept: bool = False
 

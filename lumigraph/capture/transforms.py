@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
 from ..files import is_file, read_json
 from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
@@ -23,6 +24,7 @@ from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, reductions, upright_size, versions
 from .points import SparsePoints, read_ply, similarity
 
+RESULT_FILE = "capture.json"  # of a folder that `lumigraph capture` made
 EXPECTED_FILES = "transforms.json (instant-ngp, nerfstudio)"
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # signs of the camera's axes
 NGP_SCALE = 0.33  # instant-ngp's unit cube is 1 / 0.33 of the file's units wide
@@ -60,14 +62,30 @@ class Whole:
 
 
 @dataclass(frozen=True)
+class Placed:
+    """Field `gps` of capture.json: whether the axes point east, north and up, in metres, and of what origin."""
+
+    used: bool = False
+    origin: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Made:
-    """Fields of capture.json: the source of a scene, the name of its making, the messages about it, and photographs
-    without a pose with the reason."""
+    """Fields of capture.json: the source of a scene, the name of its making, the messages about it, photographs
+    without a pose with the reason, and its position on Earth."""
 
     sources: list[str] = field(default_factory=list)
     key: str = ""
     warnings: list[str] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
+    gps: Placed | None = None
+
+    @property
+    def origin(self) -> GeographicOrigin | None:
+        """Origin of the frame on Earth, if GPS has determined it."""
+        if self.gps is None or not self.gps.used or self.gps.origin is None:
+            return None
+        return GeographicOrigin(*self.gps.origin)
 
 
 @dataclass(frozen=True)
@@ -126,14 +144,11 @@ def read(folder: Path) -> Capture:
     if whole.up is not None and not any(whole.up):
         raise LumigraphError(f'{path}: "up" points nowhere; correct it or remove it')
     cloud = {} if points is None else vars(points)
-    return Capture(str(folder), shots, missing=missing, reach=reach, up=whole.up, notes=folded(folder), **cloud)
-
-
-def folded(folder: Path) -> list[str]:
-    """Folds that `lumigraph capture` reported, if it made the folder, from the matches of photographs."""
-    path = folder / "capture.json"
-    said = read_json(path, Made).warnings if path.is_file() else []
-    return [f"{folder}: {warning}" for warning in said if "folded" in warning]
+    made = read_json(folder / RESULT_FILE, Made) if (folder / RESULT_FILE).is_file() else Made()
+    folded = [f"{folder}: {warning}" for warning in made.warnings if "folded" in warning]
+    return Capture(
+        str(folder), shots, missing=missing, reach=reach, up=whole.up, origin=made.origin, notes=folded, **cloud
+    )
 
 
 def read_frames_file(path: Path) -> tuple[Whole, Json]:

@@ -18,6 +18,8 @@ from .options import (
     DeviceOption,
     Keeping,
     Overwrite,
+    PhotographsOption,
+    Scaling,
     Set,
     SourceOption,
     controlled,
@@ -28,11 +30,12 @@ from .options import (
 )
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
+TEXTURED = 50_000  # triangles whose texture holds the finer detail
 
 
 @dataclass(frozen=True)
 class ExportMesh:
-    """Export a triangle mesh with vertex colours, in the frame of the photographs or upright.
+    """Export a triangle mesh with vertex colours or a texture, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
     with distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene
@@ -59,9 +62,16 @@ class ExportMesh:
     smooth: Annotated[int, between(0, 1000), option("N")] = 10
     """Rounds of smoothing; more round off detail, 0 is none."""
     faces: Annotated[
-        Annotated[int, between(4, 1_000_000_000)] | None, option("N", f"all, for phones {FOR_PHONES:,}")
+        Annotated[int, between(4, 1_000_000_000)] | None,
+        option("N", f"all, for phones {FOR_PHONES:,}, with --texture {TEXTURED:,}"),
     ] = None
     """Number of triangles after simplification; fewer make a smaller file."""
+    texture: bool = False
+    """Give the mesh a texture and a normal map (.glb, .obj, .usdz), from the photographs where they are at hand."""
+    texture_size: Annotated[int, between(64, 32_768), option("TEXELS")] = 2048
+    """Width and height of the texture; larger shows finer print, and takes more memory and a larger file."""
+    lit: bool = False
+    """Let lights of a viewer act on a textured mesh; otherwise it shines in the photographs' own light."""
     keep: Annotated[Share, option("SHARE")] = 0.01
     """Smallest piece to keep, as a share of the largest one's area; larger removes more fragments."""
     unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
@@ -69,25 +79,37 @@ class ExportMesh:
     size: Annotated[Pixels, option("PIXELS")] = 400
     """Longer side of the pictures for colours and depth, at most that of the photographs; larger is finer, slower."""
     views: Annotated[Count, option("N")] = 64
-    """Largest number of these pictures."""
+    """Largest number of these pictures, and of photographs for a texture."""
+    scene: PhotographsOption = None
     overwrite: Overwrite = False
+    scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
     device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ..export.mesh import extract_mesh
-        from ..export.mesh_file import ending, write_mesh
+        from ..export.mesh_file import files_of, write_mesh
 
-        for_phones = ending(self.output) == ".usdz"
-        claim(self.output, "mesh", self.overwrite, [self.source])
-        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        for path in files_of(self.output, self.texture):
+            claim(path, "mesh", self.overwrite, [self.source])
+        opened, mesh = self.extracted()
+        up = opened.frame.to_source.rotation[:, 2].numpy()
+        written = write_mesh(self.output, mesh, up, lit=self.lit, origin=opened.frame.origin)
+        show(self.rows(opened, mesh, written))
+        return 0
+
+    def extracted(self) -> tuple[Any, Any]:
+        """The opened source, and its mesh in the frame of exports."""
+        from ..export.mesh import extract_mesh
+
+        for_phones = self.output.suffix.lower() == ".usdz" and not self.texture
+        opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
         mesh = extract_mesh(
             self.part.without_floaters(method, opened),
             opened.survey(cameras["train"]),
             extent=self.extent,
             crop=self.part.crop(opened.frame),
-            cell=None if self.cell_size is None else self.cell_size / opened.frame.to_source.scale,
+            cell=None if self.cell_size is None else self.cell_size / opened.frame.to_export.scale,
             level=self.level,
             way=self.way,
             smooth=self.smooth,
@@ -96,22 +118,44 @@ class ExportMesh:
             closed=None if self.unseen is None else self.unseen == "close",
             size=self.size,
             views=self.views,
-        ).in_source(opened.frame)
-        write_mesh(self.output, mesh, opened.frame.to_source.rotation[:, 2].numpy())
+            texture=self.texture_size if self.texture else None,
+            photographs=self.photographs(opened) if self.texture else None,
+        )
+        return opened, mesh.in_source(opened.frame)
+
+    def photographs(self, opened: Any) -> Any:
+        """The photographs of a run; None, with a warning, where they are gone. Raises LumigraphError if they are not
+        where --scene says."""
+        if opened.open_scene is None:
+            return None
+        try:
+            return opened.open_scene(self.scene)
+        except LumigraphError as error:
+            if self.scene is not None:
+                raise
+            warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
+            return None
+
+    def rows(self, opened: Any, mesh: Any, written: list[Path]) -> dict[str, str]:
+        """Results for the terminal. written: files"""
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        frame = "in the frame of the photographs"
+        frame += f", times {opened.frame.scale:.6g}" if opened.frame.scale != 1 else ""
         rows = {
-            "file": str(self.output),
+            "file": "\n".join(map(str, written)),
             "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
-            "extent": " x ".join(f"{x:.4g}" for x in high - low) + " in the frame of the photographs",
-            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+            "extent": " x ".join(f"{x:.4g}" for x in high - low) + f" {frame}",
+            "size": f"{sum(file.stat().st_size for file in written) / 1e6:.1f} MB",
         }
-        show(rows)
-        return 0
+        return rows | ({"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {})
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
+        from ..export.mesh_file import ending
+
         if self.extent is not None and self.part.crops:
             raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
+        ending(self.output, self.texture)
 
 
 @dataclass(frozen=True)
@@ -157,6 +201,7 @@ class ExportSplats:
     """The new file."""
     detail: OmitArgPrefixes[Levels] = Levels()
     overwrite: Overwrite = False
+    scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
 
@@ -172,6 +217,7 @@ class ExportSplats:
         claim_splats(output, self.overwrite, [self.source])
         detail = Detail(**self.detail.given)
         if is_splat_file(self.source):
+            self.scaling.remember(open_any(self.source))
             if self.settings:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
             written = read_gaussians(self.source)
@@ -181,11 +227,12 @@ class ExportSplats:
                 written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source), frame, None)
         else:
             opened = open_any(self.source)
+            self.scaling.remember(opened)
             method = controlled(opened, opened.method(), self.settings)
             gaussians = needs(method, HasGaussians).gaussians()
             crop = self.part.crop(method.frame)
             gaussians = self.part.of_gaussians(gaussians, crop, method.frame, photographers(opened, method))
-            written = gaussians.transformed(method.frame.to_source.matrix)
+            written = gaussians.transformed(opened.frame.to_export.matrix)
         write_gaussians(output, written, detail)
         size = size_of(output)
         rows = {
@@ -252,6 +299,7 @@ class ExportPoints:
     views: Annotated[Count, option("N")] = 64
     """Largest number of these pictures."""
     overwrite: Overwrite = False
+    scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
     device: DeviceOption = "auto"
@@ -262,11 +310,11 @@ class ExportPoints:
         claim(self.output, "points", self.overwrite, [self.source])
         from ..export.points import extract_points, write_points
 
-        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
         seers = opened.survey(cameras["train"])
         method, crop = self.part.without_floaters(method, opened), self.part.crop(opened.frame)
         points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
-        write_points(self.output, points)
+        write_points(self.output, points, opened.frame.origin)
         rows = {
             "file": str(self.output),
             "points": f"{len(points.positions):,}",
@@ -381,7 +429,7 @@ class ExportStereo(SphereExport):
         from ..export.panorama import EYE_DISTANCE_SHARE, save_sphere, stereo_pair, surrounding_distances, top_bottom
 
         opened, method, place, heading, where = self.opened()
-        unit = opened.frame.to_source.scale
+        unit = opened.frame.to_export.scale
         near, middle = surrounding_distances(method, place, heading)
         apart = EYE_DISTANCE_SHARE * middle if self.interpupillary is None else self.interpupillary / unit
         if apart > near:
@@ -401,8 +449,47 @@ class ExportStereo(SphereExport):
         return 0
 
 
+PIECE_NAMES = {"unreal": "UCX_{name}_{number:02}", "godot": "{name}_{number:02}-convcolonly"}
+
+
+@dataclass(frozen=True)
+class ExportCollision(ExportMesh):
+    """Export a mesh for game engines, with convex pieces that stand for its shape in collisions, as one .glb.
+
+    The pieces are meshes of their own beside the mesh, named as an engine expects. The options are those of
+    `lumigraph export mesh`.
+    """
+
+    engine: Literal["unreal", "godot"] = "unreal"
+    """Names of the pieces: UCX_name_00 for Unreal Engine, name_00-convcolonly for Godot."""
+    concavity: Annotated[float, between(0.01, 1), option("SHARE")] = 0.05
+    """Largest concavity of a piece, as a share of the mesh's size; smaller makes more pieces that fit better."""
+    pieces: Annotated[Annotated[int, between(1, 1000)] | None, option("N", "as many as the concavity needs")] = None
+    """Largest number of pieces."""
+
+    def run(self) -> int:
+        from ..export.collision import convex_pieces
+        from ..export.mesh_file import write_mesh
+
+        claim(self.output, "mesh", self.overwrite, [self.source])
+        opened, mesh = self.extracted()
+        found = convex_pieces(mesh, self.concavity, self.pieces)
+        named = {PIECE_NAMES[self.engine].format(name="source", number=i): piece for i, piece in enumerate(found)}
+        up = opened.frame.to_source.rotation[:, 2].numpy()
+        written = write_mesh(self.output, mesh, up, lit=self.lit, origin=opened.frame.origin, pieces=named)
+        rows = {"pieces": f"{len(found)}, {sum(len(faces) for _, faces in found):,} triangles"}
+        show(self.rows(opened, mesh, written) | rows)
+        return 0
+
+    def check(self) -> None:
+        super().check()
+        if self.output.suffix.lower() != ".glb":
+            raise LumigraphError(f"{self.output} should end in .glb, which holds pieces by name; rename it")
+
+
 What = (
-    Annotated[ExportMesh, subcommand("mesh")]
+    Annotated[ExportCollision, subcommand("collision")]
+    | Annotated[ExportMesh, subcommand("mesh")]
     | Annotated[ExportOctree, subcommand("octree")]
     | Annotated[ExportPanorama, subcommand("panorama")]
     | Annotated[ExportPoints, subcommand("points")]

@@ -16,8 +16,16 @@ from ..system.signals import start
 from .export import What
 
 ENDINGS = {"mesh": ".glb", "octree": ".npz", "panorama": ".jpg", "points": ".ply", "snerg": "", "splats": ".spz"}
-ENDINGS |= {"stereo": ".jpg", "web": ".html"}
-ELSEWHERE = ("source", "output", "overwrite", "part", "settings", "device")  # fields that the viewer sets otherwise
+ENDINGS |= {"collision": ".glb", "stereo": ".jpg", "web": ".html"}
+ELSEWHERE = (
+    "source",
+    "output",
+    "overwrite",
+    "scene",
+    "part",
+    "settings",
+    "device",
+)  # fields that the viewer sets otherwise
 
 
 def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) -> Any:

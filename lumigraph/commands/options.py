@@ -3,6 +3,7 @@ floaters (--box, --sphere, --clean)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,13 +55,17 @@ ANIMATE = "Change a control from A to B over the film, or on to C with A:B:C. Ca
 Animate = UseAppendAction[Annotated[tuple[str, ...], needed("NAME=A:B", ANIMATE, "animate")]]
 
 
-def open_method(source: Any, device: str, settings: Iterable[str] = ()) -> tuple[Any, Any, Any]:
+def open_method(
+    source: Any, device: str, settings: Iterable[str] = (), scaling: Scaling | None = None
+) -> tuple[Any, Any, Any]:
     """The opened run or file, its method with the controls of --set, and the cameras of its photographs by split, as
-    the method has refined them."""
+    the method has refined them. scaling: of --scale-by, which a run remembers"""
     from ..run import open_any
     from .common import choose_device
 
     opened = open_any(source)
+    if scaling is not None:
+        scaling.remember(opened)
     method = controlled(opened, opened.method(choose_device(device)), settings)
     return opened, method, {split: method.refined(cameras) for split, cameras in opened.cameras().items()}
 
@@ -122,6 +127,25 @@ def numbers(opened: Any) -> dict[str, str]:
 
 Six = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
 Four = tuple[Coordinate, Coordinate, Coordinate, Positive]
+Seven = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Positive]
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """The unit of exports, by one known length."""
+
+    scale_by: Annotated[Seven | None, option("X0 Y0 Z0 X1 Y1 Z1 LENGTH", "the scale that the run remembers")] = None
+    """Two points in the frame of the photographs, and their distance in the unit that exports shall have."""
+
+    def check(self) -> None:
+        """Raises LumigraphError for two points in one place."""
+        if self.scale_by is not None and self.scale_by[:3] == self.scale_by[3:6]:
+            raise LumigraphError("--scale-by names one point twice; give two points, and the distance between them")
+
+    def remember(self, opened: Any) -> None:
+        """Set the scale of an opened run, once and for all exports. Raises LumigraphError for what remembers none."""
+        if self.scale_by is not None:
+            opened.set_scale(self.scale_by[6] / math.dist(self.scale_by[:3], self.scale_by[3:6]))
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,32 @@ from .scene import Frame
 
 
 @dataclass(frozen=True)
+class Texture:
+    """Pictures of a surface.
+
+    uv:      place of each vertex: (0, 0) is the upper left corner of the pictures, (1, 1) the lower right one
+    colours: sRGB-encoded
+    normals: 255 (n + 1) / 2 of unit normals n in the frame of tangent (growing u), bitangent (upwards in the picture)
+             and the mesh's own normal; None where there is no further detail
+    """
+
+    uv: Float[np.ndarray, "vertex 2"]
+    colours: UInt8[np.ndarray, "height width 3"]
+    normals: UInt8[np.ndarray, "height width 3"] | None = None
+
+
+@dataclass(frozen=True)
 class Mesh:
     """Triangles with a colour at each vertex, anticlockwise seen from outside.
 
-    vertices: in the frame that its maker states
+    vertices: in the frame that its maker states; split where parts of a texture end
     colours:  sRGB-encoded
     """
 
     vertices: Float[np.ndarray, "vertex 3"]
     faces: Int[np.ndarray, "face 3"]
     colours: UInt8[np.ndarray, "vertex 3"]
+    texture: Texture | None = None
 
     def transformed(self, similarity: Float[np.ndarray, "4 4"]) -> Mesh:
         """The same mesh in another frame, x' = M x. A mirroring turns the triangles, so that outside stays outside."""
@@ -30,5 +46,5 @@ class Mesh:
         return replace(self, vertices=vertices, faces=faces)
 
     def in_source(self, frame: Frame) -> Mesh:
-        """From the scene's frame to that of the capture."""
-        return self.transformed(frame.to_source.matrix.numpy())
+        """From the scene's frame to that of the capture, in the unit of exports."""
+        return self.transformed(frame.to_export.matrix.numpy())

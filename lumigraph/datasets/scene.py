@@ -52,6 +52,29 @@ class Forward:
 
 
 @dataclass(frozen=True)
+class GeographicOrigin:
+    """Position on Earth (WGS 84) of the origin of a frame whose axes point east, north and up, in metres.
+
+    latitude, longitude: degrees; altitude: metres above the ellipsoid
+    """
+
+    latitude: Annotated[float, between(-90, 90)]
+    longitude: Annotated[float, between(-180, 180)]
+    altitude: Annotated[float, between(-1e5, 1e5)]
+
+    @property
+    def sentence(self) -> str:
+        """The reference system, for comments in files."""
+        return (
+            f"metres east, north and up of latitude {self.latitude:.8f}, longitude {self.longitude:.8f}, "
+            f"altitude {self.altitude:.2f} m (WGS 84)"
+        )
+
+    def to_json(self) -> dict[str, float]:
+        return asdict(self)
+
+
+@dataclass(frozen=True)
 class Frame:
     """Bounds and frame of a scene, in plain numbers: sufficient to build a method, with or without photographs.
 
@@ -67,6 +90,8 @@ class Frame:
     forward:     of a capture without bounds whose cameras all look one way; None for any other
     times:       first and last moment of a capture whose photographs say when they were taken, in its own unit; None
                  for any other, and where all were taken at once
+    scale:       units of exports to a unit of the capture's frame, by a length that the user knows
+    origin:      of the capture's frame on Earth, where its photographs' GPS has determined it
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -78,6 +103,8 @@ class Frame:
     source_from_scene: tuple[Row, ...] = Similarity.make(1.0).rows
     forward: Forward | None = None
     times: tuple[Coordinate, Coordinate] | None = None
+    scale: Size = 1.0
+    origin: GeographicOrigin | None = None
 
     @property
     def is_open(self) -> bool:
@@ -88,6 +115,11 @@ class Frame:
     def to_source(self) -> Similarity:
         """The way back to the frame that the capture came in."""
         return Similarity.of(self.source_from_scene)
+
+    @property
+    def to_export(self) -> Similarity:
+        """The way to the frame of exports: that of the capture, in the unit of a length that the user knows."""
+        return Similarity.make(self.scale) @ self.to_source
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists; `from_json` turns them back exactly."""

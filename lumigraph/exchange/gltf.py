@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -111,16 +112,24 @@ class Column:
     target: int = VERTICES
 
 
-def encoded(about: dict[str, Any], columns: list[Column]) -> bytes:
-    """A .glb file: `about` and an accessor for each column, in their order. Each begins at a multiple of 4 bytes."""
+def encoded(about: dict[str, Any], columns: list[Column], pictures: Sequence[tuple[str, bytes]] = ()) -> bytes:
+    """A .glb file: `about`, an accessor for each column and an image for each picture, in their order. Each begins at a
+    multiple of 4 bytes.
+
+    pictures: media type and file of each
+    """
     parts = [np.ascontiguousarray(column.numbers).tobytes() for column in columns]
+    parts += [data for _, data in pictures]
     starts = np.cumsum([0, *(len(part) + -len(part) % 4 for part in parts)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": column.target}
-        for start, part, column in zip(starts, parts, columns, strict=False)
+    views: list[dict[str, Any]] = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(part)} for start, part in zip(starts, parts, strict=False)
     ]
+    for view, column in zip(views, columns, strict=False):
+        view["target"] = column.target
     accessors = [_accessor(i, column) for i, column in enumerate(columns)]
     whole = about | {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
+    if pictures:
+        whole["images"] = [{"bufferView": len(columns) + i, "mimeType": kind} for i, (kind, _) in enumerate(pictures)]
     text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     body = CHUNK.pack(len(text), JSON) + text + CHUNK.pack(starts[-1], BINARY)

@@ -16,9 +16,10 @@ from torch.nn.functional import grid_sample
 from ..camera import Camera
 from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
-from ..datasets.scene import Frame
+from ..datasets.scene import Frame, Scene
 from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, render_depth_maps
 from ..errors import LumigraphError
+from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasDensity, HasDistance, can, needs
 from ..system.progress import counting, track
@@ -36,13 +37,16 @@ from .surface import (
     vertex_normals,
     zero_level,
 )
+from .texture import Views, check_room, photographed, rendered, textured
 
 DEFAULT_CELLS = 256  # default, along the longest side of the box
 OPEN_BOX = 1.5  # times the box of interest, for rooms and open scenes
+TEXTURED_FACES = 50_000  # triangles of a mesh with a texture, without another budget
 MIN_CELLS, MAX_CELLS = 8, 2048  # cells along it that make sense
 PROBE_CELLS = 160  # probes along it that locate the surface
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
 TRUNCATION_CELLS = 5  # cells from the surface that depth maps are fused over
+HIDDEN_CELLS = 2  # cells behind the first surface from which on a picture does not show it
 CUT_ROUNDS = 30  # rounds of diffusion in which the line where an open surface is cut becomes even
 INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
@@ -68,6 +72,8 @@ def extract_mesh(
     closed: bool | None = None,
     size: int = 400,
     views: int = 64,
+    texture: int | None = None,
+    photographs: Scene | None = None,
 ) -> Mesh:
     """The surface in the middle of a scene, in the scene's frame.
 
@@ -78,13 +84,18 @@ def extract_mesh(
     level:   density of the surface, per scene unit; None for that where the cameras see surfaces
     way:     "distance", "density", "depth", or "auto" for the first of these that the method has
     smooth:  rounds of smoothing
-    faces:   number of triangles to come down to; None for all
+    faces:   number of triangles to come down to; None for all, or for TEXTURED_FACES with a texture
     keep:    pieces with less than this share of the largest one's area are dropped
     closed:  whether the surface is closed around what no camera sees, or cut there; None closes objects alone
     size:    longer side of the cameras' pictures at most, pixels
     views:   cameras at most
-    Raises LumigraphError where nothing is solid, and for numbers that make no sense.
+    texture: texels a side of a texture; None for colours at vertices alone
+    photographs: the scene whose training split `cameras` are, for the texture; None to take the method's renderings
+    Raises LumigraphError where nothing is solid, where a texture does not fit into memory, and for numbers that make
+    no sense.
     """
+    if texture is not None:
+        check_room(texture)
     method.eval()
     closed = not method.frame.is_open if closed is None else closed
     limits = meshed_box(method.frame, extent) if crop is None else within_reach(method.frame, crop)
@@ -119,10 +130,18 @@ def extract_mesh(
         )
     with counting("Smoothing the surface"):
         vertices = smoothed(vertices, triangles, smooth)
+        detailed = vertices, triangles
+        faces = TEXTURED_FACES if faces is None and texture is not None else faces
         if faces is not None:
             vertices, triangles = simplified(vertices, triangles, faces)
             corners, triangles = manifold(triangles)
             vertices = vertices[corners]
+    if texture is not None:
+        sources: list[Views] = [lambda _: rendered(depth_maps)]
+        if photographs is not None:
+            chosen = evenly(range(len(cameras)), views)
+            sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
+        return textured((vertices, triangles), sources, HIDDEN_CELLS * grid.cell, texture, detailed)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())

@@ -1,254 +1,229 @@
-"""Meshes as files: PLY, OBJ, GLB and USDZ, each with its colours where most programs read them.
-
-USDZ is what phones and tablets open in space. They draw no colours of vertices, so the colours are in a picture: two by
-two texels for each triangle, between whose centres a GPU interpolates as between vertices. The layer in the archive is
-text, so no library of USD is needed.
-"""
+"""Meshes as files: PLY, OBJ, GLB and USDZ, each with its colours or its texture where most programs read them."""
 
 from __future__ import annotations
 
 import io
-import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from string import Template
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 from ..color.srgb import linear_from_srgb
-from ..datasets.mesh import Mesh
+from ..datasets.mesh import Mesh, Texture
+from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
 from ..exchange import gltf
-from ..exchange.codes import morton_order
 from ..files import write_bytes
 from ..geometry import to_quaternion, turning
 from ..system.progress import counting
-from .surface import vertex_normals
-
-ALIGNMENT_BYTES = 64  # of every file's data in the archive (Usdz File Format Specification 1.3, "Layout")
-ZIP_HEADER_BYTES = 30  # bytes of a zip file's header before the name
-PADDING = b"\x19\x86"  # id of an extra field, which readers ignore
-PICTURE = "colours.png"
-
-# Light of its own and no other: the light of the scene is in its colours already. Phones take emission for sRGB.
-LAYER = Template("""#usda 1.0
-(
-    customLayerData = {
-        matrix4d sourceFromUpright = $source
-        string creator = "Lumigraph"
-    }
-    defaultPrim = "Scene"
-    metersPerUnit = 1
-    upAxis = "Y"
-)
-
-def Xform "Scene" (
-    kind = "component"
-)
-{
-    def Mesh "Mesh" (
-        prepend apiSchemas = ["MaterialBindingAPI"]
-    )
-    {
-        uniform bool doubleSided = 1
-        uniform token subdivisionScheme = "none"
-        float3[] extent = [$extent]
-        int[] faceVertexCounts = [$counts]
-        int[] faceVertexIndices = [$corners]
-        point3f[] points = [$points]
-        texCoord2f[] primvars:st = [$places] (
-            interpolation = "faceVarying"
-        )
-        rel material:binding = </Scene/Material>
-    }
-
-    def Material "Material"
-    {
-        token outputs:surface.connect = </Scene/Material/Surface.outputs:surface>
-
-        def Shader "Surface"
-        {
-            uniform token info:id = "UsdPreviewSurface"
-            color3f inputs:diffuseColor = (0, 0, 0)
-            color3f inputs:emissiveColor.connect = </Scene/Material/Colours.outputs:rgb>
-            float inputs:metallic = 0
-            float inputs:roughness = 1
-            token outputs:surface
-        }
-
-        def Shader "Colours"
-        {
-            uniform token info:id = "UsdUVTexture"
-            asset inputs:file = @$picture@
-            token inputs:sourceColorSpace = "sRGB"
-            float2 inputs:st.connect = </Scene/Material/Places.outputs:result>
-            token inputs:wrapS = "clamp"
-            token inputs:wrapT = "clamp"
-            float3 outputs:rgb
-        }
-
-        def Shader "Places"
-        {
-            uniform token info:id = "UsdPrimvarReader_float2"
-            string inputs:varname = "st"
-            float2 outputs:result
-        }
-    }
-}
-""")
-
-
-def usdz(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
-    """A USDZ archive of one mesh, y up, the middle of its base at the origin, a unit of the mesh for a metre.
-
-    upright: the rotation that brings up, in the mesh's frame, to +y
-    """
-    turned = mesh.vertices @ upright.T
-    low, high = turned.min(0), turned.max(0)
-    base = np.array([0.5 * (low[0] + high[0]), low[1], 0.5 * (low[2] + high[2])])
-    source_from_upright = np.eye(4)
-    source_from_upright[:3, :3], source_from_upright[:3, 3] = upright.T, upright.T @ base
-    picture, places = baked(mesh)
-    layer = LAYER.substitute(
-        source=f"({tuples(source_from_upright.T, '%.17g')})",  # USD multiplies rows from the left
-        extent=tuples(np.stack([low, high]) - base),
-        counts=", ".join(["3"] * len(mesh.faces)),
-        corners=", ".join(map(str, mesh.faces.reshape(-1).tolist())),
-        points=tuples(turned - base),
-        places=tuples(places.reshape(-1, 2), "%.6g"),
-        picture=PICTURE,
-    )
-    held = io.BytesIO()
-    Image.fromarray(picture).save(held, "PNG")
-    return archive({"scene.usda": layer.encode(), PICTURE: held.getvalue()})
-
-
-def baked(mesh: Mesh) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "face 3 2"]]:
-    """A picture of the triangles' colours, and where on it their corners are: from its lower left corner, in [0, 1].
-
-    With colours a, b, c at texels (0, 0), (1, 0), (0, 1) and b + c - a at (1, 1), bilinear interpolation is linear.
-    Triangles that are neighbours in space are neighbours on the picture, so that it may be made smaller, too.
-    """
-    count = len(mesh.faces)
-    rank = np.empty(count, np.int64)
-    rank[morton_order(mesh.vertices[mesh.faces].mean(1))] = np.arange(count)
-    x, y = (2 * along for along in z_curve(rank))
-    width, height = int(x.max()) + 2, int(y.max()) + 2
-    a, b, c = np.moveaxis(mesh.colours[mesh.faces].astype(np.int64), 1, 0)
-    picture = np.zeros((height, width, 3), np.uint8)
-    for dx, dy, colour in ((0, 0, a), (1, 0, b), (0, 1, c), (1, 1, (b + c - a).clip(0, 255))):
-        picture[y + dy, x + dx] = colour
-    texels = np.stack([x, y], -1)[:, None] + np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
-    return picture, texels / [width, -height] + [0, 1]
-
-
-def z_curve(rank: Int[np.ndarray, " place"]) -> tuple[Int[np.ndarray, " place"], Int[np.ndarray, " place"]]:
-    """Columns and rows of places along a Z-curve through a square: even and odd bits (Morton 1966)."""
-    x, y = np.zeros_like(rank), np.zeros_like(rank)
-    for bit in range(20):
-        x |= (rank >> 2 * bit & 1) << bit
-        y |= (rank >> 2 * bit + 1 & 1) << bit
-    return x, y
-
-
-def tuples(rows: Iterable[Iterable[float]], form: str = "%.7g") -> str:
-    return ", ".join(f"({', '.join(form % value for value in row)})" for row in np.asarray(rows).tolist())
-
-
-def archive(parts: Mapping[str, bytes]) -> bytes:
-    """A zip archive that holds files as they are, in this order, each beginning at a multiple of 64 bytes."""
-    held = io.BytesIO()
-    with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as packed:
-        for name, data in parts.items():
-            about = zipfile.ZipInfo(name)
-            header = held.tell() + ZIP_HEADER_BYTES + len(name.encode()) + 4
-            room = -header % ALIGNMENT_BYTES
-            about.extra = PADDING + room.to_bytes(2, "little") + bytes(room)
-            packed.writestr(about, data)
-    return held.getvalue()
-
+from .surface import Triangles, tangents, vertex_normals
+from .usdz import png, usdz
 
 Z = np.array([0.0, 0.0, 1.0])
+JPEG_QUALITY = 92  # of a texture's colours in a .glb
+CLAMP_TO_EDGE = 33071  # glTF's sampler: texels beyond the picture
 
 
-def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
-    """Write in the format that the ending names, whole or not at all.
+@dataclass(frozen=True)
+class MeshFile:
+    """A mesh to write, and how.
+
+    name:    of the file, without its ending
+    upright: rotation that brings up, in the mesh's frame, to +y
+    lit:     whether the lights of a viewer act on it; otherwise it shines in its own colours
+    origin:  of the mesh's frame on Earth, where it is known
+    pieces:  further triangles without colours, in the same frame, by name
+    """
+
+    name: str
+    mesh: Mesh
+    upright: Float[np.ndarray, "3 3"]
+    lit: bool = False
+    origin: GeographicOrigin | None = None
+    pieces: Mapping[str, Triangles] = field(default_factory=dict)
+
+    @property
+    def normals(self) -> Float[np.ndarray, "vertex 3"]:
+        """Unit normals at vertices, the same for all copies of a vertex that a texture splits."""
+        if self.mesh.texture is None:
+            return vertex_normals(self.mesh.vertices, self.mesh.faces)
+        places, same = np.unique(self.mesh.vertices, axis=0, return_inverse=True)
+        return vertex_normals(places, same.reshape(-1)[self.mesh.faces])[same.reshape(-1)]
+
+
+def write_mesh(
+    path: Path,
+    mesh: Mesh,
+    up: Float[np.ndarray, " 3"] = Z,
+    *,
+    lit: bool = False,
+    origin: GeographicOrigin | None = None,
+    pieces: Mapping[str, Triangles] | None = None,
+) -> list[Path]:
+    """Write in the format that the ending names, each file whole or not at all. Returns the files.
 
     .ply and .obj, which have no convention for up, are in the frame of the mesh. The other two are
     upright, +y up; a .glb by a node that turns the vertices, which are in the mesh's own frame there too.
 
     up: in the mesh's frame
+    lit: whether the lights of a viewer act on the mesh: the colours already contain the light of the scene
+    origin: of the mesh's frame on Earth, in comments (.ply) or extras (.glb)
+    pieces: further triangles by name, in a .glb alone
     .ply: binary, float32, sRGB-encoded bytes at each vertex
-    .obj: sRGB-encoded colours from 0 to 1 after each vertex, as MeshLab, Blender and others read them
-    .glb: linear colours, float32, and an unlit material, for the light is in the colours already
-    .usdz: a picture of the colours, as `usdz` has it
-    Raises LumigraphError for any other ending.
+    .obj: sRGB-encoded colours from 0 to 1 after each vertex, as MeshLab, Blender and others read them; with a texture
+          its places, and beside it .mtl, .png and -normals.png
+    .glb: linear colours, float32, or a texture inside the file
+    .usdz: a picture of the colours, or the texture, as `usdz` has it
+    Raises LumigraphError for any other ending, and for a texture in a .ply.
     """
-    encode = ENCODERS[ending(path)]
+    encode = ENCODERS[ending(path, mesh.texture is not None)]
     upright = turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 1.0, 0.0])).numpy()
+    parts = encode(MeshFile(path.stem, mesh, upright, lit, origin, pieces or {}))
+    written = [path.with_name(path.stem + end) if end else path for end in parts]
     with counting(f"Writing {path.name}"):
-        write_bytes(path, encode(mesh, upright), "mesh")
+        for file, data in zip(written, parts.values(), strict=True):
+            write_bytes(file, data, "mesh")
+    return written
 
 
-def ending(path: Path) -> str:
+def ending(path: Path, texture: bool = False) -> str:
     """The ending of a mesh's file, in lower case. Raises LumigraphError for one that no mesh has."""
-    if path.suffix.lower() not in ENCODERS:
+    end = path.suffix.lower()
+    if end not in ENCODERS:
         raise LumigraphError(f"{path} does not end like a mesh; name one that ends in {', '.join(ENCODERS)}")
-    return path.suffix.lower()
+    if texture and end == ".ply":
+        raise LumigraphError(f"{path} cannot hold a texture; name one that ends in .glb, .obj or .usdz")
+    return end
 
 
-def ply(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
-    return bytes(as_trimesh(mesh).export(file_type="ply", vertex_normal=True))
+def files_of(path: Path, texture: bool) -> list[Path]:
+    """Every file that may be written for a mesh of this name. Raises LumigraphError as `ending` does."""
+    further = (MATERIAL, PICTURE, NORMALS) if texture and ending(path, texture) == ".obj" else ()
+    return [path, *(path.with_name(path.stem + end) for end in further)]
 
 
-def obj(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
-    text = as_trimesh(mesh).export(file_type="obj", include_normals=True, digits=7, header="written by Lumigraph")
-    return str(text).encode()
+Parts = dict[str, bytes]  # contents of files, by what follows the name without its ending; "" for the file itself
+MATERIAL, PICTURE, NORMALS = ".mtl", ".png", "-normals.png"
 
 
-def glb(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
+def ply(file: MeshFile) -> Parts:
+    data = bytes(as_trimesh(file).export(file_type="ply", vertex_normal=True))
+    first, rest = data.split(b"\n", 2)[:2], data.split(b"\n", 2)[2]
+    comments = ["written by Lumigraph", *([] if file.origin is None else [file.origin.sentence])]
+    return {"": b"\n".join([*first, *(f"comment {text}".encode() for text in comments), rest])}
+
+
+def obj(file: MeshFile) -> Parts:
+    if file.mesh.texture is not None:
+        return textured_obj(file, file.mesh.texture)
+    text = as_trimesh(file).export(file_type="obj", include_normals=True, digits=7, header="written by Lumigraph")
+    return {"": str(text).encode()}
+
+
+def textured_obj(file: MeshFile, texture: Texture) -> Parts:
+    """Text of an OBJ file, of its material, and the pictures that this names. OBJ's v points upwards."""
+    held, numbers = io.StringIO(), np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9)
+    held.write(f"# written by Lumigraph\nmtllib {file.name}{MATERIAL}\nusemtl surface\n")
+    np.savetxt(held, file.mesh.vertices, "v %.9g %.9g %.9g")
+    np.savetxt(held, texture.uv * [1, -1] + [0, 1], "vt %.7g %.7g")
+    np.savetxt(held, file.normals, "vn %.5g %.5g %.5g")
+    np.savetxt(held, numbers, "f " + " ".join(["%d/%d/%d"] * 3))
+    colour = "Kd 1 1 1" if file.lit else "Kd 1 1 1\nKa 0 0 0\nillum 0"
+    lines = ["# written by Lumigraph", "newmtl surface", colour, f"map_Kd {file.name}{PICTURE}"]
+    parts = {"": held.getvalue().encode(), MATERIAL: b"", PICTURE: png(texture.colours)}
+    if texture.normals is not None:
+        parts[NORMALS] = png(texture.normals)
+        lines.append(f"norm {file.name}{NORMALS}")
+    return parts | {MATERIAL: "".join(line + "\n" for line in lines).encode()}
+
+
+def glb(file: MeshFile) -> Parts:
     """A binary glTF 2.0 of one mesh in its own frame, below a node that turns it upright."""
-    columns = [
-        gltf.Column(mesh.vertices.astype("<f4"), bounded=True),
-        gltf.Column(vertex_normals(mesh.vertices, mesh.faces).astype("<f4")),
-        gltf.Column(linear_from_srgb(mesh.colours / 255).astype("<f4")),
-        gltf.Column(mesh.faces.astype("<u4").reshape(-1), target=gltf.INDICES),
-    ]
-    about = {
+    mesh, texture = file.mesh, file.mesh.texture
+    columns = {
+        "POSITION": gltf.Column(mesh.vertices.astype("<f4"), bounded=True),
+        "NORMAL": gltf.Column(file.normals.astype("<f4")),
+    }
+    material: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
+    pictures: list[tuple[str, bytes]] = []
+    if texture is None:
+        columns["COLOR_0"] = gltf.Column(linear_from_srgb(mesh.colours / 255).astype("<f4"))
+    else:
+        columns["TEXCOORD_0"] = gltf.Column(texture.uv.astype("<f4"))
+        pictures.append(("image/jpeg", jpeg(texture.colours)))
+        material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+        if texture.normals is not None:
+            frame = tangents(mesh.vertices, mesh.faces, texture.uv, file.normals)
+            columns["TANGENT"] = gltf.Column(frame.astype("<f4"))
+            pictures.append(("image/png", png(texture.normals)))
+            material["normalTexture"] = {"index": 1}
+    about: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Lumigraph"},
-        "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [
             {
                 "name": "upright",
-                "rotation": to_quaternion(torch.from_numpy(upright)).roll(-1).tolist(),  # glTF has w last
-                "extras": {"source_from_upright": upright.T.tolist()},
+                "rotation": to_quaternion(torch.from_numpy(file.upright)).roll(-1).tolist(),  # glTF has w last
+                "extras": {"source_from_upright": file.upright.T.tolist()},
                 "children": [1],
             },
             {"name": "source", "mesh": 0},
         ],
         "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}]}
-        ],
-        "materials": [
             {
-                "extensions": {"KHR_materials_unlit": {}},
-                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "name": "source",
+                "primitives": [
+                    {
+                        "attributes": {name: i for i, name in enumerate(columns)},
+                        "indices": len(columns),
+                        "material": 0,
+                    }
+                ],
             }
         ],
+        "materials": [material],
     }
-    return gltf.encoded(about, columns)
+    if not file.lit:
+        material["extensions"], about["extensionsUsed"] = {"KHR_materials_unlit": {}}, ["KHR_materials_unlit"]
+    if file.origin is not None:
+        about["nodes"][1]["extras"] = {"reference": file.origin.sentence, "origin": file.origin.to_json()}
+    if pictures:
+        about["samplers"] = [{"wrapS": CLAMP_TO_EDGE, "wrapT": CLAMP_TO_EDGE}]
+        about["textures"] = [{"source": i, "sampler": 0} for i in range(len(pictures))]
+    every = [*columns.values(), gltf.Column(mesh.faces.astype("<u4").reshape(-1), target=gltf.INDICES)]
+    for name, (vertices, faces) in file.pieces.items():
+        about["nodes"][0]["children"].append(len(about["nodes"]))
+        about["nodes"].append({"name": name, "mesh": len(about["meshes"])})
+        primitive = {"attributes": {"POSITION": len(every)}, "indices": len(every) + 1}
+        about["meshes"].append({"name": name, "primitives": [primitive]})
+        every.append(gltf.Column(vertices.astype("<f4"), bounded=True))
+        every.append(gltf.Column(faces.astype("<u4").reshape(-1), target=gltf.INDICES))
+    return {"": gltf.encoded(about, every, pictures)}
 
 
-def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+def jpeg(picture: UInt8[np.ndarray, "height width 3"]) -> bytes:
+    held = io.BytesIO()
+    Image.fromarray(picture).save(held, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return held.getvalue()
+
+
+def as_trimesh(file: MeshFile) -> trimesh.Trimesh:
     """For trimesh, which leaves vertices and their order as they are."""
-    normals = vertex_normals(mesh.vertices, mesh.faces)
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=mesh.colours, process=False)
+    mesh = file.mesh
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, vertex_normals=file.normals, vertex_colors=mesh.colours, process=False
+    )
 
 
-ENCODERS = {".ply": ply, ".obj": obj, ".glb": glb, ".usdz": usdz}
+def phone(file: MeshFile) -> Parts:
+    return {"": usdz(file.mesh, file.normals, file.upright, file.lit)}
+
+
+ENCODERS: dict[str, Callable[[MeshFile], Parts]] = {".ply": ply, ".obj": obj, ".glb": glb, ".usdz": phone}

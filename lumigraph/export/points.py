@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.crop import Crop
-from ..datasets.scene import Frame
+from ..datasets.scene import Frame, GeographicOrigin
 from ..depth_maps import DepthMap, SurfacePoints, Tolerance, render_depth_maps
 from ..errors import LumigraphError
 from ..files import replacing
@@ -40,9 +40,9 @@ class PointCloud:
     colours: UInt8[np.ndarray, "point 3"]
 
     def in_source(self, frame: Frame) -> PointCloud:
-        """From the scene's frame to that of the capture."""
+        """From the scene's frame to that of the capture, in the unit of exports."""
         positions, normals = (torch.from_numpy(x) for x in (self.positions, self.normals))
-        there = frame.to_source
+        there = frame.to_export
         return PointCloud(there.points(positions).numpy(), there.directions(normals).numpy(), self.colours)
 
 
@@ -124,13 +124,17 @@ def cells(
     return ((columns[:, :3] - low) / size).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
 
 
-def write_points(path: Path, points: PointCloud) -> None:
-    """A binary PLY file: x y z, nx ny nz (float32), red green blue (bytes). Raises LumigraphError where it cannot."""
+def write_points(path: Path, points: PointCloud, origin: GeographicOrigin | None = None) -> None:
+    """A binary PLY file: x y z, nx ny nz (float32), red green blue (bytes). Raises LumigraphError where it cannot.
+
+    origin: of the points' frame on Earth, for a comment
+    """
     floats, bytes_ = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
     rows = np.empty(len(points.positions), [*((name, "<f4") for name in floats), *((name, "u1") for name in bytes_)])
     values = np.concatenate([points.positions, points.normals, points.colours], -1)
     for name, column in zip((*floats, *bytes_), values.T, strict=True):
         rows[name] = column
     with replacing(path, "points") as partial, open(partial, "wb") as file:
+        comments = ["written by Lumigraph", *([] if origin is None else [origin.sentence])]
         elements = [plyfile.PlyElement.describe(rows, "vertex")]
-        plyfile.PlyData(elements, byte_order="<", comments=["written by Lumigraph"]).write(file)
+        plyfile.PlyData(elements, byte_order="<", comments=comments).write(file)

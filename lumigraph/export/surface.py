@@ -243,6 +243,24 @@ def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
     return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-30)
 
 
+def tangents(
+    vertices: Vertices, faces: Faces, uv: Float[np.ndarray, "vertex 2"], normals: Vertices
+) -> Float[np.ndarray, "vertex 4"]:
+    """Unit tangents towards growing u, at right angles to the normals, and the sign s of the bitangent s (n x t), which
+    points upwards in the picture. uv: from the picture's upper left corner, as in `Texture`"""
+    (a, b, c), (u, v, w) = vertices[faces].swapaxes(0, 1), (uv * [1, -1])[faces].swapaxes(0, 1)
+    (du, dv), (eu, ev) = (v - u).T[:, :, None], (w - u).T[:, :, None]
+    turned = np.sign(du * ev - eu * dv)
+    along = turned * (ev * (b - a) - dv * (c - a))
+    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
+    weighted = np.hstack([along, turned]) * np.linalg.norm(face_normals(vertices, faces), axis=-1, keepdims=True)
+    total = np.stack([np.bincount(faces.ravel(), np.repeat(x, 3), len(vertices)) for x in weighted.T], -1)
+    total[:, :3] -= (total[:, :3] * normals).sum(-1, keepdims=True) * normals
+    total[:, :3] /= np.maximum(np.linalg.norm(total[:, :3], axis=-1, keepdims=True), 1e-30)
+    total[:, 3] = np.where(total[:, 3] < 0, -1, 1)
+    return total
+
+
 def face_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "face 3"]:
     """Normals of faces: outward, as long as twice the area."""
     a, b, c = vertices[faces].swapaxes(0, 1)

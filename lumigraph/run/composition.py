@@ -330,7 +330,16 @@ def canonical_frame(frame: Frame, scale: float, bounds: tuple[Vector, Vector]) -
         farthest = max(farthest, frame.reach * scale)
     reach = 2.0 ** math.ceil(math.log2(max(farthest, 1.0)))
     rows = Similarity.make(1.0).rows
-    return replace(frame, bounds=bounds, reach=reach, near=frame.near * scale, source_from_scene=rows, forward=None)
+    return replace(
+        frame,
+        bounds=bounds,
+        reach=reach,
+        near=frame.near * scale,
+        source_from_scene=rows,
+        forward=None,
+        scale=1.0,
+        origin=None,
+    )
 
 
 def write_canonicalised(

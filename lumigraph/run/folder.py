@@ -131,6 +131,11 @@ class Run(Trained):
         self.settings = replace(self.settings, budget=budget)
         self.settings.write(self._config)
 
+    def set_scale(self, scale: float) -> None:
+        self.frame = replace(self.frame, scale=scale)
+        self.settings = replace(self.settings, frame=self.frame)
+        self.settings.write(self._config)
+
     # What was trained on what
 
     @property
@@ -198,7 +203,7 @@ class Run(Trained):
             names = read_cameras(self._cameras).names
             options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
-        if not alike(self.frame.to_json(), data.frame.to_json()):
+        if not alike(replace(self.frame, scale=1.0).to_json(), data.frame.to_json()):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"
             raise LumigraphError(f"{source} is not what {self.folder} was trained on: {what}; train a new run on it")
         if isinstance(data, Scene):

@@ -12,6 +12,7 @@ import torch
 from ..camera import Camera, dome, ring
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
+from ..errors import LumigraphError
 from ..exchange import size_of
 from ..gaussians import Gaussians
 from ..method import Method
@@ -86,6 +87,12 @@ class Opened(ABC):
     def survey(self, cameras: Camera) -> Camera:
         """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
         return cameras if self.photographed else dome(cameras)
+
+    def set_scale(self, scale: float) -> None:
+        """Remember the scale of exports: see `Frame.scale`. Raises LumigraphError for what remembers none."""
+        raise LumigraphError(
+            f"{self.path} remembers no scale, as a run does; export from the run, or scale the result in its program"
+        )
 
     def metrics(self) -> list[dict[str, Any]]:
         """Training metrics, one row every few steps; empty where unknown."""

@@ -23,9 +23,9 @@ from ..photos.photo import Track
 from ..pictures import list_images, read_grey
 from ..raw import RAW_FILE
 from ..transforms import OPENCV_FROM_OPENGL, Made
+from ..transforms import RESULT_FILE as RESULT_FILE
 
 WORK_FOLDER = "work"
-RESULT_FILE = "capture.json"
 SOURCES_FILE = "sources.json"  # inside WORK_FOLDER: the sources of the folder
 POINTS_FILE = "points.ply"
 DRAWING_FILES = "capture.png", "photographs.png"
