@@ -1,11 +1,12 @@
-"""3D Gaussian Splatting: a scene as a cloud of soft, coloured ellipsoids (Kerbl et al. 2023, arXiv 2308.04079)."""
+"""CloudMethod: a method whose scene is a cloud of Gaussians that learns from one photograph a step (Kerbl 2023)."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from abc import ABC
+from dataclasses import replace
 from functools import cache, partial
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,61 +16,21 @@ from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
-from ...components.clouds.dense_points import compile_sweep, seen_points
-from ...components.clouds.moved_cloud import seen_from
-from ...components.fields.teacher import teacher_of
-from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
-from ...errors import LumigraphError
-from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
 from ...method.capabilities import ColourPairs
-from .adaptive import AdaptiveDensity, AdaptiveNumbers
+from ..fields.teacher import teacher_of
+from ..training.pose_refinement import PoseRefinement
 from .addition import Addition, Step
-from .appearance import AppearanceNumbers, SplatAppearance
-from .cloud import Cloud, RateNumbers, picture_share, thinned
-from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
-from .few_views import FewViewNumbers, FewViews
-from .initialization import Initialization, cloud_of, initial_cloud, random_cloud, surface_cloud
+from .appearance import SplatAppearance
+from .cloud import Cloud, picture_share, thinned
+from .dense_points import compile_sweep, seen_points
+from .density_control import BYTES_PER_GAUSSIAN, DensityControl
+from .initialization import cloud_of, initial_cloud, random_cloud, surface_cloud
 from .interval_schedule import intervals
-from .mcmc import MarkovChain, McmcNumbers
-from .mip_filter import MipFilter, MipNumbers
-from .robust_mask import RobustMask, RobustNumbers
-from .tidying import ALL_RULES, Tidying, TidyingNumbers
-
-
-@dataclass(frozen=True)
-class Config:
-    """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
-
-    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
-    sh_degree_interval: Steps = 1000  # steps for each further degree, section 7.1; or the share below, if sooner
-    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7; higher gives structure more weight
-    initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
-    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
-    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
-    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished, appendix C; higher is faster
-    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
-    rates: RateNumbers = RateNumbers()
-    refine: RefineNumbers = RefineNumbers()
-    adaptive: AdaptiveNumbers = AdaptiveNumbers()
-    mcmc: McmcNumbers = McmcNumbers()
-    filters: MipNumbers = MipNumbers()
-    poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
-    photographs: AppearanceNumbers = AppearanceNumbers()
-    distractors: RobustNumbers = RobustNumbers()
-    sparse: FewViewNumbers = FewViewNumbers()
-    tidying: TidyingNumbers = TidyingNumbers()
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
-
-    def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other."""
-        if self.strategy == "mcmc" and not self.refine.max_gaussians:
-            raise LumigraphError("With --strategy mcmc a cloud grows up to its cap; give one with --max-gaussians")
-
+from .moved_cloud import seen_from
 
 BLACK = 0.0, 0.0, 0.0
 SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
@@ -80,9 +41,13 @@ PLACEHOLDER_COUNT = 1000  # random Gaussians before training at most
 MAX_TEACHER_SHARE = 0.5  # of the cap, with which a cloud begins on the surfaces of a teacher
 
 
-class GaussianSplatting(Method):
+class CloudMethod(Method, ABC):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
 
+    Assign a DensityControl as `density_control`, a PoseRefinement or None as `poses`, and further `Addition`s. The
+    Config has the numbers `sh_degree`, `sh_degree_interval`, `sh_degree_interval_share`, `ssim_weight`,
+    `initialization`, `initial_gaussians`, `half_resolution_until`, `transmittance_threshold` and `seed`, and the parts'
+    `rates`, `refine` and `photographs`.
     cameras:  of the photographs that are learnt from; None before training
     progress: share of the budget spent
     bands:    of the harmonics in use
@@ -90,24 +55,16 @@ class GaussianSplatting(Method):
     drawn:    number of photographs that were learnt from
     """
 
-    Config = Config
+    density_control: DensityControl
+    poses: PoseRefinement | None
     drawn: Tensor
 
-    def __init__(self, frame: Frame, config: Any = None):
-        c = config or Config()
+    def __init__(self, frame: Frame, config: Any):
+        c = config
         super().__init__(frame, c)
         count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians or PLACEHOLDER_COUNT)
         self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), c.rates)
-        self.cloud.antialiased = c.filters.antialiased
         self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
-        self.few_views = FewViews(c.sparse) if c.sparse.few_views != "no" else None
-        self.density_control: DensityControl = (
-            MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
-        )
-        self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
-        self.tidying = Tidying(c.tidying)
-        self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
-        self.poses = poses_for(frame, c.poses)
         self.register_buffer("drawn", torch.tensor(0))
         self.cameras: Camera | None = None
         self.progress, self.bands = 1.0, c.sh_degree + 1
@@ -122,27 +79,6 @@ class GaussianSplatting(Method):
         """Near plane for rasterization."""
         return NEAR_PLANE_SCALE * self.frame.near
 
-    @classmethod
-    def cpu_preset(cls) -> Any:
-        """A smaller cloud that begins dense: it learns more in the time."""
-        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
-        c = replace(c, refine=RefineNumbers(120_000, cap_ramp=True), mcmc=McmcNumbers(joining_per_step=120.0))
-        return replace(c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"))
-
-    @classmethod
-    def smallest(cls) -> Any:
-        """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
-        return Config(
-            sh_degree=2,
-            sh_degree_interval=4,
-            initial_gaussians=200,
-            refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
-            tidying=ALL_RULES,
-            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
-            poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
-            photographs=AppearanceNumbers(appearance="no"),
-        )
-
     def growth_bytes(self) -> int:
         return BYTES_PER_GAUSSIAN * self.density_control.max_count(self.cloud)
 
@@ -150,7 +86,7 @@ class GaussianSplatting(Method):
 
     def compile_begin(self) -> None:
         super().compile_begin()
-        if self.config.initialization == "dense" or self.few_views:
+        if self.config.initialization == "dense":
             compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
@@ -159,8 +95,8 @@ class GaussianSplatting(Method):
         sweep = cache(partial(seen_points, data, SWEEP_SHARE * seconds))
         found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
         self.begin_with(found, data.cameras[data.splits["train"]])
-        if self.few_views and not self.moves_cameras:
-            self.few_views.begin_scene(data, sweep)
+        for part in self.additions:
+            part.begin_scene(self, data, sweep)
         super().begin(data, seconds)
 
     @torch.no_grad()

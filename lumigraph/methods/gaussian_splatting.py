@@ -1,0 +1,93 @@
+"""3D Gaussian Splatting: a scene as a cloud of soft, coloured ellipsoids (Kerbl et al. 2023, arXiv 2308.04079)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+from ..components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ..components.clouds.appearance import AppearanceNumbers
+from ..components.clouds.cloud import RateNumbers
+from ..components.clouds.cloud_method import CloudMethod
+from ..components.clouds.density_control import RefineNumbers
+from ..components.clouds.few_views import FewViewNumbers, FewViews
+from ..components.clouds.initialization import Initialization
+from ..components.clouds.mcmc import MarkovChain, McmcNumbers
+from ..components.clouds.mip_filter import MipFilter, MipNumbers
+from ..components.clouds.robust_mask import RobustMask, RobustNumbers
+from ..components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
+from ..components.training.pose_refinement import PoseNumbers, poses_for
+from ..datasets.scene import Frame
+from ..errors import LumigraphError
+from ..files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
+
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
+    sh_degree_interval: Steps = 1000  # steps for each further degree, section 7.1; or the share below, if sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
+    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7; higher gives structure more weight
+    initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
+    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
+    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
+    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished, appendix C; higher is faster
+    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
+    rates: RateNumbers = RateNumbers()
+    refine: RefineNumbers = RefineNumbers()
+    adaptive: AdaptiveNumbers = AdaptiveNumbers()
+    mcmc: McmcNumbers = McmcNumbers()
+    filters: MipNumbers = MipNumbers()
+    poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    photographs: AppearanceNumbers = AppearanceNumbers()
+    distractors: RobustNumbers = RobustNumbers()
+    sparse: FewViewNumbers = FewViewNumbers()
+    tidying: TidyingNumbers = TidyingNumbers()
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        if self.strategy == "mcmc" and not self.refine.max_gaussians:
+            raise LumigraphError("With --strategy mcmc a cloud grows up to its cap; give one with --max-gaussians")
+
+
+class GaussianSplatting(CloudMethod):
+    """Gaussians with density control, and what laptops, few photographs, other light and moving things need beside."""
+
+    Config = Config
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        self.cloud.antialiased, count = c.filters.antialiased, len(self.cloud)
+        self.few_views = FewViews(c.sparse) if c.sparse.few_views != "no" else None
+        self.density_control = (
+            MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
+        )
+        self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
+        self.tidying = Tidying(c.tidying)
+        self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
+        self.poses = poses_for(frame, c.poses)
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """A smaller cloud that begins dense: it learns more in the time."""
+        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
+        c = replace(c, refine=RefineNumbers(120_000, cap_ramp=True), mcmc=McmcNumbers(joining_per_step=120.0))
+        return replace(c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"))
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
+        return Config(
+            sh_degree=2,
+            sh_degree_interval=4,
+            initial_gaussians=200,
+            refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
+            tidying=ALL_RULES,
+            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
+            poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
+            photographs=AppearanceNumbers(appearance="no"),
+        )
