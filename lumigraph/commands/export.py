@@ -35,7 +35,8 @@ class ExportMesh:
     """Export a triangle mesh with vertex colours, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
-    with density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene is meshed.
+    with signed distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a
+    scene is meshed.
     Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 
@@ -49,10 +50,10 @@ class ExportMesh:
     cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
     """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
     way: Annotated[
-        Literal["auto", "density", "depth"],
-        arg(name="from", help_behavior_hint="(default: density where the method has one)"),
+        Literal["auto", "distance", "density", "depth"],
+        arg(name="from", help_behavior_hint="(default: the first of these that the method has)"),
     ] = "auto"
-    """Source of the surface: the density field, or rendered depth."""
+    """Source of the surface: the signed distance, the density field, or rendered depth."""
     level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
     """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
     smooth: Annotated[int, between(0, 1000), option("N")] = 10
@@ -75,12 +76,13 @@ class ExportMesh:
     device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ..export.mesh import extract_mesh
+        from ..export.mesh import best_way, extract_mesh
         from ..export.mesh_file import ending, write_mesh
 
         for_phones = ending(self.output) == ".usdz"
         claim(self.output, "mesh", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
+        way, why = best_way(method) if self.way == "auto" else (self.way, f"{self.way}, as --from says")
         mesh = extract_mesh(
             self.part.without_floaters(method, opened),
             opened.survey(cameras["train"]),
@@ -88,7 +90,7 @@ class ExportMesh:
             crop=self.part.crop(opened.frame),
             cell=None if self.cell_size is None else self.cell_size / opened.frame.to_source.scale,
             level=self.level,
-            way=self.way,
+            way=way,
             smooth=self.smooth,
             faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
             keep=self.keep,
@@ -100,6 +102,7 @@ class ExportMesh:
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         rows = {
             "file": str(self.output),
+            "surface": f"from {why}",
             "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
             "extent": " x ".join(f"{x:.4g}" for x in high - low) + " in the frame of the photographs",
             "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
