@@ -13,9 +13,9 @@ from lumigraph.components.clouds.adaptive import AdaptiveDensity, AdaptiveNumber
 from lumigraph.components.clouds.cloud import Cloud, CloudAdam
 from lumigraph.components.clouds.density_control import PRUNE_OPACITY, RefineNumbers
 from lumigraph.components.clouds.initialization import initial_cloud, nearest_distance
-from lumigraph.components.clouds.mcmc import MarkovChain, McmcNumbers, sample_by, shared_out
-from lumigraph.components.clouds.mip_filter import FILTER_VARIANCE, convolved, sampling_interval
 from lumigraph.errors import LumigraphError
+from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain, McmcNumbers, sample_by, shared_out
+from lumigraph.methods.gaussian_splatting.mip_filter import FILTER_VARIANCE, convolved, sampling_interval
 from lumigraph.run import build
 
 pytestmark = budget("methods")

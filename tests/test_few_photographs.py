@@ -13,7 +13,10 @@ from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph.components.clouds.dense_points import Points
-from lumigraph.components.clouds.few_views import (
+from lumigraph.components.clouds.initialization import round_gaussians
+from lumigraph.components.training.regularizers import camera_between, places_between
+from lumigraph.gaussians.splatting import splat, view_of
+from lumigraph.methods.gaussian_splatting.few_views import (
     FewViewNumbers,
     FewViews,
     depth_roughness,
@@ -21,9 +24,6 @@ from lumigraph.components.clouds.few_views import (
     surface_error,
     visible_points,
 )
-from lumigraph.components.clouds.initialization import round_gaussians
-from lumigraph.components.training.regularizers import camera_between, places_between
-from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.training import fit
 
 pytestmark = budget("methods")

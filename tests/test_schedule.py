@@ -10,8 +10,8 @@ from budgets import budget
 from lumigraph import methods
 from lumigraph.components.clouds.adaptive import AdaptiveDensity
 from lumigraph.components.clouds.interval_schedule import IntervalSchedule, short_schedule_lr_scale
-from lumigraph.components.clouds.mcmc import MarkovChain
 from lumigraph.files.ranges import changed
+from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain
 from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.training import loop as train

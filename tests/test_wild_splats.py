@@ -33,7 +33,6 @@ from lumigraph.components.clouds.cloud import (
     with_view,
     zero_unobserved_sh,
 )
-from lumigraph.components.clouds.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers
 from lumigraph.components.clouds.tidying import (
     MAX_ANISOTROPY,
     MAX_SCALE,
@@ -51,6 +50,7 @@ from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.methods.gaussian_splatting import GaussianSplatting
+from lumigraph.methods.gaussian_splatting.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 

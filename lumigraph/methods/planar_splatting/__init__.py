@@ -128,9 +128,19 @@ class PlanarSplatting(CloudMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A smaller cloud that begins as discs on dense points; fewer patches, consistent from early on."""
-        planes = PlaneNumbers(consistency_from=0.15, patches=2048, both_views=False, discs=True)
-        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.5, planes=planes)
+        """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more, with fewer
+        patches, which are smaller because photographs are."""
+        planes = PlaneNumbers(
+            normal_weight=0.05,
+            photometric_weight=0.6,
+            geometric_weight=0.1,
+            consistency_from=0.05,
+            patches=2048,
+            patch_side=5,
+            both_views=False,
+            discs=True,
+        )
+        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.3, planes=planes)
         c = replace(c, refine=RefineNumbers(60_000, cap_ramp=True), tidying=ALL_RULES)
         return replace(c, rates=RateNumbers(most_haste=4.0))
 

@@ -18,6 +18,7 @@ from ...geometry import to_matrix, to_quaternion, unit
 MIN_FACING = 0.02  # cosine between a plane's normal and a ray; below it they have no crossing that counts
 DISC_NEIGHBOURS = 10  # nearest points that determine the normal of a disc
 DISC_THICKNESS = 0.2  # of its width, at first
+DISC_OPACITY = 0.7  # at first: points that plane sweeps find lie on surfaces
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,8 @@ def planes(
 
 @torch.no_grad()
 def discs(cloud: Gaussians) -> Gaussians:
-    """The cloud with each Gaussian flat, across the direction in which the nearest centres vary least."""
+    """The cloud with each Gaussian nearly opaque and flat, across the direction in which the nearest centres vary
+    least."""
     if len(cloud) <= DISC_NEIGHBOURS:
         return cloud
     means = cloud.means.cpu()
@@ -85,7 +87,8 @@ def discs(cloud: Gaussians) -> Gaussians:
     axes = torch.linalg.eigh(around.mT @ around).eigenvectors.flip(-1)  # the least last
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]
     thin = cloud.log_scales + cloud.log_scales.new_tensor([1.0, 1.0, DISC_THICKNESS]).log()
-    return replace(cloud, quaternions=to_quaternion(axes).to(cloud.quaternions), log_scales=thin)
+    solid = torch.full_like(cloud.opacities, DISC_OPACITY).logit()
+    return replace(cloud, quaternions=to_quaternion(axes).to(cloud.quaternions), log_scales=thin, opacities=solid)
 
 
 def normals_of(depth: Float[Tensor, "height width"], maps: PlaneMaps) -> Float[Tensor, "inner_height inner_width 3"]:

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
-from ..components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
-from ..components.clouds.appearance import AppearanceNumbers
-from ..components.clouds.cloud import RateNumbers
-from ..components.clouds.cloud_method import CloudMethod
-from ..components.clouds.density_control import RefineNumbers
-from ..components.clouds.few_views import FewViewNumbers, FewViews
-from ..components.clouds.initialization import Initialization
-from ..components.clouds.mcmc import MarkovChain, McmcNumbers
-from ..components.clouds.mip_filter import MipFilter, MipNumbers
-from ..components.clouds.robust_mask import RobustMask, RobustNumbers
-from ..components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
-from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..datasets.scene import Frame
-from ..errors import LumigraphError
-from ..files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.appearance import AppearanceNumbers
+from ...components.clouds.cloud import RateNumbers
+from ...components.clouds.cloud_method import CloudMethod
+from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.initialization import Initialization
+from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
+from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...datasets.scene import Frame
+from ...errors import LumigraphError
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from .few_views import FewViewNumbers, FewViews
+from .mcmc import MarkovChain, McmcNumbers
+from .mip_filter import MipFilter, MipNumbers
+from .robust_mask import RobustMask, RobustNumbers
 
 
 @dataclass(frozen=True)

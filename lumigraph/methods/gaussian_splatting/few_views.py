@@ -17,14 +17,14 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...camera import Camera
+from ...components.clouds.addition import Addition, Step
+from ...components.clouds.dense_points import Points, compile_sweep
+from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted, splat, view_of
-from ..training.regularizers import camera_between, normalized_distance, roughness
-from .addition import Addition, Step
-from .dense_points import Points, compile_sweep
 
 MAX_SPARSE_VIEWS = 40  # training photographs up to which an open capture may be sparse
 MAX_SURFACE_SHARE = 0.2  # share of pixels whose surface plane sweeps find, from which on a capture is not sparse
