@@ -7,9 +7,11 @@
     lumigraph train gaussian-splatting FOX --downscale 4 --seconds 60 --output C
     python benchmarks/mesh.py --overlap C --scene FOX
 
-Exact: of a run of a procedural scene. The chamfer distance is the mean of two means, in per cent of the diagonal of the
-box around the world's objects: from points spread evenly over the mesh to the world's surface (its signed distance),
-and from points of the surface that the training cameras see (one per ray, traced) to the mesh's points.
+Exact: of a run of a procedural scene, or of a folder of `benchmarks/photographed.py`, whose truth.ply is the surface.
+The chamfer distance is the mean of two means, in per cent of the diagonal of the box around the world's objects: from
+points spread evenly over the mesh to the exact surface, and from points of the surface that the training cameras see
+(one per ray, traced; of a truth.ply by embreex) to the mesh's points. Normal consistency is the mean of two means
+likewise, of the absolute cosine between the normals there. PSNR is of held-out photographs.
 Overlap: in the capture's frame. From points of the mesh, inside the mesh's own box, to the nearest of the exported
 points; from exported points, Gaussians (opacity above one half) and sparse points of the capture there to the mesh.
 """
@@ -17,6 +19,7 @@ points; from exported points, Gaussians (opacity above one half) and sparse poin
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +30,12 @@ import tyro
 from rich.table import Table
 from scipy.spatial import cKDTree
 
+from lumigraph.camera import Camera
+from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.shapes.triangles import Triangles
+from lumigraph.evaluation import evaluate
 from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
@@ -43,7 +50,7 @@ RAYS = 100_000  # of the training cameras, towards the exact surface
 
 @dataclass(frozen=True)
 class Options:
-    exact: tuple[Path, ...] = ()  # runs of procedural scenes
+    exact: tuple[Path, ...] = ()  # runs of procedural scenes, and of folders with a truth.ply
     overlap: tuple[Path, ...] = ()  # runs of a capture
     scene: Path | None = None  # its photographs, for their sparse points
     views: int = 64
@@ -63,41 +70,92 @@ def main(options: Options) -> None:
         write_json(options.output, result)
 
 
+@dataclass(frozen=True)
+class Truth:
+    """An exact surface in the frame of the photographs.
+
+    diagonal: of the box around it
+    nearest:  distances of points from it, and its unit normals at the nearest places
+    seen:     points of it that the training cameras see;  normals: there
+    """
+
+    diagonal: float
+    nearest: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    seen: np.ndarray
+    normals: np.ndarray
+
+
 def beside_truth(run: Run, views: int) -> dict:
-    """Chamfer distance, and whether the mesh is closed."""
-    name = run.settings.scene.source.removeprefix("procedural:").partition(",")[0]
-    stage = scenes.stage(name)
+    """Chamfer distance, normal consistency, and whether the mesh is closed."""
+    file = Path(run.settings.scene.source) / "truth.ply"
+    truth = truth_of_mesh(file, run) if file.is_file() else truth_of_world(run)
+    method = run.method()
     begin = time.perf_counter()
-    mesh = extract_mesh(run.method(), run.cameras()["train"], views=views).in_source(run.frame)
+    mesh = extract_mesh(method, run.cameras()["train"], views=views).in_source(run.frame)
     seconds = time.perf_counter() - begin
-    points = spread(mesh)
-    away = signed_distance(stage.world, torch.from_numpy(points)).abs().numpy()
-    visible = seen_surface(stage)
-    back = cKDTree(points).query(visible)[0]
-    low, high = stage.world.bounds()
-    diagonal = float(np.linalg.norm(high - low))
+    points, normals = spread(mesh)
+    away, there = truth.nearest(points)
+    back, index = cKDTree(points).query(truth.seen)
+    alike = [np.abs((normals * there).sum(-1)), np.abs((normals[index] * truth.normals).sum(-1))]
     return {
         "method": run.method_name,
+        "training s": round(run.state.seconds, 1),
         "triangles": len(mesh.faces),
-        "seconds": round(seconds, 1),
+        "mesh s": round(seconds, 1),
         "watertight": bool(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).is_watertight),
-        "mesh to truth %": 100 * float(away.mean()) / diagonal,
-        "truth to mesh %": 100 * float(back.mean()) / diagonal,
-        "chamfer %": 50 * float(away.mean() + back.mean()) / diagonal,
+        "mesh to truth %": 100 * float(away.mean()) / truth.diagonal,
+        "truth to mesh %": 100 * float(back.mean()) / truth.diagonal,
+        "chamfer %": 50 * float(away.mean() + back.mean()) / truth.diagonal,
+        "normals": float(np.mean([x.mean() for x in alike])),
+        "psnr": evaluate(method, open_scene(run.settings.scene.source, **run.settings.scene.options)).psnr,
     }
 
 
-def seen_surface(stage) -> np.ndarray:
-    """Where rays of the training cameras meet the world."""
-    cameras = stage.cameras["train"]
-    found = []
+def truth_of_world(run: Run) -> Truth:
+    """The surface of a procedural world."""
+    name = run.settings.scene.source.removeprefix("procedural:").partition(",")[0]
+    stage = scenes.stage(name)
+
+    def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        steps = np.concatenate([np.zeros((1, 3)), np.eye(3) * 1e-4, -np.eye(3) * 1e-4])
+        around = [signed_distance(stage.world, torch.from_numpy(points + step)).numpy() for step in steps]
+        slope = np.stack([around[1 + k] - around[4 + k] for k in range(3)], -1)
+        return np.abs(around[0]), slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
+
+    points, normals = [], []
+    for rays in some_rays(stage.cameras["train"]):
+        seen = trace(stage.world, rays, shaded=False)
+        depth = torch.from_numpy(seen.depth).float()
+        points.append(rays.at(depth)[depth.isfinite()].numpy())
+        normals.append(seen.normal[depth.isfinite().numpy()])
+    low, high = stage.world.bounds()
+    return Truth(float(np.linalg.norm(high - low)), nearest, np.concatenate(points), np.concatenate(normals))
+
+
+def truth_of_mesh(file: Path, run: Run) -> Truth:
+    """The surface in a file beside photographs, in their frame."""
+    mesh = trimesh.load(file, process=False)
+    tree = Triangles(np.asarray(mesh.triangles))
+
+    def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance, face = tree.nearest(points)
+        return distance, mesh.face_normals[face]
+
+    points, normals = [], []
+    for rays in some_rays(run.cameras()["train"].transformed(run.frame.to_source.matrix)):
+        given = rays.origins.numpy(), rays.directions.numpy()
+        places, _, faces = mesh.ray.intersects_location(*given, multiple_hits=False)
+        points.append(places)
+        normals.append(mesh.face_normals[faces])
+    return Truth(float(np.linalg.norm(mesh.extents)), nearest, np.concatenate(points), np.concatenate(normals))
+
+
+def some_rays(cameras: Camera) -> Iterator[Rays]:
+    """Rays through random pixels of each camera, RAYS of all."""
     for i in range(len(cameras)):
         pixels = cameras[i].pixels()
-        rays = cameras[i].rays(pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(i))])
-        rays = rays[: RAYS // len(cameras)]
-        depth = torch.from_numpy(trace(stage.world, rays, shaded=False).depth).float()
-        found.append(rays.at(depth)[depth.isfinite()])
-    return torch.cat(found).numpy()
+        chosen = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(i))
+        yield cameras[i].rays(pixels[chosen])[: RAYS // len(cameras)]
 
 
 def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
@@ -105,7 +163,7 @@ def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
     method, cameras = run.method(), run.cameras()["train"]
     mesh = extract_mesh(method, cameras, views=views).in_source(run.frame)
     points = extract_points(method, cameras, views=views).in_source(run.frame).positions
-    surface = spread(mesh)
+    surface, _ = spread(mesh)
     low, high = surface.min(0), surface.max(0)
     tree = cKDTree(surface)
 
@@ -133,10 +191,11 @@ def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
     return row
 
 
-def spread(mesh: Mesh) -> np.ndarray:
-    """Points evenly over a mesh."""
+def spread(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Points evenly over a mesh, and normals of their faces."""
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    return np.asarray(trimesh.sample.sample_surface(solid, SAMPLES, seed=0)[0])
+    points, faces = trimesh.sample.sample_surface(solid, SAMPLES, seed=0)
+    return np.asarray(points), solid.face_normals[faces]
 
 
 def show(title: str, rows: list[dict]) -> None:

@@ -49,7 +49,7 @@ class Seen(RayMethod):
 
     def __init__(self, distance: Distance, frame: Frame | None = None):
         super().__init__(frame or Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True), {})
-        self.distance, self.nothing = distance, torch.nn.Parameter(torch.zeros(1))
+        self.shape, self.nothing = distance, torch.nn.Parameter(torch.zeros(1))
 
     def batch(self, scene, generator):
         raise NotImplementedError
@@ -63,8 +63,8 @@ class Seen(RayMethod):
     def render_rays(self, rays, background):
         t = torch.zeros(len(rays))
         for _ in range(40):
-            t = t + self.distance(rays.at(t))
-        hit = self.distance(rays.at(t)).abs() < 1e-3
+            t = t + self.shape(rays.at(t))
+        hit = self.shape(rays.at(t)).abs() < 1e-3
         rgb = torch.where(hit[:, None], painted(rays.at(t)), background)
         return Rendering(rgb, torch.where(hit, t, torch.inf), hit.float())
 
@@ -73,7 +73,14 @@ class Solid(Seen):
     """The same with a density."""
 
     def density(self, points):
-        return SOLID * torch.sigmoid(-SHARPNESS * self.distance(points))
+        return SOLID * torch.sigmoid(-SHARPNESS * self.shape(points))
+
+
+class Measured(Solid):
+    """The same with a signed distance too."""
+
+    def distance(self, points):
+        return self.shape(points)
 
 
 def around(count: int = 24, size: int = 80, lowest: float = -90.0, distance: float = 3.0) -> Camera:

@@ -19,6 +19,7 @@ from lumigraph.camera import ring
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
 from lumigraph.commands.convert import kept, verdict
+from lumigraph.components.clouds.initialization import rotation_to_normal
 from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logit, teacher_of
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
@@ -29,7 +30,6 @@ from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
 from lumigraph.method.capabilities import FromField, HasField, can
-from lumigraph.methods.gaussian_splatting.initialization import rotation_to_normal
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, open_any
 from lumigraph.run.derived import Converted, MeasuredModel

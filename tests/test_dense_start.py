@@ -14,11 +14,10 @@ from torch.nn.functional import normalize
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Fisheye, OpenCV, Pinhole
-from lumigraph.components.clouds import dense_points
+from lumigraph.components.clouds import dense_points, initialization
 from lumigraph.components.clouds.flat_view import flat_view
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
-from lumigraph.methods.gaussian_splatting import initialization
 
 pytestmark = budget("methods", 8)
 

@@ -9,11 +9,11 @@ from budgets import budget
 from test_gaussians import NAMES, cloud
 
 from lumigraph import methods
+from lumigraph.components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from lumigraph.components.clouds.cloud import Cloud, CloudAdam
+from lumigraph.components.clouds.density_control import PRUNE_OPACITY, RefineNumbers
+from lumigraph.components.clouds.initialization import initial_cloud, nearest_distance
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.gaussian_splatting.adaptive import AdaptiveDensity, AdaptiveNumbers
-from lumigraph.methods.gaussian_splatting.cloud import Cloud, CloudAdam
-from lumigraph.methods.gaussian_splatting.density_control import PRUNE_OPACITY, RefineNumbers
-from lumigraph.methods.gaussian_splatting.initialization import initial_cloud, nearest_distance
 from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain, McmcNumbers, sample_by, shared_out
 from lumigraph.methods.gaussian_splatting.mip_filter import FILTER_VARIANCE, convolved, sampling_interval
 from lumigraph.run import build
@@ -55,7 +55,7 @@ def test_where_everything_moves_it_is_adam(generator):
 @pytest.mark.parametrize("device", ["cpu", "as on a GPU"])
 def test_a_row_seen_now_and_then_goes_as_far_as_adam_would_take_it(device, monkeypatch):
     """A row with a gradient in every 20th step: the same as Adam, which moves it in all of them, in the end."""
-    from lumigraph.methods.gaussian_splatting import cloud as module
+    from lumigraph.components.clouds import cloud as module
 
     if device != "cpu":
 
@@ -131,7 +131,7 @@ def test_a_cloud_grows_no_further_than_it_may_and_says_so(generator):
 
 @pytest.mark.parametrize("ramp", [False, True])
 def test_a_cap_may_rise_over_the_budget_and_need_not_be(ramp, monkeypatch):
-    from lumigraph.methods.gaussian_splatting import density_control
+    from lumigraph.components.clouds import density_control
 
     monkeypatch.setattr(density_control, "room_for", lambda size, device: 10_000)
     some = Cloud(cloud(10))

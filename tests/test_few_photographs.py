@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -12,6 +13,7 @@ from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph.components.clouds.dense_points import Points
+from lumigraph.components.clouds.initialization import round_gaussians
 from lumigraph.components.training.regularizers import camera_between, places_between
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.methods.gaussian_splatting.few_views import (
@@ -22,7 +24,6 @@ from lumigraph.methods.gaussian_splatting.few_views import (
     surface_error,
     visible_points,
 )
-from lumigraph.methods.gaussian_splatting.initialization import round_gaussians
 from lumigraph.training import fit
 
 pytestmark = budget("methods")
@@ -163,5 +164,5 @@ def test_a_capture_is_sparse_if_sweeps_agree_little_on_up_to_forty_photographs_o
         (many, points, False),
     ):
         part = FewViews(FewViewNumbers("auto"))
-        part.begin_scene(data, lambda found=found: found)
+        part.begin_scene(SimpleNamespace(moves_cameras=False), data, lambda found=found: found)
         assert bool(part.active) == expected and len(part.surface) == 5 * expected

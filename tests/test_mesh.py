@@ -16,7 +16,7 @@ import trimesh
 from budgets import budget
 from listing import names
 from scipy.spatial import cKDTree
-from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
+from solids import SOLID, Measured, Seen, Solid, around, ball, painted, shell, together, torus
 
 from lumigraph.camera import Camera
 from lumigraph.camera.crop import CropBox, Sphere
@@ -27,7 +27,7 @@ from lumigraph.datasets.scene import Frame
 from lumigraph.depth_maps import Tolerance, agreed, render_depth_maps
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
-from lumigraph.export.mesh import extract_mesh, meshed_box
+from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, simplified, smoothed, zero_level
@@ -54,11 +54,12 @@ def solid_ball() -> Mesh:
     return extract_mesh(Solid(ball()), around(), cell=CELL, level=SOLID / 2)
 
 
-@pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
+@pytest.mark.parametrize("kind", [Measured, Solid, Seen], ids=["distance", "density", "depth"])
 @pytest.mark.parametrize("name", ["ball", "torus"])
 def test_a_mesh_is_closed_and_lies_on_the_surface(kind, name):
     distance = {"ball": ball(), "torus": torus()}[name]
     volume = {"ball": 4 / 3 * math.pi * 0.6**3, "torus": 2 * math.pi**2 * 0.55 * 0.2**2}[name]
+    assert best_way(kind(distance))[0] == {Measured: "distance", Solid: "density", Seen: "depth"}[kind]
     mesh = extract_mesh(kind(distance), around(), cell=CELL)
     solid = as_trimesh(mesh)
     assert solid.is_watertight and solid.is_winding_consistent

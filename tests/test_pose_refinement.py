@@ -18,6 +18,7 @@ from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
 from lumigraph.capture.oddities import about_fold
+from lumigraph.components.clouds.initialization import random_cloud
 from lumigraph.components.clouds.moved_cloud import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.photometric import Exposure
@@ -34,7 +35,6 @@ from lumigraph.files.ranges import changed, holds
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
 from lumigraph.method.capabilities import RefinesPoses, can
-from lumigraph.methods.gaussian_splatting.initialization import random_cloud
 from lumigraph.run import build
 from lumigraph.training.verdict import cameras_moved
 

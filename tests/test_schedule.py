@@ -8,9 +8,9 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
+from lumigraph.components.clouds.adaptive import AdaptiveDensity
+from lumigraph.components.clouds.interval_schedule import IntervalSchedule, short_schedule_lr_scale
 from lumigraph.files.ranges import changed
-from lumigraph.methods.gaussian_splatting.adaptive import AdaptiveDensity
-from lumigraph.methods.gaussian_splatting.interval_schedule import IntervalSchedule, short_schedule_lr_scale
 from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain
 from lumigraph.run import build
 from lumigraph.training import fit

@@ -72,7 +72,8 @@ def test_every_export_is_offered_and_its_command_line_works(ball_run, tmp_path):
     assert set(menu.formats) == {"web", "mesh", "panorama", "points", "stereo"}  # it has neither Gaussians nor octree
     options = {name: {option.name: option for option in kind.options} for name, kind in menu.formats.items()}
     assert (
-        options["mesh"]["from"].choices == ("auto", "density", "depth") and options["mesh"]["cell-size"].default == ""
+        options["mesh"]["from"].choices == ("auto", "distance", "density", "depth")
+        and options["mesh"]["cell-size"].default == ""
     )
     assert options["mesh"]["unseen"].choices == ("default", "close", "cut") and "as" in options["web"]
     assert "1/256 of the box" in options["mesh"]["cell-size"].hint

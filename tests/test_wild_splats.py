@@ -16,16 +16,7 @@ from test_nerf_w import two_lights
 
 from lumigraph import kernels
 from lumigraph.color.blending import over
-from lumigraph.components.training import photometric
-from lumigraph.components.training.photometric import spread_of_light
-from lumigraph.datasets.images import ImageStore
-from lumigraph.datasets.scene import Photograph
-from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.halves import judged_by_halves, left_half
-from lumigraph.files.ranges import changed
-from lumigraph.methods.gaussian_splatting import GaussianSplatting
-from lumigraph.methods.gaussian_splatting.appearance import (
+from lumigraph.components.clouds.appearance import (
     MIN_SPREAD,
     fit_colours,
     mean_skies,
@@ -35,15 +26,14 @@ from lumigraph.methods.gaussian_splatting.appearance import (
     sky_harmonics,
     sky_loss,
 )
-from lumigraph.methods.gaussian_splatting.cloud import (
+from lumigraph.components.clouds.cloud import (
     MIN_VIEWS,
     VIEW_BITS,
     view_count,
     with_view,
     zero_unobserved_sh,
 )
-from lumigraph.methods.gaussian_splatting.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers
-from lumigraph.methods.gaussian_splatting.tidying import (
+from lumigraph.components.clouds.tidying import (
     MAX_ANISOTROPY,
     MAX_SCALE,
     NEAR_ZONE,
@@ -51,6 +41,16 @@ from lumigraph.methods.gaussian_splatting.tidying import (
     clamped_scales,
     near_camera,
 )
+from lumigraph.components.training import photometric
+from lumigraph.components.training.photometric import spread_of_light
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Photograph
+from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.files.ranges import changed
+from lumigraph.methods.gaussian_splatting import GaussianSplatting
+from lumigraph.methods.gaussian_splatting.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 

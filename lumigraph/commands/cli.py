@@ -130,6 +130,7 @@ DESCRIPTION = """Train radiance fields from photographs, and render films, meshe
   lumigraph demo                        run every step on a procedural scene, in a few minutes
   lumigraph capture PHOTOS_OR_VIDEO     find the camera poses of photographs
   lumigraph train instant-ngp PHOTOS    train on a folder of photographs or a video
+  lumigraph train surface PHOTOS        train the default method for meshes; then `lumigraph export mesh`
   lumigraph eval runs/PHOTOS-instant-ngp-1     compare with held-out photographs
   lumigraph train my-method PHOTOS --method-file my.py    train a method of your own; all commands take the option"""
 
@@ -198,7 +199,7 @@ def parse(arguments: list[str]) -> Any:
     """The command with its options. Leaves with code 2 if they cannot be understood."""
     arguments = without_method_files(arguments)
     commands, first, rest = dict(COMMANDS), "".join(arguments[:1]), arguments[1:]
-    there = methods.available()
+    there = {*methods.available(), *(methods.ALIASES if first == "train" else ())}
     named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert") else []
     if named:  # the options of the method too
         commands[first] = with_options_of(named[0], rest, commands[first])

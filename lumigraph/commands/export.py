@@ -38,8 +38,8 @@ class ExportMesh:
     """Export a triangle mesh with vertex colours or a texture, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
-    with distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene
-    is meshed.
+    with signed distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a
+    scene is meshed.
     Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 
@@ -54,9 +54,9 @@ class ExportMesh:
     """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
     way: Annotated[
         Literal["auto", "distance", "density", "depth"],
-        arg(name="from", help_behavior_hint="(default: distance, else density, where the method has one)"),
+        arg(name="from", help_behavior_hint="(default: the first of these that the method has)"),
     ] = "auto"
-    """Source of the surface: the zero level of the distance, the density field, or rendered depth."""
+    """Source of the surface: the signed distance, the density field, or rendered depth."""
     level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
     """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
     smooth: Annotated[int, between(0, 1000), option("N")] = 10
@@ -92,18 +92,19 @@ class ExportMesh:
 
         for path in files_of(self.output, self.texture):
             claim(path, "mesh", self.overwrite, [self.source])
-        opened, mesh = self.extracted()
+        opened, mesh, why = self.extracted()
         up = opened.frame.to_source.rotation[:, 2].numpy()
         written = write_mesh(self.output, mesh, up, lit=self.lit, origin=opened.frame.origin)
-        show(self.rows(opened, mesh, written))
+        show(self.rows(opened, mesh, written, why))
         return 0
 
-    def extracted(self) -> tuple[Any, Any]:
-        """The opened source, and its mesh in the frame of exports."""
-        from ..export.mesh import extract_mesh
+    def extracted(self) -> tuple[Any, Any, str]:
+        """The opened source, its mesh in the frame of exports, and the source of the surface as text."""
+        from ..export.mesh import best_way, extract_mesh
 
         for_phones = self.output.suffix.lower() == ".usdz" and not self.texture
         opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
+        way, why = best_way(method) if self.way == "auto" else (self.way, f"{self.way}, as --from says")
         mesh = extract_mesh(
             self.part.without_floaters(method, opened),
             opened.survey(cameras["train"]),
@@ -111,7 +112,7 @@ class ExportMesh:
             crop=self.part.crop(opened.frame),
             cell=None if self.cell_size is None else self.cell_size / opened.frame.to_export.scale,
             level=self.level,
-            way=self.way,
+            way=way,
             smooth=self.smooth,
             faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
             keep=self.keep,
@@ -121,7 +122,7 @@ class ExportMesh:
             texture=self.texture_size if self.texture else None,
             photographs=self.photographs(opened) if self.texture else None,
         )
-        return opened, mesh.in_source(opened.frame)
+        return opened, mesh.in_source(opened.frame), why
 
     def photographs(self, opened: Any) -> Any:
         """The photographs of a run; None, with a warning, where they are gone. Raises LumigraphError if they are not
@@ -136,13 +137,14 @@ class ExportMesh:
             warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
             return None
 
-    def rows(self, opened: Any, mesh: Any, written: list[Path]) -> dict[str, str]:
-        """Results for the terminal. written: files"""
+    def rows(self, opened: Any, mesh: Any, written: list[Path], why: str) -> dict[str, str]:
+        """Results for the terminal. written: files;  why: source of the surface, and the reason"""
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         frame = "in the frame of the photographs"
         frame += f", times {opened.frame.scale:.6g}" if opened.frame.scale != 1 else ""
         rows = {
             "file": "\n".join(map(str, written)),
+            "surface": f"from {why}",
             "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
             "extent": " x ".join(f"{x:.4g}" for x in high - low) + f" {frame}",
             "size": f"{sum(file.stat().st_size for file in written) / 1e6:.1f} MB",
@@ -472,7 +474,7 @@ class ExportCollision(ExportMesh):
         from ..export.mesh_file import write_mesh
 
         claim(self.output, "mesh", self.overwrite, [self.source])
-        opened, mesh = self.extracted()
+        opened, mesh, _ = self.extracted()
         found = convex_pieces(mesh, self.concavity, self.pieces)
         named = {PIECE_NAMES[self.engine].format(name="source", number=i): piece for i, piece in enumerate(found)}
         up = opened.frame.to_source.rotation[:, 2].numpy()

@@ -209,7 +209,7 @@ class Train:
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
-    """Method to train, for example instant-ngp."""
+    """Method to train, for example instant-ngp, or `surface` for the default method for meshes."""
     scene: Annotated[Positional[str], needed("SCENE")]
     """Photographs, a video, or other data to train on."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None

@@ -1,4 +1,4 @@
-"""A mesh of what a method has learnt: from its distance or density, otherwise from the depth that it renders."""
+"""A mesh of a method: of its signed distance or density where it has one, otherwise of the depth that it renders."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which 
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
 
-Way = Literal["auto", "distance", "density", "depth"]
+Way = Literal["distance", "density", "depth"]
 
 
 @torch.no_grad()
@@ -65,7 +65,7 @@ def extract_mesh(
     crop: Crop | None = None,
     cell: float | None = None,
     level: float | None = None,
-    way: Way = "auto",
+    way: Way | None = None,
     smooth: int = 10,
     faces: int | None = None,
     keep: float = 0.01,
@@ -82,7 +82,7 @@ def extract_mesh(
     crop:    what is meshed instead, as far as the scene reaches
     cell:    side of the cubes that are marched through, scene units; None for 1/256 of the box's longest side
     level:   density of the surface, per scene unit; None for that where the cameras see surfaces
-    way:     "distance", "density", "depth", or "auto" for the first of these that the method has
+    way:     source of the surface; None for `best_way`
     smooth:  rounds of smoothing
     faces:   number of triangles to come down to; None for all, or for TEXTURED_FACES with a texture
     keep:    pieces with less than this share of the largest one's area are dropped
@@ -103,14 +103,15 @@ def extract_mesh(
     grid = make_grid(limits, cell)
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
     step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
-    seen = from_depth(depth_maps, grid.cell, closed)
-    if way == "distance" or (way == "auto" and can(method, HasDistance)):
+    value, way = from_depth(depth_maps, grid.cell, closed), way or best_way(method)[0]
+    if way == "distance" and method.learns_from is not Scene:  # of shapes, known where no camera sees it
         value = from_distance(method, grid.cell)
-    elif way == "depth" or (way == "auto" and not can(method, HasDensity)):
-        value = seen
-    else:
-        level = surface_level(method, depth_maps, holds) if level is None else level
-        value = from_density(method, level, interpolated(seen, grid, step))
+    elif way != "depth":
+        if way == "distance":
+            own = from_distance(method, grid.cell)
+        else:
+            own = from_density(method, surface_level(method, depth_maps, holds) if level is None else level)
+        value = near_depth(own, interpolated(value, grid, step))
     vertices, triangles = find_surface(grid, step, holds, value, -1.0 if closed else math.nan)
     if len(triangles):
         points = torch.from_numpy(vertices).float()
@@ -145,6 +146,15 @@ def extract_mesh(
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
+
+
+def best_way(method: Method) -> tuple[Way, str]:
+    """The best source of a surface that a method offers, and why it is."""
+    if can(method, HasDistance):
+        return "distance", "the signed distance, whose zero level is the surface that was learnt"
+    if can(method, HasDensity):
+        return "density", "the density, which is finer than depth from pictures; there is no signed distance"
+    return "depth", "rendered depth, fused; there is no signed distance and no density at points"
 
 
 def meshed_box(frame: Frame, times: float | None) -> CropBox:
@@ -202,7 +212,7 @@ def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Val
 
 
 def from_distance(method: Method, cell: float) -> Value:
-    """A function of points: 0 at the zero level of the method's distance, 1 well inside, -1 well outside."""
+    """A function of points: 0 where the signed distance is, 1 well inside, -1 well outside."""
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         distance = needs(method, HasDistance).distance(points.to(method.device)).cpu().float()
@@ -211,19 +221,29 @@ def from_distance(method: Method, cell: float) -> Value:
     return value
 
 
-def from_density(method: Method, level: float, depth: Value) -> Value:
+def from_density(method: Method, level: float) -> Value:
     """A function of points: 0 where the density is at its level, 1 well inside, -1 well outside.
 
     It is the logarithm that counts, for it changes evenly where the density itself grows by orders of magnitude within
-    a cell. Farther than a few cells from the surface that the cameras see, their depth decides. This
-    removes cavities inside objects, where the field had no supervision, and transparent mist.
+    a cell.
+    """
+
+    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        density = needs(method, HasDensity).density(points.to(method.device)).cpu().float()
+        return ((density.clamp_min(1e-30) / level).log() / SOFTNESS).clamp(-1, 1)
+
+    return value
+
+
+def near_depth(own: Value, depth: Value) -> Value:
+    """A function of points: a field's own value within a few cells of the surface that the cameras see, farther away
+    that of their depth. This removes cavities inside objects, where the field had no supervision, and transparent mist.
     """
     inward, outward = INWARD_CELLS / TRUNCATION_CELLS, OUTWARD_CELLS / TRUNCATION_CELLS
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        density = needs(method, HasDensity).density(points.to(method.device)).cpu().float()
-        own, seen = ((density.clamp_min(1e-30) / level).log() / SOFTNESS).clamp(-1, 1), depth(points)
-        return own.maximum(seen - inward).minimum(seen + outward)
+        seen = depth(points)
+        return own(points).maximum(seen - inward).minimum(seen + outward)
 
     return value
 

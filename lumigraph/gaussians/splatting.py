@@ -14,6 +14,7 @@ from ..camera.lens import Mixed, OpenCV, Pinhole
 from ..camera.rays import Rendering
 from ..color.blending import over
 from ..errors import LumigraphError
+from ..kernels.tile import Tiles
 from ..system.work import at_work
 from .cloud import Gaussians
 
@@ -30,14 +31,25 @@ class Splatted:
     rgb:     colours over black
     depth:   opacity-weighted sum of depths along the optical axis
     opacity: share of light that the cloud stops
-    centres, opacities: of each Gaussian's footprint, zero for those that the picture does not show
+    centres, conics, opacities: of each Gaussian's footprint, zero for those that the picture does not show
+    tiles:   footprints of each tile, in order
+    stop:    transmittance at which a pixel is finished
     """
 
     rgb: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
     opacity: Float[Tensor, "height width"]
     centres: Float[Tensor, "gaussian 2"]
+    conics: Float[Tensor, "gaussian 3"]
     opacities: Float[Tensor, " gaussian"]
+    tiles: Tiles
+    stop: float
+
+    def composited(
+        self, vectors: Float[Tensor, "gaussian 3"], numbers: Float[Tensor, " gaussian"]
+    ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+        """Further values of the Gaussians with the weights of the picture: sum_i w_i v_i; differentiable as `splat`."""
+        return kernels.rasterize(self.centres, self.conics, self.opacities, vectors, numbers, self.tiles, self.stop)[:2]
 
 
 def splat(
@@ -54,7 +66,7 @@ def splat(
     )
     tiles = kernels.tile(centres, conics, opacities, depths, view.size)
     rgb, depth, opacity = kernels.rasterize(centres, conics, opacities, colours, depths, tiles, stop)
-    return Splatted(rgb, depth, opacity, centres, opacities)
+    return Splatted(rgb, depth, opacity, centres, conics, opacities, tiles, stop)
 
 
 @at_work()

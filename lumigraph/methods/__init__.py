@@ -32,6 +32,7 @@ LOADED_FILE = "methods.json"  # in the cache: files of methods that this user ha
 # A method that is added comes behind these, so that no colour of theirs changes from one release to the next.
 COLOURED = ("gaussian-splatting", "instant-ngp", "mip-nerf", "nerf", "fourier-features")
 
+ALIASES = {"surface": "planar-splatting"}  # words for the default method of a purpose
 
 _registered: dict[str, type[Any]] = {}  # methods from elsewhere, by name
 METHOD_FILE = "--method-file"  # an option of every command
@@ -151,8 +152,8 @@ def summary(name: str) -> str:
 
 
 def check(name: str) -> str:
-    """The name of an installed method, or LumigraphError naming those there are."""
-    name = name.replace("_", "-")
+    """The name of an installed method, of itself or of a word in ALIASES; LumigraphError naming those there are."""
+    name = ALIASES.get(name, name).replace("_", "-")
     if name not in available():
         near = meant(name, available())
         hint = f"; did you mean {near}?" if near else ""

@@ -1,1 +1,1 @@
-"""Points and flat views of photographs with known cameras."""
+"""Parts of methods whose scene is a cloud of Gaussians; dense points and flat views of photographs."""

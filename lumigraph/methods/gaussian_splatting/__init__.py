@@ -2,42 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from typing import Annotated, Any, Literal
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
-
-from ... import kernels
-from ...camera import Camera
-from ...camera.rays import Rendering
-from ...color.blending import over
-from ...components.clouds.dense_points import compile_sweep, seen_points
-from ...components.clouds.moved_cloud import seen_from
-from ...components.fields.teacher import teacher_of
+from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.appearance import AppearanceNumbers
+from ...components.clouds.cloud import RateNumbers
+from ...components.clouds.cloud_method import CloudMethod
+from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.initialization import Initialization
+from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...datasets.scene import Frame, Photograph, Scene
+from ...datasets.scene import Frame
 from ...errors import LumigraphError
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
-from ...gaussians import Gaussians
-from ...gaussians.splatting import render, splat, view_of
-from ...method import Method
-from ...method.capabilities import ColourPairs
-from .adaptive import AdaptiveDensity, AdaptiveNumbers
-from .addition import Addition, Step
-from .appearance import AppearanceNumbers, SplatAppearance
-from .cloud import Cloud, RateNumbers, picture_share, thinned
-from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
 from .few_views import FewViewNumbers, FewViews
-from .initialization import Initialization, cloud_of, initial_cloud, random_cloud, surface_cloud
-from .interval_schedule import intervals
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
 from .robust_mask import RobustMask, RobustNumbers
-from .tidying import ALL_RULES, Tidying, TidyingNumbers
 
 
 @dataclass(frozen=True)
@@ -71,56 +53,23 @@ class Config:
             raise LumigraphError("With --strategy mcmc a cloud grows up to its cap; give one with --max-gaussians")
 
 
-BLACK = 0.0, 0.0, 0.0
-SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
-NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
-MIN_PIXELS = 64  # along the shorter side of a photograph that is reduced
-COARSE_UNTIL = 0.5  # share of the budget with plain colours, and by default half size, where poses are refined
-PLACEHOLDER_COUNT = 1000  # random Gaussians before training at most
-MAX_TEACHER_SHARE = 0.5  # of the cap, with which a cloud begins on the surfaces of a teacher
-
-
-class GaussianSplatting(Method):
-    """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
-
-    cameras:  of the photographs that are learnt from; None before training
-    progress: share of the budget spent
-    bands:    of the harmonics in use
-    current:  the step between `loss` and `after_step`
-    drawn:    number of photographs that were learnt from
-    """
+class GaussianSplatting(CloudMethod):
+    """Gaussians with density control, and what laptops, few photographs, other light and moving things need beside."""
 
     Config = Config
-    drawn: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians or PLACEHOLDER_COUNT)
-        self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), c.rates)
-        self.cloud.antialiased = c.filters.antialiased
-        self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
+        self.cloud.antialiased, count = c.filters.antialiased, len(self.cloud)
         self.few_views = FewViews(c.sparse) if c.sparse.few_views != "no" else None
-        self.density_control: DensityControl = (
+        self.density_control = (
             MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
         )
         self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
         self.tidying = Tidying(c.tidying)
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
         self.poses = poses_for(frame, c.poses)
-        self.register_buffer("drawn", torch.tensor(0))
-        self.cameras: Camera | None = None
-        self.progress, self.bands = 1.0, c.sh_degree + 1
-        self.current: Step | None = None
-
-    @property
-    def additions(self) -> list[Addition]:
-        return [part for part in self.children() if isinstance(part, Addition)]
-
-    @property
-    def near_plane(self) -> float:
-        """Near plane for rasterization."""
-        return NEAR_PLANE_SCALE * self.frame.near
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -142,179 +91,3 @@ class GaussianSplatting(Method):
             poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
             photographs=AppearanceNumbers(appearance="no"),
         )
-
-    def growth_bytes(self) -> int:
-        return BYTES_PER_GAUSSIAN * self.density_control.max_count(self.cloud)
-
-    # Initialisation
-
-    def compile_begin(self) -> None:
-        super().compile_begin()
-        if self.config.initialization == "dense" or self.few_views:
-            compile_sweep()
-
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        c, cap = self.config, self.density_control.max_count(self.cloud)
-        counts = min(c.initial_gaussians, cap), cap
-        sweep = cache(partial(seen_points, data, SWEEP_SHARE * seconds))
-        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
-        self.begin_with(found, data.cameras[data.splits["train"]])
-        if self.few_views and not self.moves_cameras:
-            self.few_views.begin_scene(data, sweep)
-        super().begin(data, seconds)
-
-    @torch.no_grad()
-    def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Gaussians on the teacher's surfaces; a cloud is taken as it is."""
-        degree, cap = self.config.sh_degree, self.density_control.max_count(self.cloud)
-        found = cloud_of(teacher, cap, degree)
-        if found is None:
-            count = max(2, math.ceil(MAX_TEACHER_SHARE * cap))
-            found = surface_cloud(teacher_of(teacher, cameras), count, degree, self.random(3))
-        self.begin_with(found, cameras)
-
-    def begin_with(self, gaussians: Gaussians, cameras: Camera) -> None:
-        """Begin with a cloud, to be learnt from photographs of these cameras."""
-        self.cloud.replace(gaussians)
-        self.cloud.set_extent(cameras)
-        self.cameras = cameras
-        for part in self.additions:
-            part.begin_cloud(self)
-
-    # Optimisation (section 5)
-
-    def before_step(self, step: int, progress: float) -> None:
-        """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
-        super().before_step(step, progress)
-        c, self.progress = self.config, progress
-        joined = intervals(step, progress, c.sh_degree_interval, c.sh_degree_interval_share)
-        coarse = self.moves_cameras and progress < COARSE_UNTIL
-        plain = coarse or any(part.base_colours for part in self.additions)
-        self.bands = 1 if plain else 1 + min(int(joined), c.sh_degree)
-
-    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
-        """The next photograph: each once in a random order, then in another."""
-        train = data.splits["train"]
-        if self.cameras is None:  # in a run that was resumed
-            self.cameras = data.cameras[train]
-        turn, place = divmod(int(self.drawn), len(train))
-        self.drawn += 1
-        order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
-        photograph = data.photograph(int(train[order[place]]))
-        self.figures["reduction"] = times = self.reduction(min(photograph.rgb.shape[:2]))
-        return photograph.reduced(times).to(self.device)
-
-    def reduction(self, shorter: int) -> int:
-        """Factor by which photographs are smaller now. shorter: pixels along the shorter side"""
-        half = self.config.half_resolution_until or COARSE_UNTIL * self.moves_cameras
-        wanted = 4 if self.progress < half / 4 else 2 if self.progress < half else 1
-        return max(1, min(wanted, shorter // MIN_PIXELS))
-
-    def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
-        """The absolute error and D-SSIM of a picture (eq. 7), and the terms of additions."""
-        c, cloud = self.config, self.filtered()
-        now = self.current = Step(batch, self.random(~step), cloud, cloud, batch.camera)
-        for part in self.additions:
-            part.before_raster(self, now)
-        if self.poses:
-            now.cloud, now.camera = seen_from(self.poses, now.cloud, now.camera)
-        now.picture = splat(now.cloud, view_of(now.camera, self.near_plane), self.bands, c.transmittance_threshold)
-        now.rgb, now.background = now.picture.rgb, self.background[0]
-        if now.picture.centres.requires_grad:
-            now.picture.centres.retain_grad()  # density control follows it
-        if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
-            now.background = torch.rand(3, generator=now.chance).to(self.device)
-        now.target = batch.before(now.background)
-        for part in self.additions:
-            part.after_raster(self, now)
-        if now.background.any():
-            now.rgb = over(now.rgb, now.picture.opacity, now.background)
-        if batch.mask is not None:
-            now.target = torch.where(batch.mask[..., None], now.target, now.rgb.detach())
-        now.residual = (now.rgb - now.target).detach()
-        for part in self.additions:
-            part.mask(self, now)
-        now.terms["l1"] = (1 - c.ssim_weight) * (now.rgb - now.target).abs().mean()
-        now.terms["ssim"] = c.ssim_weight * (1 - kernels.ssim(now.rgb, now.target))
-        for part in self.additions:
-            part.regularize(self, now)
-        return now.terms
-
-    @torch.no_grad()
-    def after_step(self, step: int) -> None:
-        now = self.current
-        assert now is not None and now.picture.centres.grad is not None
-        now.due = self.density_control.due(step, self.progress)
-        if now.camera.image_index is not None:
-            self.cloud.record_view(now.camera.image_index, now.picture.centres.grad.ne(0).any(-1))
-        super().after_step(step)
-        self.figures |= {"mse": float(now.residual.square().mean()), "gaussians": len(self.cloud)}
-        self.current = None
-
-    @torch.no_grad()
-    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
-        """Leave the Gaussians of a mask, with their moments in the optimizer."""
-        self.cloud.prune(keep)
-        for part in self.additions:
-            part.prune(keep)
-
-    # Rendering (section 6)
-
-    def filtered(self) -> Gaussians:
-        """The cloud as it is rasterized, in no photograph's appearance."""
-        cloud = self.cloud.gaussians()
-        for part in self.additions:
-            cloud = part.filtered(cloud)
-        return cloud
-
-    def gaussians(self) -> Gaussians:
-        """The cloud in the scene's frame, under the settings."""
-        cloud = self.filtered()
-        for part in self.additions:
-            cloud = part.recoloured_cloud(self, cloud)
-        return cloud
-
-    def rasterized(self, camera: Camera) -> Rendering:
-        """Rendering over black, in no photograph's appearance."""
-        return render(self.filtered(), camera, BLACK, self.near_plane)
-
-    def render(self, camera: Camera) -> Rendering:
-        camera = camera.to(self.device)
-        return self.shown(self.rasterized(camera), camera)
-
-    def shown(self, seen: Rendering, camera: Camera) -> Rendering:
-        """A rendering over black in the appearance of the settings, before the background."""
-        background = self.background[0]
-        for part in self.additions:
-            rgb, background = part.shown(self, seen, camera, background)
-            seen = replace(seen, rgb=rgb)
-        return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
-
-    def colour_pairs(self, photograph: Photograph) -> ColourPairs:
-        """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
-        photograph, cloud = photograph.to(self.device), self.filtered()
-        target = photograph.trusted(photograph.before(self.background[0]))
-
-        def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-            moved, camera = seen_from(poses, cloud, photograph.camera)
-            picture = splat(moved, view_of(camera, self.near_plane))
-            seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
-            return photograph.trusted(seen.rgb), target
-
-        return pairs
-
-    # Compression
-
-    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """Gain of one picture's brightness where a Gaussian alone gets brighter."""
-        return {"cloud.harmonics": picture_share(self.gaussians(), camera.to(self.device), self.near_plane)}
-
-    @torch.no_grad()
-    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
-        """Remove the least important Gaussians."""
-        weights = importance["cloud.harmonics"]
-        cloud, kept = thinned(self.cloud.gaussians(), weights, share)
-        self.cloud.replace(cloud)
-        for part in self.additions:
-            part.prune(kept)
-        return {"cloud.harmonics": weights[kept]}

@@ -17,14 +17,14 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...camera import Camera
-from ...components.clouds.dense_points import Points
+from ...components.clouds.addition import Addition, Step
+from ...components.clouds.dense_points import Points, compile_sweep
 from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted, splat, view_of
-from .addition import Addition, Step
 
 MAX_SPARSE_VIEWS = 40  # training photographs up to which an open capture may be sparse
 MAX_SURFACE_SHARE = 0.2  # share of pixels whose surface plane sweeps find, from which on a capture is not sparse
@@ -85,8 +85,13 @@ class FewViews(Addition):
         surface = ("plane-sweep surfaces at unobserved views",) if numbers.surface_weight and known else ()
         return ("dropout of Gaussians", *depth, *surface) if self.active else ()
 
-    def begin_scene(self, data: Scene, sweep: Callable[[], Points]) -> None:
+    def compile_begin(self) -> None:
+        compile_sweep()
+
+    def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
         """Decide whether the capture is sparse, and keep what plane sweeps have found."""
+        if method.moves_cameras:
+            return
         count = len(data.splits["train"])
         if self.numbers.few_views == "auto":
             few = data.frame.is_open and not data.frame.has_alpha and count <= MAX_SPARSE_VIEWS

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ...components.clouds.addition import Step
+from ...components.clouds.cloud import Cloud
+from ...components.clouds.density_control import PRUNE_OPACITY, DensityControl, RefineNumbers
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...geometry import to_matrix
-from .addition import Step
-from .cloud import Cloud
-from .density_control import PRUNE_OPACITY, DensityControl, RefineNumbers
 
 NOISE_SCALE = 5e5  # times the means' learning rate (section 3.1 and the authors' release)
 MAX_NOISE_OPACITY = 0.1  # above it the gate of the noise is below 1e-4

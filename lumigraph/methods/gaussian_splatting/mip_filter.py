@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ...camera import Camera
+from ...components.clouds.addition import Addition
 from ...gaussians import Gaussians
 from ...gaussians.splatting import view_of
-from .addition import Addition
 
 FILTER_VARIANCE = 0.2  # squared sampling intervals (section 6.1)
 

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from ...components.clouds.addition import Addition, Step
 from ...files.ranges import Share
-from .addition import Addition, Step
 
 INLIER_SHARE = 0.8  # share of pixels below the threshold; the authors' release
 HISTOGRAM_DECAY = 0.95  # factor for each step

@@ -15,14 +15,14 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from ...camera import Camera
-from ...components.training.row_optimizers import RowOptimizer, adam_moments, adam_rate, exchange
-from ...components.training.schedules import falling
 from ...exchange.codes import morton_order
 from ...exchange.packing import Stored, most_important
 from ...files.ranges import LearningRate, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import splat, view_of
 from ...method import Part
+from ..training.row_optimizers import RowOptimizer, adam_moments, adam_rate, exchange
+from ..training.schedules import falling
 from .interval_schedule import short_schedule_lr_scale
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")

@@ -14,15 +14,15 @@ from torch import Tensor
 from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.fields.appearance import APPEARANCE, PhotographCodes
-from ...components.training.photometric import spread_of_light
-from ...components.training.schedules import falling
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning
 from ...files.ranges import LearningRate, NonNegative
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
 from ...method.controls import Control
+from ..fields.appearance import APPEARANCE, PhotographCodes
+from ..training.photometric import spread_of_light
+from ..training.schedules import falling
 from .addition import Addition, Step
 from .cloud import CloudAdam
 from .interval_schedule import short_schedule_lr_scale

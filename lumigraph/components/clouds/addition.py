@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,10 +12,11 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...datasets.scene import Photograph
+from ...datasets.scene import Photograph, Scene
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted
 from ...method import Part
+from .dense_points import Points
 
 
 @dataclass
@@ -49,7 +51,7 @@ class Step:
 
 class Addition(Part):
     """A part that changes how a cloud is learnt or shown. All hooks do nothing by default, and are visited in the order
-    in which parts were assigned. `method` is the GaussianSplatting that holds the part.
+    in which parts were assigned. `method` is the CloudMethod that holds the part.
 
     base_colours: whether it keeps harmonics beyond the first at zero
     """
@@ -60,6 +62,9 @@ class Addition(Part):
 
     def begin_cloud(self, method: Any) -> None:
         """Follow a new cloud."""
+
+    def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
+        """Initialise from the photographs. sweep: gives points that plane sweeps find"""
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
         """Follow a cloud of which the Gaussians of a mask, or of indices, are left."""

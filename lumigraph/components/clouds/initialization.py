@@ -11,14 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...components.clouds.dense_points import Points, seen_points, thinned
-from ...components.fields.teacher import Teacher
-from ...components.sampling.occupancy import visual_hull
 from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
 from ...method.capabilities import HasGaussians, can
+from ..fields.teacher import Teacher
+from ..sampling.occupancy import visual_hull
+from .dense_points import Points, seen_points, thinned
 
 Initialization = Literal["dense", "sparse", "random"]
 

@@ -1,0 +1,181 @@
+"""Planar splatting: surfaces from photographs by flat Gaussians (PGSR, Chen et al. 2024, arXiv 2406.06521).
+
+Each Gaussian is flattened into a disc, whose plane gives unbiased depth and a normal (2DGS, Huang et al. 2024, arXiv
+2403.17888, has discs as well). Planes agree with the depth of their own view, and with the photographs of other views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import torch
+
+from ...camera import Camera
+from ...camera.rays import Rendering
+from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.addition import Addition, Step
+from ...components.clouds.appearance import AppearanceNumbers
+from ...components.clouds.cloud import RateNumbers
+from ...components.clouds.cloud_method import CloudMethod
+from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.initialization import Initialization
+from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
+from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...datasets.scene import Frame, Photograph, Scene
+from ...files.ranges import BatchSize, CloudSize, Count, NonNegative, PositiveShare, Seed, Share, Steps, between
+from ...gaussians.splatting import splat, view_of
+from ...geometry import unit
+from ...system.work import at_work
+from .consistency import PlaneView, grey_of, multi_view_errors, near_views, patch_centres, single_view_error
+from .planes import discs, plane_maps
+
+
+@dataclass(frozen=True)
+class PlaneNumbers:
+    """A Config's numbers of planes."""
+
+    flatness_weight: NonNegative = 100.0  # lambda_1, weight of the smallest scales; higher: flatter Gaussians
+    normal_weight: NonNegative = 0.015  # lambda_2, weight of depth-normal consistency; higher: smoother surfaces
+    photometric_weight: NonNegative = 0.15  # lambda_3, weight of 1 - NCC between views; 0: photographs one by one
+    geometric_weight: NonNegative = 0.03  # lambda_4, weight of reprojection errors in pixels
+    consistency_from: Share = 7000 / 30_000  # share of the budget before consistency counts
+    patches: BatchSize = 102_400  # pixels of a step that are compared with another view; fewer are faster
+    patch_side: Annotated[int, between(3, 31)] = 7  # pixels along a patch, an odd number
+    near_views: Count = 8  # nearest photographs, of which a step draws the other view
+    view_angle: Annotated[float, between(1, 180)] = 30.0  # degrees between the axes of two views, at most
+    both_views: bool = True  # move the other view's planes too; off: its picture needs no backward pass, faster
+    discs: bool = False  # begin as discs across the points' normals; off: as balls
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, those of 3D Gaussian Splatting where it gives none."""
+
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
+    sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
+    ssim_weight: Share = 0.2  # share of D-SSIM in the loss; higher gives structure more weight
+    initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
+    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points
+    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
+    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
+    planes: PlaneNumbers = PlaneNumbers()
+    rates: RateNumbers = RateNumbers()
+    refine: RefineNumbers = RefineNumbers()
+    adaptive: AdaptiveNumbers = AdaptiveNumbers()
+    poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    photographs: AppearanceNumbers = AppearanceNumbers()
+    tidying: TidyingNumbers = TidyingNumbers()
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+@dataclass(frozen=True)
+class Pair(Photograph):
+    """A photograph, and one that was taken beside it.
+
+    other: None where no camera is near
+    """
+
+    other: Photograph | None = None
+
+
+class Planes(Addition):
+    """Terms of the loss that flatten Gaussians and make their planes consistent."""
+
+    def __init__(self, numbers: PlaneNumbers):
+        super().__init__()
+        self.numbers = numbers
+
+    def begin_scene(self, method: Any, data: Scene, sweep: Any) -> None:
+        if self.numbers.discs:
+            method.cloud.replace(discs(method.cloud.gaussians()))
+
+    def regularize(self, method: Any, step: Step) -> None:
+        """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms (eq. 15)."""
+        c, cloud = self.numbers, step.cloud
+        visible = step.picture.opacities > 0
+        step.terms["flatness"] = c.flatness_weight * cloud.log_scales[visible].amin(-1).exp().mean()  # eq. 1
+        if method.progress < c.consistency_from:
+            return
+        here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera))
+        step.terms["normals"] = c.normal_weight * single_view_error(here)
+        other = step.photograph.other if isinstance(step.photograph, Pair) else None
+        if other is None or not (c.photometric_weight or c.geometric_weight):
+            return
+        camera = method.refined(other.camera)
+        with torch.set_grad_enabled(c.both_views):
+            picture = splat(step.whole, view_of(camera, method.near_plane), 1, method.config.transmittance_threshold)
+            there = PlaneView(camera, grey_of(other), plane_maps(step.whole, picture, camera))
+        middle = patch_centres(step.photograph, here.maps, c.patch_side, c.patches, step.chance)
+        photometric, geometric = multi_view_errors(here, there, *middle, c.patch_side)
+        step.terms["photometric"] = c.photometric_weight * photometric
+        step.terms["geometric"] = c.geometric_weight * geometric
+
+
+class PlanarSplatting(CloudMethod):
+    """A cloud of discs that renders the depth and the normals of their planes."""
+
+    Config = Config
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        self.planes = Planes(c.planes)
+        self.density_control = AdaptiveDensity(c.refine, c.adaptive, len(self.cloud))
+        self.tidying = Tidying(c.tidying)
+        self.poses = poses_for(frame, c.poses)
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more, with fewer
+        patches, which are smaller because photographs are."""
+        planes = PlaneNumbers(
+            normal_weight=0.05,
+            photometric_weight=0.6,
+            geometric_weight=0.1,
+            consistency_from=0.05,
+            patches=2048,
+            patch_side=5,
+            both_views=False,
+            discs=True,
+        )
+        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.3, planes=planes)
+        c = replace(c, refine=RefineNumbers(60_000, cap_ramp=True), tidying=ALL_RULES)
+        return replace(c, rates=RateNumbers(most_haste=4.0))
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some hundred Gaussians that are refined, reset and made consistent within some twenty quick steps."""
+        return Config(
+            sh_degree=1,
+            sh_degree_interval=4,
+            initial_gaussians=200,
+            planes=PlaneNumbers(consistency_from=0.1, patches=64, patch_side=3, view_angle=180.0),
+            refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
+            tidying=ALL_RULES,
+            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
+            photographs=AppearanceNumbers(appearance="no"),
+        )
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
+        """The next photograph, and one of those that were taken beside it."""
+        c, seen, train = self.config.planes, super().batch(data, generator), data.splits["train"]
+        assert self.cameras is not None and seen.camera.image_index is not None
+        index = int((train == seen.camera.image_index.cpu()).nonzero()[0, 0])
+        near = near_views(self.cameras, index, c.near_views, c.view_angle)
+        other = None
+        if len(near):
+            chosen = near[int(torch.randint(len(near), (1,), generator=generator))]
+            other = data.photograph(int(train[chosen])).reduced(int(self.figures["reduction"])).to(self.device)
+        return Pair(seen.camera, seen.rgb, seen.alpha, seen.mask, seen.extra, other)
+
+    @at_work()
+    @torch.no_grad()
+    def rasterized(self, camera: Camera) -> Rendering:
+        """Rendering over black, in no photograph's appearance, with unbiased depth and unit normals."""
+        cloud = self.filtered()
+        picture = splat(cloud, view_of(camera, self.near_plane))
+        maps = plane_maps(cloud, picture, camera)
+        depth = torch.where(maps.opacity > 1e-3, maps.depth, torch.inf)
+        return Rendering(picture.rgb, depth, maps.opacity, {"normals": unit(maps.normals)})
