@@ -63,8 +63,8 @@ class Config:
         """Raises LumigraphError for numbers that contradict each other."""
         if self.rays.fine_samples < self.upsampling_rounds:
             raise LumigraphError(
-                f"--fine-samples {self.rays.fine_samples} in --upsampling-rounds {self.upsampling_rounds} leave a round "
-                "without any; give fewer rounds"
+                f"--fine-samples {self.rays.fine_samples} in --upsampling-rounds {self.upsampling_rounds} leave a "
+                "round without any; give fewer rounds"
             )
 
 
@@ -150,16 +150,16 @@ class NeuS(FieldMethod):
         c, generator = self.config, self.random(step)
         (seen,), terms = self.learn(batch.rays, generator)
         background = backdrop(batch, self.background, generator, self.sampler.is_open)
-        look, (gradient, laplacian, inside) = seen.look(self.network), seen.features
+        look, (gradient, inside, *laplacian) = seen.look(self.network), seen.features
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual = rendering.rgb - batch.before(background)
-        self.figures |= {"mse": float(residual.detach().square().mean()), "s": float(self.network.sharpness)}
+        self.figures |= {"mse": float(residual.detach().square().mean()), "s": float(self.network.sharpness.detach())}
         shown = 1.0 if batch.alpha is None else batch.alpha.mean().clamp_min(1e-2)
         terms["colour"] = residual.abs().mean() / shown
         anywhere = self.network.shape.surface(self._anywhere(len(batch), generator))
         terms["eikonal"] = c.eikonal_weight * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
-        if c.curvature_weight and laplacian is not None:
-            terms["curvature"] = c.curvature_weight * laplacian[inside].abs().mean()
+        if c.curvature_weight and laplacian:
+            terms["curvature"] = c.curvature_weight * laplacian[0][inside].abs().mean()
         if batch.alpha is not None and c.mask_weight:
             terms["mask"] = c.mask_weight * mask_error(rendering.opacity, batch.alpha)
         return terms
@@ -173,7 +173,8 @@ class NeuS(FieldMethod):
         c, network = self.config, self.network
         sharpness = {"params": [network.deviation], "scale": c.sharpness_rate}
         if isinstance(network.shape, HashDistance):
-            outside = network.outside.optimizers_at(c.learning_rate) if network.outside else []
+            around = network.outside
+            outside = around.optimizers_at(c.learning_rate) if isinstance(around, HashField) else []
             return [*network.shape.table.optimizers_at(c.learning_rate, scale=1.0, groups=[sharpness]), *outside]
         others = [x for x in network.parameters() if x is not network.deviation]
         return [torch.optim.Adam([{"params": others}, sharpness], c.learning_rate)]
@@ -201,21 +202,23 @@ def first_sphere(data: Scene) -> tuple[Float[Tensor, " 3"], float, bool]:
     """Centre and radius of the sphere that the distance begins as, and whether it is hollow.
 
     Half as large as the ball around what is known to matter: the visual hull of photographs with alpha, or the sparse
-    points in the box, or the box itself. No camera is near it, for one inside would show nothing but black. Cameras
-    that are inside the box look at a room, which is hollow.
+    points in the box of interest, or that box. It fits between the planes that are closest around that, and no camera
+    is near it, for one inside would show nothing but black. Where most cameras are in the box, it holds a room, and the
+    sphere is hollow.
     """
     low, high = torch.tensor(data.frame.bounds)
     stands = data.cameras[data.splits["train"]].position.cpu()
-    hollow = float(((stands > low) & (stands < high)).all(-1).float().mean()) > 0.5
-    known = torch.stack([low, high])
+    known = torch.cat([torch.diag(high), torch.diag(low)])  # middles of the box's faces, where it is about the origin
     if data.images.has_alpha and not data.frame.is_open:
         cells = visual_hull(data, HULL_CELLS).nonzero()
         known = (cells + 0.5) * (2 / HULL_CELLS) - 1 if len(cells) else known
     elif data.points is not None:
         inside = data.points[((data.points > low) & (data.points < high)).all(-1)].cpu()
         known = inside if len(inside) >= MIN_POINTS else known
-    centre = known.median(0).values if len(known) > 2 else known.mean(0)
-    if hollow:
-        return centre, ROOM_RADIUS * float((known - centre).abs().amax(-1).quantile(0.9)), True
-    radius = FIRST_RADIUS * float((known - centre).norm(dim=-1).quantile(0.98))
-    return centre, min(radius, CLEAR_RADIUS * float((stands - centre).norm(dim=-1).min())), False
+    centre = known.median(0).values
+    away = (known - centre).abs()
+    if float(((stands > low) & (stands < high)).all(-1).float().mean()) > 0.5:
+        return centre, ROOM_RADIUS * float(away.amax(-1).quantile(0.9)), True
+    radius = FIRST_RADIUS * float(away.norm(dim=-1).quantile(0.98))
+    clear = CLEAR_RADIUS * float((stands - centre).norm(dim=-1).min())
+    return centre, min(radius, clear, float(away.quantile(0.98, dim=0).min())), False

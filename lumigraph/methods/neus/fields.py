@@ -108,7 +108,8 @@ class NetworkDistance(DistanceField):
         layers = []
         for i in range(n.depth):
             before = inputs if i == 0 else narrow + inputs if i == self.skip else width
-            layers.append(geometric(nn.Linear(before, narrow if i == self.skip - 1 else width), i == 0, i == self.skip))
+            waves = inputs - 3 if i in (0, self.skip) else 0
+            layers.append(geometric(nn.Linear(before, narrow if i == self.skip - 1 else width), waves))
         self.layers = nn.ModuleList(weight_norm(layer) for layer in layers)
         last = nn.Linear(width, 1 + width)
         nn.init.normal_(last.weight, math.sqrt(math.pi / width), 1e-4)
@@ -151,14 +152,12 @@ class NetworkDistance(DistanceField):
         return self.colour(inputs).sigmoid()
 
 
-def geometric(layer: nn.Linear, first: bool, skips: bool) -> nn.Linear:
-    """A hidden layer that keeps the norm of its input on average, once the waves behind its last or only coordinates are
-    left out (Atzmon 2020)."""
+def geometric(layer: nn.Linear, waves: int) -> nn.Linear:
+    """A hidden layer that keeps the norm of its input on average (Atzmon 2020). waves: last inputs of weight 0"""
     nn.init.normal_(layer.weight, 0.0, math.sqrt(2 / layer.out_features))
     nn.init.zeros_(layer.bias)
     with torch.no_grad():
-        if first:
-            layer.weight[:, 3:] = 0
+        layer.weight[:, layer.in_features - waves :] = 0
     return layer
 
 
@@ -172,6 +171,8 @@ class HashDistance(DistanceField):
     tetrahedron do (instead of six along the axes). Their mean gives the Laplacian. The step is a cell of the finest
     level that has joined.
     """
+
+    corners: Tensor
 
     def __init__(self, numbers: HashNumbers, width: int, joining: Joining | None):
         super().__init__()

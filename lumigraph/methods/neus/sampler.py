@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays, Samples
@@ -55,8 +55,8 @@ class SectionSampler(Sampler):
     def sample(
         self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
-        """One pass, with the colours of its samples. Features: the distance's gradient, its Laplacian where it is
-        known, and the mask of samples inside the box."""
+        """One pass, with the colours of its samples. Features: the distance's gradient, the mask of samples inside the
+        box, and the Laplacian where it is known."""
         assert isinstance(field, NeuSField)
         samples, light = self.sections(rays, field, generator)
         points, directions = samples.along(rays)
@@ -66,19 +66,18 @@ class SectionSampler(Sampler):
         density, rgb = thickness / samples.length, field.shape.shade(points, surface, directions)
         if generator is not None:
             self.evaluated = len(samples)
-        features = surface.gradient, surface.laplacian, torch.ones(len(samples), dtype=torch.bool, device=points.device)
+        inside = torch.ones(len(samples), dtype=torch.bool, device=points.device)
+        features = surface.gradient, inside, *([] if surface.laplacian is None else [surface.laplacian])
         if field.outside is None or self.around is None:
             return [Pass("samples", samples, density, features, directions, rgb=rgb, evaluated=len(samples))]
         behind = self.beyond(rays, light, generator)
         further = behind.along(rays)
         density_behind, rgb_behind = field.outside(*further)
         both, order = in_order(samples, behind)
-        gradient, laplacian, inside = (None if x is None else padded(x, len(behind))[order] for x in features)
+        features = (*(padded(x, len(behind))[order] for x in features),)
         density, rgb, directions = (
-            torch.cat(pair)[order]
-            for pair in ((density, density_behind), (rgb, rgb_behind), (directions, further[1]))
+            torch.cat(pair)[order] for pair in ((density, density_behind), (rgb, rgb_behind), (directions, further[1]))
         )
-        features = gradient, laplacian, inside
         return [Pass("samples", both, density, features, directions, rgb=rgb, evaluated=len(both))]
 
     @torch.no_grad()
