@@ -213,3 +213,14 @@ def test_in_the_open_a_field_around_the_box_learns_too(config):
     assert (points[inside].abs() <= 1).all() and inside.any() and not inside.all()
     assert (seen.samples.t_start.diff()[ray.diff() == 0] >= -1e-5).all()
     assert (~inside[1:] | inside[:-1] | (ray.diff() > 0)).all()  # within a ray nothing follows the field around
+
+
+def test_rays_grow_as_fewer_sections_matter():
+    """To fill the samples of a step, by a fifth at once and to four times as many at most; never below the first."""
+    sampler = NeuS(tiny.scene().frame, replace(NeuS.smallest(), samples_per_step=2048)).sampler
+    first = sampler.batch_size
+    for evaluated, expected in ((4 * 2048, first), (512, int(1.2 * first)), (2048, int(1.2 * first)), (1, 4 * first)):
+        sampler.evaluated = evaluated
+        for step in range(1 if evaluated > 1 else 20):
+            sampler.after_step(None, step)
+        assert sampler.batch_size == expected

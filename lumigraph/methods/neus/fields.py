@@ -193,7 +193,7 @@ class HashDistance(DistanceField):
         return self.sign * ((points - self.centre).norm(dim=-1) - self.radius)
 
     def added(self, encoded: Float[Tensor, "point width"]) -> Float[Tensor, " point"]:
-        """What the table adds, without features."""
+        """Values of the table behind its network, without features."""
         *hidden, last = self.table.density_network.weights
         return kernels.perceptron(encoded, *hidden, last[:1].contiguous())[:, 0]
 

@@ -20,6 +20,8 @@ from .fields import NeuSField
 
 FIRST_SHARPNESS = 64.0  # s of the first round of up-sampling, per scene unit; each round doubles it
 MIN_LIGHT = 1e-3  # of a ray's light that leaves the box: with less, nothing is evaluated behind it
+TYPICAL_SECTIONS = 6  # that matter of a ray, of a typical photograph with alpha
+MAX_GROWTH, MAX_RAYS = 1.2, 4  # factors by which rays may grow from one step to the next, and in all
 NETWORK_CHUNK, TABLE_CHUNK = 512, 4096  # rays that are rendered at once, so that activations fit into memory or cache
 
 
@@ -31,9 +33,12 @@ class SectionSampler(Sampler):
     space:            the box in which the distance holds
     numbers:          places of a ray, even ones and those of all rounds, and rays of a step
     rounds:           of up-sampling
+    samples_per_step: sections of a step that the number of rays follows, once they are fewer; 0: always as many rays
     weight_threshold: weight of a section below which it is left out; 0 for none
     around:           space of the field around the box, and the samples of a ray in it; None where nothing is
     """
+
+    rays_per_step: Tensor
 
     def __init__(
         self,
@@ -41,6 +46,7 @@ class SectionSampler(Sampler):
         numbers: RayNumbers,
         mask: MaskNumbers,
         rounds: int,
+        samples_per_step: int,
         weight_threshold: float,
         around: tuple[Contraction, int] | None = None,
         rays_per_chunk: int = TABLE_CHUNK,
@@ -48,9 +54,18 @@ class SectionSampler(Sampler):
         super().__init__()
         self.space, self.numbers, self.rounds, self.around = space, numbers, rounds, around
         self.weight_threshold, self.rays_per_chunk = weight_threshold, rays_per_chunk
-        self.batch_size = self.expected_rays = numbers.rays_per_step
+        self.samples_per_step = samples_per_step
+        self.register_buffer("rays_per_step", torch.tensor(numbers.rays_per_step))
         self.is_open = around is not None  # type: ignore[misc]  # of an instance
         self.empty = OccupancyMask(mask.occupancy_resolution, mask.occupancy_threshold)
+
+    @property
+    def batch_size(self) -> int:  # type: ignore[override]
+        return int(self.rays_per_step)
+
+    @property
+    def expected_rays(self) -> float:  # type: ignore[override]
+        return max(self.numbers.rays_per_step, self.samples_per_step / TYPICAL_SECTIONS)
 
     def sample(
         self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
@@ -127,8 +142,12 @@ class SectionSampler(Sampler):
         t[:, 0] = first
         return Samples.rows(t, last).keep((light > MIN_LIGHT).repeat_interleave(count))
 
-    def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
-        self.empty.begin_from(teacher, self.space, chance)
+    def after_step(self, method: Any, step: int) -> None:
+        """Set the next step's number of rays, as s grows and fewer sections of each matter."""
+        if self.samples_per_step:
+            rays, least = int(self.rays_per_step), self.numbers.rays_per_step
+            wanted = rays * self.samples_per_step / max(self.evaluated, 1)
+            self.rays_per_step.fill_(int(min(max(wanted, least), MAX_GROWTH * rays, MAX_RAYS * least)))
 
 
 def section_weights(
