@@ -252,7 +252,7 @@ def tangents(
     (du, dv), (eu, ev) = (v - u).T[:, :, None], (w - u).T[:, :, None]
     turned = np.sign(du * ev - eu * dv)
     along = turned * (ev * (b - a) - dv * (c - a))
-    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
+    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
     weighted = np.hstack([along, turned]) * np.linalg.norm(face_normals(vertices, faces), axis=-1, keepdims=True)
     total = np.stack([np.bincount(faces.ravel(), np.repeat(x, 3), len(vertices)) for x in weighted.T], -1)
     total[:, :3] -= (total[:, :3] * normals).sum(-1, keepdims=True) * normals

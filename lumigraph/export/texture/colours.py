@@ -188,7 +188,7 @@ def gains(samples: Samples) -> Float[np.ndarray, "view 3"]:
         left = difference + found[first] - found[second]
         weight = 1 / (1 + (left / GAIN_SIGMA) ** 2) ** 2
         for k in range(3):
-            matrix, target = np.zeros((count, count)), np.zeros(count)
+            matrix = np.zeros((count, count))
             w, d = weight[:, k], difference[:, k]
             for row, column, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
                 matrix += sign * np.bincount(row * count + column, w, count * count).reshape(count, count)
