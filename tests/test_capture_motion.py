@@ -565,7 +565,7 @@ def test_gaps_around_a_subject():
     assert "take 13 photographs more" in told and "front" in use_of(40.0, side.ends)
     assert use_of(360.0, None) == "enough for views from all sides"
     sparse = coverage(names[:9], ring(np.arange(0, 360, 40)))  # all around, too far apart
-    assert sparse.ends is None and len(sparse.gaps) == 9 and sparse.advice[0].startswith("1 more from")
+    assert sparse.ends is None and len(sparse.gaps) == 9 and "more from" in sparse.advice[0]
 
 
 def test_exposure_rotation_and_reasons():

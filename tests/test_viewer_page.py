@@ -150,6 +150,7 @@ def test_a_drag_keeps_the_ball_where_it_is(viewer, page, size):
     assert np.abs(before).max() < 0.2
     if size != SIZE:  # until it is folded, the panel is where the drag begins
         wait(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] < 100)
+        assert page.locator(".mantine-Paper-root").first.bounding_box()["width"] == size[0]
     drag(page, visitor, 60)
     moved = np.array(visitor.request().pose)[:, 3]
     assert np.abs(middle(visitor) - before).max() < 0.1

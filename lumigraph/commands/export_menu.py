@@ -42,7 +42,7 @@ def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) 
     kinds = {name: kind for name, kind in kinds.items() if name not in needs or can(method, needs[name])}
     kinds = {"web": kinds.pop("web"), **kinds}  # the usual one first
     formats = {
-        name: ExportFormat(ENDINGS[name], " ".join(inspect.cleandoc(kind.__doc__).split()), tuple(options_of(kind)))
+        name: ExportFormat(ENDINGS[name], inspect.cleandoc(kind.__doc__).partition("\n")[0], tuple(options_of(kind)))
         for name, kind in kinds.items()
     }
 

@@ -115,12 +115,14 @@ def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"],
 NARROW_WINDOW_PIXELS = 576  # pixels: viser's panel is a sheet at the bottom of windows up to this width
 
 # A click on the sheet's handle folds it; what is clicked is the text of the title, inside the handle. The mark keeps it
-# from folding again when a user opens it, which makes the picture anew.
+# from folding again when a user opens it, which makes the picture anew. viser's sheet is 20em wide on any window.
 SCRIPT = """
 document.title = {title};
 const sheet = this.closest(".mantine-Paper-root");
 if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
   window.sheetFolded = true;
+  const fixed = [sheet, ...sheet.querySelectorAll("div")].filter((part) => part.style.width === "20em");
+  fixed.forEach((part) => (part.style.width = "100%"));
   const texts = [...sheet.querySelectorAll("*")].filter((part) => part.childElementCount === 0);
   texts.find((part) => part.textContent === {title})?.click();
 }}
@@ -128,9 +130,11 @@ if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
 
 
 def prepare_window(gui: Any, title: str) -> None:
-    """Name the tab after the scene, and fold the panel of small windows once. gui: viser's, of the server.
+    """Name the tab after the scene; fold the panel of small windows once, and make it as wide as they are.
 
-    viser has no option for either. A hidden picture that fails to load runs a line of JavaScript instead.
+    gui: viser's, of the server
+
+    viser has no option for any of it. A hidden picture that fails to load runs a line of JavaScript instead.
     """
     script = SCRIPT.format(title=json.dumps(title), narrow=NARROW_WINDOW_PIXELS)
     gui.add_html(f'<img hidden alt="" src="data:," onerror="{escape(script)}">', order=1e9)

@@ -289,8 +289,8 @@ class Visitor:
             self._splats = self._client.scene.add_gaussian_splats("/gaussians", *arrays, scale=1 / UNIT_SCALE)
         else:
             self._splats.set_gaussians(*arrays)
-        found = "" if floating is None else f", {int(floating.sum())} floaters"
-        self._say(f"{len(cloud)} Gaussians, drawn by the browser{found}")
+        found = "" if floating is None else f", {int(floating.sum()):,} floaters"
+        self._say(f"{len(cloud):,} Gaussians, drawn by the browser{found}")
 
     def _recolour(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
         """Send the colours seen from where the eye rests now."""
