@@ -46,7 +46,7 @@ class Config:
     field: Literal["network", "hash"] = "network"  # distance field: the paper's network, or a faster hash table
     hidden_width: Width = 256  # channels of a hidden layer; wider holds more detail, and costs time
     upsampling_rounds: Annotated[int, between(1, 16)] = 4  # rounds that share the fine samples; more are finer, slower
-    samples_per_step: Annotated[int, between(0, 1 << 24)] = 0  # sections of a step, which more rays fill; 0: no more
+    samples_per_step: Annotated[int, between(0, 1 << 24)] = 0  # sections of a step, which sets its rays; 0: fixed rays
     outside_samples: RaySamples = 32  # samples of a ray behind the box of an open capture; more are sharper, slower
     weight_threshold: Share = 0.0  # weight of a section below which it is left out; higher is faster, less exact
     eikonal_weight: NonNegative = 0.1  # lambda, weight of the eikonal term, eq. 17; higher keeps f closer to a distance
@@ -112,7 +112,7 @@ class NeuS(FieldMethod):
         c = Config(table=CPU_TABLE, rays=RayNumbers(48, 16, rays_per_step=768), mask=MaskNumbers(64), field="hash")
         c = replace(c, hidden_width=32, upsampling_rounds=2, outside_samples=24, weight_threshold=1e-3)
         c = replace(c, samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.3, warmup=0.02)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02)
 
     @classmethod
     def smallest(cls) -> Any:

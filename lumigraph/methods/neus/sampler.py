@@ -21,7 +21,8 @@ from .fields import NeuSField
 FIRST_SHARPNESS = 64.0  # s of the first round of up-sampling, per scene unit; each round doubles it
 MIN_LIGHT = 1e-3  # of a ray's light that leaves the box: with less, nothing is evaluated behind it
 TYPICAL_SECTIONS = 6  # that matter of a ray, of a typical photograph with alpha
-MAX_GROWTH, MAX_RAYS = 1.2, 4  # factors by which rays may grow from one step to the next, and in all
+MAX_GROWTH = 1.2  # factor by which rays may grow from one step to the next
+MIN_SHARE, MAX_SHARE = 0.25, 4.0  # of the first step's rays, in later ones
 NETWORK_CHUNK, TABLE_CHUNK = 512, 4096  # rays that are rendered at once, so that activations fit into memory or cache
 
 
@@ -33,7 +34,7 @@ class SectionSampler(Sampler):
     space:            the box in which the distance holds
     numbers:          places of a ray, even ones and those of all rounds, and rays of a step
     rounds:           of up-sampling
-    samples_per_step: sections of a step that the number of rays follows, once they are fewer; 0: always as many rays
+    samples_per_step: sections of a step that the number of rays follows; 0: always as many rays
     weight_threshold: weight of a section below which it is left out; 0 for none
     around:           space of the field around the box, and the samples of a ray in it; None where nothing is
     """
@@ -145,9 +146,9 @@ class SectionSampler(Sampler):
     def after_step(self, method: Any, step: int) -> None:
         """Set the next step's number of rays, as s grows and fewer sections of each matter."""
         if self.samples_per_step:
-            rays, least = int(self.rays_per_step), self.numbers.rays_per_step
+            rays, first = int(self.rays_per_step), self.numbers.rays_per_step
             wanted = rays * self.samples_per_step / max(self.evaluated, 1)
-            self.rays_per_step.fill_(int(min(max(wanted, least), MAX_GROWTH * rays, MAX_RAYS * least)))
+            self.rays_per_step.fill_(int(min(max(wanted, MIN_SHARE * first), MAX_GROWTH * rays, MAX_SHARE * first)))
 
 
 def section_weights(
