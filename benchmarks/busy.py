@@ -1,12 +1,12 @@
 """How quick the package is alone, and beside programs that each keep a processor busy, by how threads wait.
 
-    python benchmarks/busy.py [--quick] [--beside 2] [--before CHECKOUT] [--work train eval mesh demo]
+    python benchmarks/busy.py [--quick] [--beside 2] [--before CHECKOUT] [--work steps train eval mesh demo]
 
 Starts and ends the busy programs itself. Ways of waiting take turns, so that whatever else happens on the machine meets
 all of them: ours; OpenMP's own, which looks for work for milliseconds; and sleeping at once. `--before` measures
 another checkout of the package too. Training is steps a second at a fixed share of the budget, of clouds that do not
 grow; commands are seconds from start to end, with Python's and PyTorch's own start; of the demo, those beside its
-training.
+training. `steps` counts the steps of 20 seconds, once by `lumigraph train` and once by `fit` in a script.
 """
 
 from __future__ import annotations
@@ -31,7 +31,19 @@ SPEAK = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 PROGRESS = 0.4  # share of the budget at which steps are timed
 WARM_UP = {"instant-ngp": 100, "gaussian-splatting": 10}  # steps; the number of rays settles in them
 DEMO = 10.0  # seconds of training
-Work = Literal["train", "eval", "mesh", "demo"]
+STEPS_SECONDS = 20.0  # of training whose steps are counted
+SCRIPT = """
+import sys
+import torch
+from lumigraph import fit, methods
+from lumigraph.capture import open_scene
+from lumigraph.run import build
+
+data, kind, device = open_scene(sys.argv[1]), methods.find("instant-ngp"), torch.device("cpu")
+method = build(kind, data.frame, kind.preset(device), device, 0, learning=True)
+print(fit(method, data, seconds=float(sys.argv[2]), show=False).state.step)
+"""
+Work = Literal["steps", "train", "eval", "mesh", "demo"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +54,7 @@ class Options:
     rounds: int = 3
     quick: bool = False  # one round of our way and OpenMP's own, without the demo
     before: Path | None = None  # another checkout
-    work: tuple[Work, ...] = ("train", "eval", "mesh", "demo")
+    work: tuple[Work, ...] = ("steps", "train", "eval", "mesh", "demo")
     output: Path | None = None  # also write the figures there, as JSON
 
 
@@ -64,6 +76,11 @@ def main(options: Options) -> None:
     ways = environments(options)
     result: dict[str, dict[str, Figures]] = {}
     with tempfile.TemporaryDirectory() as folder:
+        if "steps" in options.work:
+            both = {"lumigraph train": ways["ours"], "fit in a script": ways["ours"]}
+            result["instant-ngp, steps in 20 s"] = in_turn(
+                options, both, lambda way: steps_of(way, options.scene, Path(folder), both[way])
+            )
         if "train" in options.work:
             for method in WARM_UP:
                 with learners(method, options.scene, ways) as learn:
@@ -127,6 +144,19 @@ def busy_programs(count: int) -> Iterator[None]:
         for program in programs:
             program.kill()
             program.wait()
+
+
+def steps_of(way: str, scene: str, folder: Path, environment: dict[str, str]) -> float:
+    """Steps of instant-ngp in STEPS_SECONDS of training, by the command or by a script."""
+    if way == "fit in a script":
+        command = [sys.executable, "-c", SCRIPT, scene, str(STEPS_SECONDS)]
+        return float(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    run = folder / f"steps-{time.time_ns()}"
+    told = ["--seconds", f"{STEPS_SECONDS:g}", "--device", "cpu", "--output", str(run)]
+    lasted(["train", "instant-ngp", scene, *told], environment)
+    from lumigraph.run import Run
+
+    return float(Run(run).state.step)
 
 
 @contextlib.contextmanager
@@ -218,12 +248,12 @@ def show(result: dict[str, dict[str, Figures]], busy: int) -> None:
 
     from lumigraph.system.console import console
 
-    table = Table("work", "threads wait", "alone", f"beside {busy}", "of OpenMP's own, alone", f"beside {busy}")
+    table = Table("work", "way", "alone", f"beside {busy}", "share of OpenMP's own, alone", f"beside {busy}")
     for work, rows in result.items():
-        yardstick = statistics.median(rows["OpenMP's own"].alone)
+        yardstick = statistics.median(rows.get("OpenMP's own", next(iter(rows.values()))).alone)
         for way, figures in rows.items():
             alone, beside = statistics.median(figures.alone), statistics.median(figures.beside)
-            shares = [x / yardstick if work.endswith("steps/s") else yardstick / x for x in (alone, beside)]
+            shares = [x / yardstick if "steps" in work else yardstick / x for x in (alone, beside)]
             table.add_row(work, way, f"{alone:.1f}", f"{beside:.1f}", *(f"{share:.0%}" for share in shares))
     console().print(table)
 

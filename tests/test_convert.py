@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,6 +24,7 @@ from lumigraph.components.clouds.initialization import rotation_to_normal
 from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logit, teacher_of
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
+from lumigraph.derive import conversion
 from lumigraph.derive.conversion import ConversionTarget, between, convert, rendered_scene, ways
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
@@ -245,6 +247,31 @@ def test_schedules_go_on_from_the_middle(made):
     )
 
 
+@pytest.mark.parametrize(
+    ("name", "given", "steps", "seconds", "own"),
+    [
+        ("plenoctrees", [], 800, None, {"octree_depth": 9}),
+        ("plenoctrees", ["--octree-depth", "5", "--seconds", "7"], None, 7.0, {"octree_depth": 5}),
+        ("snerg", [], 800, None, {"voxel_learning_rate": 0.003, "resolution": 400}),
+        ("plenoxels", [], None, 30.0, {}),
+    ],
+)
+def test_defaults_follow_another_method(name, given, steps, seconds, own, ball_run, tmp_path, monkeypatch):
+    """The octree's depth, and steps, where the user names none."""
+    aims = []
+
+    def noted(source, name, output, aim, *rest, **more):
+        aims.append(aim)
+        raise LumigraphError("noted")
+
+    monkeypatch.setattr(conversion, "convert", noted)
+    words = ["convert", str(ball_run.folder), name, "--output", str(tmp_path / "new"), "--device", "cpu", *given]
+    assert main(words) == 2
+    assert (aims[0].steps, aims[0].seconds) == (steps, seconds)
+    assert {key: getattr(aims[0].config, key) for key in own} == own
+    assert methods.find("plenoctrees").preset(torch.device("cpu")).octree_depth == 8  # of training
+
+
 def test_photographs_are_learnt_from_where_they_are(ball_folder, tmp_path, capsys):
     words = [
         "train",
@@ -264,6 +291,7 @@ def test_photographs_are_learnt_from_where_they_are(ball_folder, tmp_path, capsy
     said = Converted.read(tmp_path / "b")
     assert said.how == "pictures" and said.learnt_from == "photographs" and said.views == 2
     assert said.student.psnr > 15 and "PSNR against photographs" in printed
+    assert re.search(r"cost +-?\d+\.\d\d dB, .*B instead of .*B, \d+ s", printed)
     assert Run(tmp_path / "b").settings.config["rays"] == 128
     assert main(["eval", str(tmp_path / "b"), "--views", "1"]) == 0
 

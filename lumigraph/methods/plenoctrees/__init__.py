@@ -91,6 +91,7 @@ class PlenOctrees(FieldMethod):
     """
 
     Config = Config
+    taught_steps = 800
     teacher: HarmonicTeacher | None
     teacher_sampler: OccupancySampler | None
     begun: Tensor

@@ -121,6 +121,7 @@ class SNeRG(FieldMethod):
     """
 
     Config = Config
+    taught_steps = 800
     network: DeferredField
     stage: Tensor
     began: Tensor
@@ -159,6 +160,11 @@ class SNeRG(FieldMethod):
         c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3)
         c = replace(c, deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128)
         return replace(c, rays_per_step=4096, hash_weight_decay=0.3, huber_delta=0.3, sparsity_weight=1e-4)
+
+    @classmethod
+    def taught_preset(cls, device: torch.device) -> Any:
+        """Voxels begin close to their values, and rays in minutes are few for each: steps of 0.01 add noise."""
+        return replace(cls.preset(device), voxel_learning_rate=0.003)
 
     @classmethod
     def smallest(cls) -> Any:
