@@ -474,13 +474,13 @@ class ExportCollision(ExportMesh):
         from ..export.mesh_file import write_mesh
 
         claim(self.output, "mesh", self.overwrite, [self.source])
-        opened, mesh, _ = self.extracted()
+        opened, mesh, why = self.extracted()
         found = convex_pieces(mesh, self.concavity, self.pieces)
         named = {PIECE_NAMES[self.engine].format(name="source", number=i): piece for i, piece in enumerate(found)}
         up = opened.frame.to_source.rotation[:, 2].numpy()
         written = write_mesh(self.output, mesh, up, lit=self.lit, origin=opened.frame.origin, pieces=named)
         rows = {"pieces": f"{len(found)}, {sum(len(faces) for _, faces in found):,} triangles"}
-        show(self.rows(opened, mesh, written) | rows)
+        show(self.rows(opened, mesh, written, why) | rows)
         return 0
 
     def check(self) -> None:
