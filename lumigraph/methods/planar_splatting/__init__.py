@@ -23,6 +23,7 @@ from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
+from ...errors import LumigraphError
 from ...files.ranges import BatchSize, CloudSize, Count, NonNegative, PositiveShare, Seed, Share, Steps, between
 from ...gaussians.splatting import splat, view_of
 from ...geometry import unit
@@ -76,6 +77,11 @@ class Config:
     photographs: AppearanceNumbers = AppearanceNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+    def check(self) -> None:
+        """Raises LumigraphError for patches without a middle."""
+        if self.planes.patch_side % 2 == 0:
+            raise LumigraphError(f"Patches of {self.planes.patch_side} pixels have no middle; give an odd --patch-side")
 
 
 @dataclass(frozen=True)

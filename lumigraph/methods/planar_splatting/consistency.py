@@ -61,7 +61,8 @@ def patch_centres(
     there = torch.zeros_like(maps.crossed)
     half = side // 2
     if min(height, width) < side:
-        return there.nonzero().unbind(-1)
+        row, column = there.nonzero().unbind(-1)
+        return row, column
     trusted = torch.ones_like(there) if photograph.alpha is None else photograph.alpha > TRUSTED_ALPHA
     if photograph.mask is not None:
         trusted = trusted & photograph.mask
