@@ -106,10 +106,10 @@ class Planes(Addition):
             method.cloud.replace(discs(method.cloud.gaussians()))
 
     def regularize(self, method: Any, step: Step) -> None:
-        """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms (eq. 15)."""
+        """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms."""
         c, cloud = self.numbers, step.cloud
         visible = step.picture.opacities > 0
-        step.terms["flatness"] = c.flatness_weight * cloud.log_scales[visible].amin(-1).exp().mean()  # eq. 1
+        step.terms["flatness"] = c.flatness_weight * cloud.log_scales[visible].amin(-1).exp().mean()
         if method.progress < c.consistency_from:
             return
         here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera, c.stop))

@@ -51,7 +51,7 @@ class PlaneMaps:
 
     @property
     def depth(self) -> Float[Tensor, "height width"]:
-        """Unbiased depth t = D / (N . d) along the ray to the plane (eq. 5); where none is crossed, `mean`."""
+        """Unbiased depth t = D / (N . d) along the ray to the plane; where none is crossed, `mean`."""
         crossing = self.distance / self.opacity.clamp_min(1e-6) / self.slope.clamp(max=-MIN_FACING)
         return torch.where(self.crossed, crossing, self.mean)
 
@@ -97,7 +97,7 @@ def discs(cloud: Gaussians) -> Gaussians:
 
 def normals_of(depth: Float[Tensor, "height width"], maps: PlaneMaps) -> Float[Tensor, "inner_height inner_width 3"]:
     """Unit normals of a depth map at the pixels inside its border, towards the camera, by differences between the
-    neighbours on both sides (eq. 8); differentiable."""
+    neighbours on both sides; differentiable."""
     points = depth[..., None] * maps.rays
     across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     return unit(torch.linalg.cross(down, across))
