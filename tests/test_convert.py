@@ -31,7 +31,7 @@ from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
-from lumigraph.method.capabilities import FromField, HasField, can
+from lumigraph.method.capabilities import FromField, HasField, HasGaussians, can
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, open_any
 from lumigraph.run.derived import Converted, MeasuredModel
@@ -200,7 +200,7 @@ def test_what_goes_into_what_follows_from_capabilities(capsys):
     for name, into in found.items():
         for other, how in into.items():
             if other in STUDENTS and how is not None:
-                cloud = name == other == "gaussian-splatting"
+                cloud = all(can(methods.find(x), HasGaussians) for x in (name, other))
                 assert how == ("gaussians" if cloud else "field" if can(methods.find(name), HasField) else "depth")
     assert found["voxel-grid"]["plenoxels"] == "depth" and found["plenoxels"]["voxel-grid"] == "pictures"
     assert found["plenoxels"]["fourier-features"] is None and found["nerf"]["instant-ngp"] == "field"

@@ -293,6 +293,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "filters.filter_3d": False,
     },
     "planar-splatting": {  # PGSR's section 5, from memory; 3D Gaussian Splatting's numbers where it gives none
+        "planes.depth": "mean",
         "planes.flatness_weight": 100.0,
         "planes.normal_weight": 0.015,
         "planes.photometric_weight": 0.15,

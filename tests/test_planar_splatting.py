@@ -15,7 +15,7 @@ from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.datasets.scene import Photograph
-from lumigraph.gaussians import Gaussians
+from lumigraph.gaussians import Gaussians, joined
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import look_at, to_matrix, unit
 from lumigraph.methods.planar_splatting import Pair
@@ -70,7 +70,7 @@ def test_a_disc_has_the_depth_of_its_plane_at_every_pixel():
     eye = camera(0.4, 0.3, 2.0)
     some = disc(NORMAL)
     picture = splat(some, view_of(eye), 1)
-    maps = plane_maps(some, picture, eye)
+    maps = plane_maps(some, picture, eye, 1e-4)
     rays = eye.rays(eye.pixels()).directions.view(SIZE, SIZE, 3)
     true = -(eye.position[0] @ NORMAL) / (rays @ NORMAL)
     assert maps.crossed.all()
@@ -78,6 +78,16 @@ def test_a_disc_has_the_depth_of_its_plane_at_every_pixel():
     torch.testing.assert_close(unit(maps.normals), NORMAL.expand(SIZE, SIZE, 3), atol=1e-5, rtol=0)
     assert float((maps.mean - true).abs().max()) > 0.1
     torch.testing.assert_close(normals_of(maps.depth, maps), NORMAL.expand(SIZE - 2, SIZE - 2, 3), atol=1e-3, rtol=0)
+
+
+def test_median_depth_ignores_discs_behind_the_one_at_which_half_the_light_is_spent():
+    """The front disc stops 0.6 of the light in the middle: mean depth lies behind it, median depth on it."""
+    front = replace(disc(UP.roll(1)), opacities=torch.tensor([0.6]).logit())
+    both = joined([front, replace(front, means=torch.tensor([[0.0, 0.0, -0.5]]))])
+    eye = camera(0.0, 0.0, 2.0)
+    picture = splat(both, view_of(eye), 1)
+    mean, median = (float(plane_maps(both, picture, eye, stop).depth[SIZE // 2, SIZE // 2]) for stop in (1e-4, 0.5))
+    assert median == pytest.approx(2.0, abs=2e-3) and mean == pytest.approx(2.0 + 0.5 * 0.24 / 0.84, abs=5e-3)
 
 
 def test_planes_face_the_eye_along_the_shortest_axis():
@@ -93,7 +103,7 @@ def test_gradients_of_depth_reach_the_discs():
     some = disc(NORMAL, 0.05)
     some = replace(some, means=some.means.clone().requires_grad_(), quaternions=some.quaternions.requires_grad_())
     eye = camera(0.4, 0.3, 2.0)
-    plane_maps(some, splat(some, view_of(eye), 1), eye).depth.mean().backward()
+    plane_maps(some, splat(some, view_of(eye), 1), eye, 1e-4).depth.mean().backward()
     along = some.means.grad[0] @ NORMAL
     assert float(along) < 0 < float(some.quaternions.grad.abs().max())  # nearer to the camera is less deep
 

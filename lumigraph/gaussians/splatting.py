@@ -33,7 +33,6 @@ class Splatted:
     opacity: share of light that the cloud stops
     centres, conics, opacities: of each Gaussian's footprint, zero for those that the picture does not show
     tiles:   footprints of each tile, in order
-    stop:    transmittance at which a pixel is finished
     """
 
     rgb: Float[Tensor, "height width 3"]
@@ -43,13 +42,16 @@ class Splatted:
     conics: Float[Tensor, "gaussian 3"]
     opacities: Float[Tensor, " gaussian"]
     tiles: Tiles
-    stop: float
 
     def composited(
-        self, vectors: Float[Tensor, "gaussian 3"], numbers: Float[Tensor, " gaussian"]
-    ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
-        """Further values of the Gaussians with the weights of the picture: sum_i w_i v_i; differentiable as `splat`."""
-        return kernels.rasterize(self.centres, self.conics, self.opacities, vectors, numbers, self.tiles, self.stop)[:2]
+        self, vectors: Float[Tensor, "gaussian 3"], numbers: Float[Tensor, " gaussian"], stop: float
+    ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+        """Further values of the Gaussians, composited as colours are: sums of w_i v_i, of w_i x_i and of w_i.
+
+        stop: transmittance at which a pixel is finished; 1/2 leaves those behind the median Gaussian out
+        """
+        footprints = self.centres, self.conics, self.opacities
+        return kernels.rasterize(*footprints, vectors, numbers, self.tiles, stop)
 
 
 def splat(
@@ -66,7 +68,7 @@ def splat(
     )
     tiles = kernels.tile(centres, conics, opacities, depths, view.size)
     rgb, depth, opacity = kernels.rasterize(centres, conics, opacities, colours, depths, tiles, stop)
-    return Splatted(rgb, depth, opacity, centres, conics, opacities, tiles, stop)
+    return Splatted(rgb, depth, opacity, centres, conics, opacities, tiles)
 
 
 @at_work()

@@ -7,7 +7,7 @@ Each Gaussian is flattened into a disc, whose plane gives unbiased depth and a n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 
@@ -23,6 +23,7 @@ from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
+from ...errors import LumigraphError
 from ...files.ranges import BatchSize, CloudSize, Count, NonNegative, PositiveShare, Seed, Share, Steps, between
 from ...gaussians.splatting import splat, view_of
 from ...geometry import unit
@@ -30,11 +31,14 @@ from ...system.work import at_work
 from .consistency import PlaneView, grey_of, multi_view_errors, near_views, patch_centres, single_view_error
 from .planes import discs, plane_maps
 
+STOPS = {"mean": 1e-4, "median": 0.5}  # transmittance at which the planes of a pixel are finished
+
 
 @dataclass(frozen=True)
 class PlaneNumbers:
     """A Config's numbers of planes."""
 
+    depth: Literal["mean", "median"] = "mean"  # planes of all Gaussians on a ray, or none behind the median one
     flatness_weight: NonNegative = 100.0  # lambda_1, weight of the smallest scales; higher: flatter Gaussians
     normal_weight: NonNegative = 0.015  # lambda_2, weight of depth-normal consistency; higher: smoother surfaces
     photometric_weight: NonNegative = 0.15  # lambda_3, weight of 1 - NCC between views; 0: photographs one by one
@@ -46,6 +50,11 @@ class PlaneNumbers:
     view_angle: Annotated[float, between(1, 180)] = 30.0  # degrees between the axes of two views, at most
     both_views: bool = True  # move the other view's planes too; off: its picture needs no backward pass, faster
     discs: bool = False  # begin as discs across the points' normals; off: as balls
+
+    @property
+    def stop(self) -> float:
+        """Transmittance at which the planes of a pixel are finished."""
+        return STOPS[self.depth]
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,11 @@ class Config:
     photographs: AppearanceNumbers = AppearanceNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+    def check(self) -> None:
+        """Raises LumigraphError for patches without a middle."""
+        if self.planes.patch_side % 2 == 0:
+            raise LumigraphError(f"Patches of {self.planes.patch_side} pixels have no middle; give an odd --patch-side")
 
 
 @dataclass(frozen=True)
@@ -92,13 +106,13 @@ class Planes(Addition):
             method.cloud.replace(discs(method.cloud.gaussians()))
 
     def regularize(self, method: Any, step: Step) -> None:
-        """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms (eq. 15)."""
+        """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms."""
         c, cloud = self.numbers, step.cloud
         visible = step.picture.opacities > 0
-        step.terms["flatness"] = c.flatness_weight * cloud.log_scales[visible].amin(-1).exp().mean()  # eq. 1
+        step.terms["flatness"] = c.flatness_weight * cloud.log_scales[visible].amin(-1).exp().mean()
         if method.progress < c.consistency_from:
             return
-        here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera))
+        here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera, c.stop))
         step.terms["normals"] = c.normal_weight * single_view_error(here)
         other = step.photograph.other if isinstance(step.photograph, Pair) else None
         if other is None or not (c.photometric_weight or c.geometric_weight):
@@ -106,7 +120,7 @@ class Planes(Addition):
         camera = method.refined(other.camera)
         with torch.set_grad_enabled(c.both_views):
             picture = splat(step.whole, view_of(camera, method.near_plane), 1, method.config.transmittance_threshold)
-            there = PlaneView(camera, grey_of(other), plane_maps(step.whole, picture, camera))
+            there = PlaneView(camera, grey_of(other), plane_maps(step.whole, picture, camera, c.stop))
         middle = patch_centres(step.photograph, here.maps, c.patch_side, c.patches, step.chance)
         photometric, geometric = multi_view_errors(here, there, *middle, c.patch_side)
         step.terms["photometric"] = c.photometric_weight * photometric
@@ -128,9 +142,10 @@ class PlanarSplatting(CloudMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more, with fewer
-        patches, which are smaller because photographs are."""
+        """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more. Patches
+        are fewer, and smaller because photographs are."""
         planes = PlaneNumbers(
+            depth="median",
             normal_weight=0.05,
             photometric_weight=0.6,
             geometric_weight=0.1,
@@ -151,7 +166,7 @@ class PlanarSplatting(CloudMethod):
             sh_degree=1,
             sh_degree_interval=4,
             initial_gaussians=200,
-            planes=PlaneNumbers(consistency_from=0.1, patches=64, patch_side=3, view_angle=180.0),
+            planes=PlaneNumbers(depth="median", consistency_from=0.1, patches=64, patch_side=3, view_angle=180.0),
             refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
             tidying=ALL_RULES,
             adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
@@ -176,6 +191,6 @@ class PlanarSplatting(CloudMethod):
         """Rendering over black, in no photograph's appearance, with unbiased depth and unit normals."""
         cloud = self.filtered()
         picture = splat(cloud, view_of(camera, self.near_plane))
-        maps = plane_maps(cloud, picture, camera)
-        depth = torch.where(maps.opacity > 1e-3, maps.depth, torch.inf)
-        return Rendering(picture.rgb, depth, maps.opacity, {"normals": unit(maps.normals)})
+        maps = plane_maps(cloud, picture, camera, self.config.planes.stop)
+        depth = torch.where(picture.opacity > 1e-3, maps.depth, torch.inf)
+        return Rendering(picture.rgb, depth, picture.opacity, {"normals": unit(maps.normals)})

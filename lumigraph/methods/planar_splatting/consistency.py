@@ -1,4 +1,4 @@
-"""Consistency of planes within a view and between two views (Chen 2024, sections 4.2 and 4.3)."""
+"""Consistency of planes within a view and between two views (Chen 2024)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ...datasets.scene import Photograph
 from ...geometry import unit
 from .planes import MIN_FACING, PlaneMaps, normals_of
 
-EDGE_POWER = 5  # of 1 - |gradient|, which weights the single-view term (eq. 9)
+EDGE_POWER = 5  # of 1 - |gradient|, which weights the single-view term
 MIN_VARIANCE = 1e-4  # of grey values in a patch, below which it is flat and agrees with nothing
-MAX_REPROJECTION = 1.0  # pixels; a pixel that returns farther away is hidden from one view, and left out (section 4.3)
+MAX_REPROJECTION = 1.0  # pixels; a pixel that returns farther away is hidden from one view, and left out
 MAX_COST = 0.9  # 1 - NCC; a patch above it shows something else
 TRUSTED_ALPHA = 0.99  # opacity of a photograph's pixels that patches may hold
 
@@ -38,7 +38,7 @@ def grey_of(photograph: Photograph) -> Float[Tensor, "height width"]:
 
 
 def single_view_error(view: PlaneView) -> Float[Tensor, ""]:
-    """Edge-aware difference between the normals of depth and those of the planes (eq. 9):
+    """Edge-aware difference between the normals of depth and those of the planes:
 
         mean of (1 - |grad I|)^5 |N_d - N|_1
 
@@ -61,7 +61,8 @@ def patch_centres(
     there = torch.zeros_like(maps.crossed)
     half = side // 2
     if min(height, width) < side:
-        return there.nonzero().unbind(-1)
+        row, column = there.nonzero().unbind(-1)
+        return row, column
     trusted = torch.ones_like(there) if photograph.alpha is None else photograph.alpha > TRUSTED_ALPHA
     if photograph.mask is not None:
         trusted = trusted & photograph.mask
@@ -76,7 +77,7 @@ def patch_centres(
 def multi_view_errors(
     here: PlaneView, there: PlaneView, row: Int[Tensor, " patch"], column: Int[Tensor, " patch"], side: int
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Photometric and geometric error between two views, at some pixels of the first (eqs. 10 to 13).
+    """Photometric and geometric error between two views, at some pixels of the first.
 
         phi(p) = |p - p'|      p' by the plane here to the other view, and by the plane there back again
         L_rgb = mean of exp(-phi) (1 - NCC(patch around p, the same patch through p's plane))      L_geo likewise of phi

@@ -23,7 +23,8 @@ DISC_OPACITY = 0.7  # at first: points that plane sweeps find lie on surfaces
 
 @dataclass(frozen=True)
 class PlaneMaps:
-    """Planes that one camera sees; sums over a pixel's Gaussians have the weights w_i = a_i T_i of its colour.
+    """Planes that one camera sees; sums are over a pixel's Gaussians with the weights w_i = a_i T_i of its colour, and
+    end where the light is spent, or behind the median Gaussian.
 
     rays:     unit directions of the pixels, in the scene's frame
     normals:  N = sum_i w_i n_i, towards the camera, in the scene's frame
@@ -50,18 +51,21 @@ class PlaneMaps:
 
     @property
     def depth(self) -> Float[Tensor, "height width"]:
-        """Unbiased depth t = D / (N . d) along the ray to the plane (eq. 5); where none is crossed, `mean`."""
+        """Unbiased depth t = D / (N . d) along the ray to the plane; where none is crossed, `mean`."""
         crossing = self.distance / self.opacity.clamp_min(1e-6) / self.slope.clamp(max=-MIN_FACING)
         return torch.where(self.crossed, crossing, self.mean)
 
 
-def plane_maps(cloud: Gaussians, picture: Splatted, camera: Camera) -> PlaneMaps:
-    """Plane maps of a cloud of which a camera has a picture."""
+def plane_maps(cloud: Gaussians, picture: Splatted, camera: Camera, stop: float) -> PlaneMaps:
+    """Plane maps of a cloud of which a camera has a picture.
+
+    stop: transmittance at which a pixel is finished; 1/2 for the Gaussians up to the median one
+    """
     rays = camera.rays(camera.pixels()).directions.view(*picture.opacity.shape, 3)
-    normals, distance = picture.composited(*planes(cloud, camera.position[0]))
+    normals, distance, opacity = picture.composited(*planes(cloud, camera.position[0]), stop)
     along = (rays @ camera.forward[0]).clamp_min(1e-3)
     mean = picture.depth / picture.opacity.clamp_min(1e-3) / along
-    return PlaneMaps(rays, normals, distance, mean, picture.opacity)
+    return PlaneMaps(rays, normals, distance, mean, opacity)
 
 
 def planes(
@@ -93,7 +97,7 @@ def discs(cloud: Gaussians) -> Gaussians:
 
 def normals_of(depth: Float[Tensor, "height width"], maps: PlaneMaps) -> Float[Tensor, "inner_height inner_width 3"]:
     """Unit normals of a depth map at the pixels inside its border, towards the camera, by differences between the
-    neighbours on both sides (eq. 8); differentiable."""
+    neighbours on both sides; differentiable."""
     points = depth[..., None] * maps.rays
     across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
     return unit(torch.linalg.cross(down, across))
