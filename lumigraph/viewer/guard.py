@@ -177,6 +177,14 @@ class SceneNodeClickMessage(Message, tag=True):
     owner: Text = ""
 
 
+class ScenePointerMessage(Message, tag=True):
+    event_type: Literal["click"]
+    ray_origin: Triple
+    ray_direction: Triple
+    screen_pos: tuple[tuple[Number, Number]]
+    modifier: Text | None
+
+
 class TransformControlsUpdateMessage(Message, tag=True):
     name: Text
     wxyz: Quaternion
@@ -198,6 +206,7 @@ DECODER = msgspec.msgpack.Decoder(
     ViewerCameraMessage
     | GuiUpdateMessage
     | SceneNodeClickMessage
+    | ScenePointerMessage
     | TransformControlsUpdateMessage
     | TransformControlsDragStartMessage
     | TransformControlsDragEndMessage

@@ -90,6 +90,7 @@ class Subject:
     page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
     behind:         colours and floor of a scene under the open sky
     exporter:       exports the scene; None where nothing can be exported
+    set_scale:      remembers units of exports to a unit of the photographs' frame; None in training
     """
 
     title: str
@@ -103,6 +104,7 @@ class Subject:
     page: Callable[[], bytes] | None = None
     behind: Backdrop | None = None
     exporter: Exporter | None = None
+    set_scale: Callable[[float], None] | None = None
 
     @cached_property
     def around(self) -> Surroundings:
