@@ -22,7 +22,7 @@ import tyro
 from rich.table import Table
 
 from lumigraph.camera import Camera
-from lumigraph.datasets.mesh import Mesh, Texture
+from lumigraph.datasets.mesh import Mesh, MeshTexture
 from lumigraph.export.texture.colours import first_surface
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
@@ -98,7 +98,9 @@ def read_textured(path: Path) -> Mesh:
     image = np.asarray(getattr(material, "baseColorTexture", None) or material.image)[..., :3]
     uv = np.asarray(part.visual.uv) * [1, -1] + [0, 1]
     colours = np.zeros((len(part.vertices), 3), np.uint8)
-    return Mesh(np.asarray(part.vertices), np.asarray(part.faces), colours, Texture(uv, np.ascontiguousarray(image)))
+    return Mesh(
+        np.asarray(part.vertices), np.asarray(part.faces), colours, MeshTexture(uv, np.ascontiguousarray(image))
+    )
 
 
 def rendered(mesh: Mesh, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:

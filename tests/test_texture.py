@@ -31,9 +31,9 @@ from lumigraph.errors import LumigraphError
 from lumigraph.export.collision import convex_pieces
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.surface import tangents, vertex_normals
-from lumigraph.export.texture import View, textured
+from lumigraph.export.texture import PosedPicture, textured
 from lumigraph.export.texture.atlas import texels_of, unwrap
-from lumigraph.export.texture.colours import RANKS, Samples, first_surface, gains
+from lumigraph.export.texture.colours import RANKS, TexelColours, first_surface, gains
 from lumigraph.export.texture.detail import normal_map
 from lumigraph.run import Run
 
@@ -52,7 +52,7 @@ def surface(solid: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int64)
 
 
-def picture(camera: Camera, solid: tuple[np.ndarray, np.ndarray], paint: Paint, gain: float = 1.0) -> View:
+def picture(camera: Camera, solid: tuple[np.ndarray, np.ndarray], paint: Paint, gain: float = 1.0) -> PosedPicture:
     """An exact photograph of a solid before black: the colour of the point that each pixel's ray meets first."""
     face, depth = first_surface(camera, *solid)
     rays = camera.rays(camera.pixels())
@@ -64,10 +64,10 @@ def picture(camera: Camera, solid: tuple[np.ndarray, np.ndarray], paint: Paint, 
     rgb8 = torch.from_numpy(np.rint(255 * rgb.clip(0, 1)).astype(np.uint8)).view(shape)
     opacity = torch.from_numpy(seen).view(depth.shape)
     known = DepthMap(camera, torch.from_numpy(depth), opacity.float(), rgb8 / 255)
-    return View(camera, rgb8, opacity, known)
+    return PosedPicture(camera, rgb8, opacity, known)
 
 
-def pictures(solid: tuple[np.ndarray, np.ndarray], paint: Paint, cameras: Camera) -> Iterator[View]:
+def pictures(solid: tuple[np.ndarray, np.ndarray], paint: Paint, cameras: Camera) -> Iterator[PosedPicture]:
     for i in range(len(cameras)):
         yield picture(cameras[i], solid, paint)
 
@@ -153,7 +153,7 @@ def test_gains_solve_for_exposures():
     padded[:, :3] = np.rint(colours)
     scores, numbers = np.zeros((3000, RANKS), np.float32), np.zeros((3000, RANKS), np.int32)
     scores[:, :3], numbers[:, :3] = 1, views
-    found = gains(Samples(padded, scores, numbers))
+    found = gains(TexelColours(padded, scores, numbers))
     np.testing.assert_allclose(found - found.mean(), (exposures.mean() - exposures)[:, None] * np.ones(3), atol=0.02)
 
 

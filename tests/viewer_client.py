@@ -52,13 +52,13 @@ class Client:
         message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
         self.socket.send(msgspec.msgpack.encode(message))
 
-    def click(self, place) -> None:
-        """Click in the scene at a place of the window, (x, y) in [0, 1]."""
+    def click(self, place, origin, direction) -> None:
+        """Click in the scene at a place of the window, (x, y) in [0, 1], and on a ray, as a browser does."""
         message = {
             "type": "ScenePointerMessage",
             "event_type": "click",
-            "ray_origin": (0.0, 0.0, 0.0),
-            "ray_direction": (0.0, 0.0, 1.0),
+            "ray_origin": [float(x) for x in origin],
+            "ray_direction": [float(x) for x in direction],
             "screen_pos": [place],
             "modifier": None,
         }

@@ -62,7 +62,7 @@ class Whole:
 
 
 @dataclass(frozen=True)
-class Placed:
+class GpsRecord:
     """Field `gps` of capture.json: whether the axes point east, north and up, in metres, and of what origin."""
 
     used: bool = False
@@ -78,7 +78,7 @@ class Made:
     key: str = ""
     warnings: list[str] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
-    gps: Placed | None = None
+    gps: GpsRecord | None = None
 
     @property
     def origin(self) -> GeographicOrigin | None:

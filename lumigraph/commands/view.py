@@ -100,6 +100,7 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: An
         opened.metrics(),
         saver(opened) if finished else None,
         page,
+        set_scale=opened.set_scale if finished else None,
     )
 
 

@@ -11,7 +11,7 @@ from .scene import Frame
 
 
 @dataclass(frozen=True)
-class Texture:
+class MeshTexture:
     """Pictures of a surface.
 
     uv:      place of each vertex: (0, 0) is the upper left corner of the pictures, (1, 1) the lower right one
@@ -36,7 +36,7 @@ class Mesh:
     vertices: Float[np.ndarray, "vertex 3"]
     faces: Int[np.ndarray, "face 3"]
     colours: UInt8[np.ndarray, "vertex 3"]
-    texture: Texture | None = None
+    texture: MeshTexture | None = None
 
     def transformed(self, similarity: Float[np.ndarray, "4 4"]) -> Mesh:
         """The same mesh in another frame, x' = M x. A mirroring turns the triangles, so that outside stays outside."""

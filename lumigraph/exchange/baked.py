@@ -251,7 +251,7 @@ def write_octree(path: Path, octree: Octree, frame: Frame) -> bool:
     rotated against that of the photographs, the octree stays in the scene's.
     """
     straight = (frame.to_source.rotation - torch.eye(3, dtype=torch.float64)).abs().max() < ROTATION_TOLERANCE
-    arrays = contents(octree, frame.to_source if straight else Similarity.make(1.0))
+    arrays = contents(octree, frame.to_export if straight else Similarity.make(1.0))
     with replacing(path, "octree") as new, open(new, "wb") as file:
         np.savez_compressed(file, **arrays)
     return bool(straight)

@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from ..color.srgb import linear_from_srgb
-from ..datasets.mesh import Mesh, Texture
+from ..datasets.mesh import Mesh, MeshTexture
 from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
 from ..exchange import gltf
@@ -126,7 +126,7 @@ def obj(file: MeshFile) -> Parts:
     return {"": str(text).encode()}
 
 
-def textured_obj(file: MeshFile, texture: Texture) -> Parts:
+def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
     """Text of an OBJ file, of its material, and the pictures that this names. OBJ's v points upwards."""
     held, numbers = io.StringIO(), np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9)
     held.write(f"# written by Lumigraph\nmtllib {file.name}{MATERIAL}\nusemtl surface\n")

@@ -247,7 +247,7 @@ def tangents(
     vertices: Vertices, faces: Faces, uv: Float[np.ndarray, "vertex 2"], normals: Vertices
 ) -> Float[np.ndarray, "vertex 4"]:
     """Unit tangents towards growing u, at right angles to the normals, and the sign s of the bitangent s (n x t), which
-    points upwards in the picture. uv: from the picture's upper left corner, as in `Texture`"""
+    points upwards in the picture. uv: from the picture's upper left corner, as in `MeshTexture`"""
     (a, b, c), (u, v, w) = vertices[faces].swapaxes(0, 1), (uv * [1, -1])[faces].swapaxes(0, 1)
     (du, dv), (eu, ev) = (v - u).T[:, :, None], (w - u).T[:, :, None]
     turned = np.sign(du * ev - eu * dv)

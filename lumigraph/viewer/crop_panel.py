@@ -16,7 +16,7 @@ from ..composition.floaters import STRENGTH
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from .path_panel import code
-from .shared import NAME, NAME_RULE, Shared
+from .shared import NAME, NAME_RULE, Locate, Shared
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
@@ -36,7 +36,7 @@ class CropPanel:
     cleaned: whether floaters are left out
     keep:    saves the rest under a name and returns its path; None where nothing can be saved
     notify:  shows the client a title and a text
-    surface: gives the point of the surface at a place in the client's window, (x, y) in [0, 1]; None where nothing is
+    locate:  the point of the scene on a ray from an origin along a direction; None where nothing is
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class CropPanel:
         changed: Callable[[], None],
         keep: Callable[[str], str] | None,
         notify: Callable[[str, str], None],
-        surface: Callable[[tuple[float, float]], Vector | None],
+        locate: Locate,
     ):
         self._client, self._shared, self._changed, self._keep, self._notify = client, shared, changed, keep, notify
-        self._surface = surface
+        self._locate = locate
         self._listening, self._last_click = False, (-math.inf, (0.0, 0.0))  # its time and place
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
@@ -139,17 +139,17 @@ class CropPanel:
         if wanted and not self._listening:
             self._client.scene.on_click()(self._clicked)
         elif self._listening and not wanted:
-            self._client.scene.remove_click_callback()
+            self._client.scene.remove_click_callback(self._clicked)
         self._listening = wanted
 
     def _clicked(self, event: Any) -> None:
-        """Move the crop's middle to the surface that a double click is on."""
+        """Move the crop's middle to the surface under a double click."""
         now, place = time.monotonic(), event.screen_pos
         (before, at), self._last_click = self._last_click, (now, place)
         if now - before > DOUBLE_CLICK_SECONDS or math.dist(place, at) > DOUBLE_CLICK_SHIFT:
             return
         self._last_click = -math.inf, place
-        if (middle := self._surface(place)) is None:
+        if (middle := self._locate(event.ray_origin, event.ray_direction)) is None:
             return
         shift = np.array(middle) - (np.array(self._lower.value) + self._upper.value) / 2
         self._following = True

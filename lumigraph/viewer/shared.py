@@ -34,6 +34,7 @@ NAME_RULE = "A name is made of letters, digits, spaces, dots and dashes"
 CROPPED_MAX_SCALE = 0.25  # extents of the crop; larger Gaussians stick out of it
 Masks = Mapping[str, Bool[Tensor, " gaussian"]]  # of Gaussians to remove, by reason
 Keep = Callable[[str, Masks], str]
+Locate = Callable[[Vector, Vector], Vector | None]  # point of the scene on a ray from an origin along a direction
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class Subject:
     page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
     behind:         colours and floor of a scene under the open sky
     exporter:       exports the scene; None where nothing can be exported
+    set_scale:      remembers units of exports to a unit of the photographs' frame; None in training
     """
 
     title: str
@@ -103,6 +105,7 @@ class Subject:
     page: Callable[[], bytes] | None = None
     behind: Backdrop | None = None
     exporter: Exporter | None = None
+    set_scale: Callable[[float], None] | None = None
 
     @cached_property
     def around(self) -> Surroundings:

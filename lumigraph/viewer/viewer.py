@@ -157,7 +157,7 @@ class Viewer:
         self._server = start_server(address, subject.title, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
-        names = ["View", "Crop", "Path", *(["Export"] if subject.exporter else [])]
+        names = ["View", "Crop", "Measure", "Path", *(["Export"] if subject.exporter else [])]
         own_tabs = {name: tabs.add_tab(name) for name in names}
         self._panel: TrainingPanel | None = None
         if subject.rows or training:

@@ -20,27 +20,29 @@ from torch import Tensor
 
 from .. import kernels
 from ..camera import Camera
+from ..camera.lens import Pinhole
 from ..camera.rays import Rendering
 from ..datasets.scene import Vector
-from ..depth_maps.depth_map import SURFACE_OPACITY
 from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..gaussians import Gaussians
-from ..geometry import to_matrix, unit
+from ..geometry import look_at, to_matrix, unit
 from ..paths.opening import upright
 from .cameras import Flight, ViewRequest, angle_across, angle_for, pose_of, rows
 from .controls import Controls, MethodControls
-from .crop_panel import CropPanel, vector
+from .crop_panel import CropPanel
 from .export_panel import ExportPanel
 from .modes import along_axis, extra_modes, picture
 from .painter import MOVING_SECONDS, Pace, Painter
 from .path_panel import PathPanel
+from .ruler_panel import RulerPanel
 from .shared import Shared
 from .turns import NotWantedError
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
 MIN_BAND_ROWS = 16  # of a band
+PICKED_PIXELS = 5  # a side of the picture around a click
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
 MAX_RECOLOURED_GAUSSIANS = 500_000  # Gaussians; more are too many to send again whenever the camera rests
 REST_SECONDS = 0.25  # seconds without movement from which on a camera beyond its limits returns
@@ -67,7 +69,8 @@ class Visitor:
         self.controls = Controls(client, shared, self.painter.request, self._go_home)
         self.method_controls = MethodControls(client, shared, self.painter.request)
         keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
-        self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify, self._surface)
+        self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify, self.locate)
+        self.ruler = RulerPanel(client, shared, self.locate, self.painter.request, self.notify)
         self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
         if shared.subject.exporter is not None:
             about = shared.subject.exporter, shared.subject.title, self.request, self.notify
@@ -132,17 +135,6 @@ class Visitor:
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
 
-    def _surface(self, place: tuple[float, float]) -> Vector | None:
-        """Point of the surface that the client sees at a place in its window, (x, y) in [0, 1]."""
-        request = self.request()
-        rendering, camera = self._render(request, replace(request, longest=DEPTH_SIZE).full, lambda: self._here)
-        height, width = rendering.depth.shape
-        x, y = (min(int(share * side), side - 1) for share, side in zip(place, (width, height), strict=True))
-        if rendering.opacity[y, x] < SURFACE_OPACITY:
-            return None
-        ray = camera.rays(torch.tensor([[x + 0.5, y + 0.5]]))
-        return vector(ray.at(rendering.depth[y, x].view(1))[0])
-
     def _keep(self, name: str) -> str:
         """Save what is left of the cloud. Raises LumigraphError if it cannot be."""
         assert self._shared.subject.keep is not None
@@ -177,11 +169,26 @@ class Visitor:
             controls.background,
             controls.exact,
             self.crop.crop,
-            controls.surrounded or self.path.drawn or self.crop.drawn,
+            controls.surrounded or self.path.drawn or self.crop.drawn or self.ruler.drawn,
             self.method_controls.values,
             self.crop.strength,
             self.crop.cleaned,
         )
+
+    def locate(self, origin: Vector, direction: Vector) -> Vector | None:
+        """The point of the visible scene that a ray meets first: the median depth of a few pixels around it."""
+        pose = look_at(torch.tensor([origin]), torch.tensor([direction]), torch.tensor([0.0, 0.01, 1.0]))
+        request = self.request()
+        focal = 0.5 * request.full[1] / math.tan(0.5 * request.angle)
+        lens = Pinhole(torch.full((1, 2), focal), torch.full((1, 2), PICKED_PIXELS / 2))
+        camera = Camera(pose, lens, torch.full((1, 2), PICKED_PIXELS))
+        with self._shared.turns.turn():
+            seen = self._shared.render(camera, request)
+        depth = seen.depth[(seen.opacity > 0.5) & seen.depth.isfinite()]
+        if not len(depth):
+            return None
+        x, y, z = (camera.position[0] + depth.median() * camera.forward[0]).tolist()
+        return x, y, z
 
     def _draw(self, seconds: float, wanted: Wanted) -> bool:
         """Show the best picture that can be drawn in a time; returns whether no better one is possible."""

@@ -7,20 +7,20 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import torch
 
-from ...datasets.mesh import Mesh, Texture
+from ...datasets.mesh import Mesh, MeshTexture
 from ...errors import LumigraphError
 from ...system.memory import ask_for
 from ...system.progress import counting
 from ..surface import Faces, Triangles, Vertices, vertex_normals
 from .atlas import texels_of, unwrap
-from .colours import View as View
+from .colours import PosedPicture as PosedPicture
 from .colours import blended, collected, gains, spread_to_unseen
 from .colours import photographed as photographed
 from .colours import rendered as rendered
 from .detail import normal_map
 
 BYTES_PER_TEXEL = 200  # while a texture is made
-Views = Callable[[float], Iterable[View]]  # pictures, by the length between neighbouring texels in scene units
+Views = Callable[[float], Iterable[PosedPicture]]  # pictures, by the length between neighbouring texels in scene units
 
 
 def textured(
@@ -65,7 +65,7 @@ def textured(
         if detailed is not None:
             detail = texels.picture(normal_map(texels, (vertices, charts), uv, normals, detailed))
     column, row = (uv * size).astype(int).clip(0, size - 1).T
-    return Mesh(vertices, charts, picture[row, column], Texture(uv, picture, detail))
+    return Mesh(vertices, charts, picture[row, column], MeshTexture(uv, picture, detail))
 
 
 def check_room(size: int) -> None:

@@ -39,7 +39,7 @@ CHUNK_TEXELS = 1 << 19
 
 
 @dataclass(frozen=True)
-class View:
+class PosedPicture:
     """A picture of the surface.
 
     camera:  a batch of one, of the picture's size
@@ -53,15 +53,15 @@ class View:
     seen: DepthMap
 
 
-def rendered(depth_maps: Sequence[DepthMap]) -> Iterator[View]:
+def rendered(depth_maps: Sequence[DepthMap]) -> Iterator[PosedPicture]:
     """The method's own renderings."""
     for seen in depth_maps:
-        yield View(seen.camera, to_bytes(seen.rgb), seen.opacity >= MIN_OPACITY, seen)
+        yield PosedPicture(seen.camera, to_bytes(seen.rgb), seen.opacity >= MIN_OPACITY, seen)
 
 
 def photographed(
     scene: Scene, cameras: Camera, chosen: Sequence[int], depth_maps: Sequence[DepthMap], spacing: float
-) -> Iterator[View]:
+) -> Iterator[PosedPicture]:
     """Photographs of the training split, reduced as long as their pixels are at most as large as texels.
 
     cameras: of this split, as the method refined them; chosen: those that the depth maps are of
@@ -74,7 +74,7 @@ def photographed(
         trusted = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool) if photograph.mask is None else photograph.mask
         if photograph.alpha is not None:
             trusted = trusted & (photograph.alpha >= MIN_OPACITY)
-        yield View(photograph.camera, to_bytes(photograph.rgb), trusted, seen)
+        yield PosedPicture(photograph.camera, to_bytes(photograph.rgb), trusted, seen)
 
 
 def pixel_angle(camera: Camera) -> float:
@@ -85,7 +85,7 @@ def pixel_angle(camera: Camera) -> float:
 
 
 @dataclass(frozen=True)
-class Samples:
+class TexelColours:
     """The best views' colours of each texel, in no order. A score of 0 is no view."""
 
     colours: UInt8[np.ndarray, "texel rank 3"]
@@ -112,7 +112,9 @@ def first_surface(
     return face, depth
 
 
-def trust(view: View, depth: Float[np.ndarray, "height width"], tolerance: float) -> Float[np.ndarray, "height width"]:
+def trust(
+    view: PosedPicture, depth: Float[np.ndarray, "height width"], tolerance: float
+) -> Float[np.ndarray, "height width"]:
     """Trust in each pixel's colour, from 0 to 1: small near the edges of surface, picture and mask, 0 beyond them.
 
     depth:     of the mesh
@@ -135,9 +137,9 @@ def collected(
     surface: tuple[Vertices, Faces],
     points: Float[np.ndarray, "texel 3"],
     normals: Float[np.ndarray, "texel 3"],
-    views: Iterable[View],
+    views: Iterable[PosedPicture],
     tolerance: float,
-) -> Samples:
+) -> TexelColours:
     """Colours of the best views of each texel, by cosine, resolution and trust.
 
     tolerance: distance between a texel and the first surface of a pixel, scene units, beyond which it is hidden
@@ -160,10 +162,10 @@ def collected(
         given = chosen, pixels.numpy(), away.numpy(), (quality * cosine).numpy()
         picture = view.rgb.contiguous().numpy(), depth, trusted
         loops.collect(*given, *picture, tolerance, number, colours, scores, numbers)
-    return Samples(colours, scores, numbers)
+    return TexelColours(colours, scores, numbers)
 
 
-def gains(samples: Samples) -> Float[np.ndarray, "view 3"]:
+def gains(samples: TexelColours) -> Float[np.ndarray, "view 3"]:
     """Logarithm of a factor for each view and channel, by which overlapping views agree: robust least squares
 
     min over g of  sum w (log c_i + g_i - log c_j - g_j)^2 + ridge |g|^2
@@ -198,7 +200,7 @@ def gains(samples: Samples) -> Float[np.ndarray, "view 3"]:
     return found
 
 
-def blended(samples: Samples, gain: Float[np.ndarray, "view 3"]) -> Float[np.ndarray, "texel 3"]:
+def blended(samples: TexelColours, gain: Float[np.ndarray, "view 3"]) -> Float[np.ndarray, "texel 3"]:
     """The mean of each texel's views, in [0, 1], weighted by their scores' power; views that disagree count less.
 
     A texel that no view sees is 0.
