@@ -161,7 +161,8 @@ class MeshFit(Method):
             colour.append(error.abs().mean())
             square.append(error.detach().square().mean())
             if photograph.alpha is not None:
-                silhouette.append(photograph.trusted((seen.opacity - photograph.alpha)[..., None]).abs().mean())
+                off = (seen.opacity - photograph.alpha).abs()
+                silhouette.append((off if photograph.mask is None else off[photograph.mask]).mean())
         terms = {"colour": torch.stack(colour).mean()}
         if silhouette:
             terms["mask"] = c.mask_weight * torch.stack(silhouette).mean()

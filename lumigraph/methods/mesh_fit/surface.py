@@ -50,8 +50,8 @@ class Solver:
 
 
 class _Smooth(torch.autograd.Function):
-    """x = (I + smoothness L)^-1 u. The matrix is symmetric, so gradients take the same way, those of single vertices cut
-    off first: where a triangle is seen nearly edge-on its colours say little, and their slope has no bound."""
+    """x = (I + smoothness L)^-1 u. The matrix is symmetric, so gradients take the same way. Their length is limited at
+    each vertex first: where a triangle is seen nearly edge-on, the slope of its colours has no bound."""
 
     @staticmethod
     def forward(ctx: Any, u: Tensor, solver: Solver) -> Tensor:  # type: ignore[override]
