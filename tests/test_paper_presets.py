@@ -344,6 +344,17 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "members_per_step": 4,
         "rays_per_member": 128,
     },
+    "mesh-fit": {  # Nicolet 2021; lambda and a sphere from the release's tutorial, from memory
+        "start": "sphere",
+        "smoothness": 19.0,
+        "laplacian_weight": 0.0,
+        "normal_weight": 0.0,
+    },
+    "voxel-fit": {  # no paper's; voxels, opacity and step of sunset1995/DirectVoxGO, configs/default.py
+        "voxels": 160**3,
+        "initial_opacity": 1e-2,
+        "step_size": 0.5,
+    },
     "hyp-nerf": {  # hyp-nerf/HyP-NeRF, nerf/network_fcblock.py
         "table.log2_hashmap_size": 11,
         "table.levels": 16,

@@ -52,7 +52,7 @@ def test_attributes_and_depth_of_a_tilted_plane_are_those_of_its_points():
 
 @pytest.mark.parametrize("inside", [0, 30, 3000], ids=["large", "pixels", "tenth of a pixel"])
 def test_sums_are_areas_and_gradients_the_areas_that_edges_sweep(inside):
-    """Of a polygon, in the mean over its places on the grid of pixels: also where triangles are smaller than a pixel."""
+    """Of a polygon, in the mean over its places on the grid of pixels, also with triangles smaller than a pixel."""
     corners, faces = fan(7, 11.0, inside=inside)
     colours, sums, gradients = torch.ones(len(corners), 1), [], []
     for shift in shifts(60):

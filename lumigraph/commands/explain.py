@@ -93,6 +93,45 @@ class ExplainEncodings:
 
 
 @dataclass(frozen=True)
+class ExplainFitting:
+    """Fit a sphere to a mesh or to photographs of an object by gradients, in large steps and in plain ones.
+
+    One picture shows the target and the surfaces after some steps, one chart the errors; their numbers are beside them
+    as JSON. A mesh is photographed by the rasteriser, and has a chamfer distance too.
+    """
+
+    data: Annotated[Positional[str], needed("MESH_OR_PHOTOS")]
+    """A mesh file, or photographs with alpha, as `lumigraph train` takes them."""
+    output: Annotated[Path | None, option("FOLDER", "explained/DATA-fitting")] = None
+    """Folder of fitting.png, fitting.svg and fitting.json."""
+    overwrite: Overwrite = False
+    steps: Annotated[Annotated[int, between(2, 100_000)], option("N")] = 200
+    """Steps of either fit, of four photographs each; more come closer to the target."""
+    seed: SeedOption = 0
+
+    def run(self) -> int:
+        from ..capture import open_dataset
+        from ..datasets.scene import Scene
+        from ..datasets.shapes import Shapes
+        from ..explain.fitting import compare, draw
+        from ..files import claim
+
+        name = scene_name(self.data)
+        folder = self.output or Path("explained") / f"{name}-fitting"
+        for file in ("fitting.png", "fitting.svg", "fitting.json"):
+            claim(folder / file, "figure", self.overwrite)
+        data = open_dataset(self.data)
+        if not isinstance(data, Scene | Shapes):
+            raise LumigraphError(f"{self.data} holds {data.kind}; name one mesh, or photographs of one object")
+        target, fits = compare(data, self.steps, self.seed)
+        draw(folder, name, target, fits)
+        rows = {fit.name: f"{fit.errors[-1]:.2g} squared error" for fit in fits}
+        rows |= {f"{fit.name}, chamfer": f"{fit.chamfer[-1]:.2f} % of the diagonal" for fit in fits if fit.chamfer}
+        show(rows | {"files": str(folder)})
+        return 0
+
+
+@dataclass(frozen=True)
 class ExplainRay:
     """Draw density, transmittance, weights, samples and accumulated colour along the ray of a pixel.
 
@@ -174,6 +213,7 @@ def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:
 What = (
     Annotated[ExplainActivation, subcommand("activation")]
     | Annotated[ExplainEncodings, subcommand("encodings")]
+    | Annotated[ExplainFitting, subcommand("fitting")]
     | Annotated[ExplainRay, subcommand("ray")]
 )
 

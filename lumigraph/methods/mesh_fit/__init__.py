@@ -10,13 +10,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 import torch
 import trimesh
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
 from ...budget import BY_PHOTOGRAPH, Efforts
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
+from ...components.fields.level_set import level_set
 from ...components.sampling.occupancy import visual_hull
 from ...components.training.schedules import falling
 from ...datasets.mesh import Mesh
@@ -29,7 +30,7 @@ from ...method.capabilities import HasMesh, can, needs
 from ...system.work import at_work
 from .optimizer import UniformAdam
 from .picture import Picture, picture
-from .surface import Surface, face_normals, of_level, remeshed, vertex_normals
+from .surface import Surface, face_normals, remeshed, vertex_normals
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class Config:
 
 
 SPHERE_RADIUS = 0.5  # of half the box of interest along each axis
-HULL_BLUR = 0.7  # cells of deviation by which a hull of cells is smoothed
+HULL_FINER, HULL_REACH = 2, 4.0  # cells of the hull for one of the first mesh; cells of the hull that distances reach
+HULL_BLUR = 1.0  # cells of deviation by which a hull of cells, and a teacher's distances, are smoothed
 TEACHER_VIEWS, TEACHER_SIZE = 32, 200  # depth maps of a teacher, and pixels of their longer side
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance
 SOLID = (0.5, 0.5, 0.5)  # grey of a mesh that no photograph has coloured
@@ -92,8 +94,9 @@ class MeshFit(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """From the hull, with a photograph or two a step and a little smoothness against the noise of that."""
-        c = Config(start="hull", first_cells=48, cells=96, remeshings=2, views_per_step=2)
-        return replace(c, learning_rate=5e-3, final_learning_rate=5e-4, laplacian_weight=0.01, normal_weight=0.02)
+        c = Config(start="hull", first_cells=48, cells=80, remeshings=2, views_per_step=2)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=2e-3, colour_learning_rate=0.1)
+        return replace(c, laplacian_weight=0.01, normal_weight=0.02)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -158,7 +161,8 @@ class MeshFit(Method):
             colour.append(error.abs().mean())
             square.append(error.detach().square().mean())
             if photograph.alpha is not None:
-                silhouette.append(photograph.trusted((seen.opacity - photograph.alpha)[..., None]).abs().mean())
+                off = (seen.opacity - photograph.alpha).abs()
+                silhouette.append((off if photograph.mask is None else off[photograph.mask]).mean())
         terms = {"colour": torch.stack(colour).mean()}
         if silhouette:
             terms["mask"] = c.mask_weight * torch.stack(silhouette).mean()
@@ -228,7 +232,7 @@ def sphere(frame: Frame, cells: int) -> Mesh:
 
 def hull(scene: Scene, cells: int) -> Mesh:
     """The visual hull of photographs with alpha, its stairs smoothed. Raises LumigraphError where nothing is left."""
-    resolution = 1 << max(5, math.ceil(math.log2(cells * 2 / box_side(scene.frame))))
+    resolution = 1 << max(5, math.ceil(math.log2(HULL_FINER * cells * 2 / box_side(scene.frame))))
     solid = visual_hull(scene, resolution).numpy()
     low, high = (np.array(corner) for corner in scene.frame.bounds)
     centres = (np.arange(resolution) + 0.5) * 2 / resolution - 1
@@ -240,8 +244,9 @@ def hull(scene: Scene, cells: int) -> Mesh:
             "No part of the box is opaque in all photographs, so there is no silhouettes' hull; check poses and alpha, "
             "or give --start sphere"
         )
-    values = gaussian_filter(solid.astype(np.float64), HULL_BLUR) - 0.5
-    return remeshed(of_level(values, np.full(3, 1 / resolution - 1), 2 / resolution), cells)
+    away = (distance_transform_edt(solid) - distance_transform_edt(~solid)).clip(-HULL_REACH, HULL_REACH)
+    values = gaussian_filter(away, HULL_BLUR) - math.sqrt(3) / 2  # by which `visual_hull` is too large
+    return remeshed(level_set(values, np.full(3, 1 / resolution - 1), 2 / resolution), cells)
 
 
 def surface_of(teacher: Any, cameras: Camera, cells: int) -> Mesh:
@@ -256,7 +261,7 @@ def surface_of(teacher: Any, cameras: Camera, cells: int) -> Mesh:
     value = torch.where(distance.isnan(), torch.where(pictured, 1.0, -1.0), -distance).view(shape).numpy()
     if not value.min() < 0 < value.max():
         raise LumigraphError("The teacher shows no surface inside the box, so no mesh can begin; train it for longer")
-    made = of_level(gaussian_filter(value, HULL_BLUR), low, cell)
+    made = level_set(gaussian_filter(value, HULL_BLUR), low, cell)
     points = torch.from_numpy(made.vertices).float()
     normals = vertex_normals(points, torch.from_numpy(made.faces))
     rgb = fused_colours(points, normals, maps, Tolerance(3 * cell))

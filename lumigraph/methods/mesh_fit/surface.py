@@ -11,16 +11,17 @@ from scipy import sparse
 from scipy.ndimage import binary_dilation, label
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 from torch import Tensor, nn
 
 from ... import kernels
+from ...components.fields.level_set import level_set
 from ...components.training.row_optimizers import exchange
 from ...datasets.mesh import Mesh
 from ...datasets.shapes.triangles import Triangles
 from ...method import Part
 
 NEAR_CELLS = 2  # cells around a surface in which its distance is computed; beyond them only the side matters
+MAX_GRADIENT = 4.0  # of a vertex, in means of those that have one
 BLENDED = 3  # old vertices that give a new one its colour
 
 
@@ -49,7 +50,8 @@ class Solver:
 
 
 class _Smooth(torch.autograd.Function):
-    """x = (I + smoothness L)^-1 u. The matrix is symmetric, so gradients take the same way."""
+    """x = (I + smoothness L)^-1 u. The matrix is symmetric, so gradients take the same way. Their length is limited at
+    each vertex first: where a triangle is seen nearly edge-on, the slope of its colours has no bound."""
 
     @staticmethod
     def forward(ctx: Any, u: Tensor, solver: Solver) -> Tensor:  # type: ignore[override]
@@ -58,7 +60,9 @@ class _Smooth(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        return ctx.solver(grad), None
+        length = grad.norm(dim=-1, keepdim=True)
+        limit = MAX_GRADIENT * length[length > 0].mean().nan_to_num()
+        return ctx.solver(grad * (limit / length.clamp_min(1e-30)).clamp(max=1.0)), None
 
 
 class Surface(Part):
@@ -173,14 +177,6 @@ def vertex_normals(vertices: Float[Tensor, "vertex 3"], faces: Int[Tensor, "face
     return nn.functional.normalize(total, dim=-1)
 
 
-def of_level(values: Float[np.ndarray, "x y z"], low: np.ndarray, cell: float, colour: int = 160) -> Mesh:
-    """The grey surface at which values on a grid are zero, positive inside, closed at the grid's end."""
-    closed = np.pad(values, 1, constant_values=min(float(values.min()), -1e-3))
-    vertices, faces, _, _ = marching_cubes(closed.astype(np.float32), 0.0, gradient_direction="ascent")
-    vertices = low + (vertices - 1) * cell
-    return Mesh(vertices.astype(np.float64), faces.astype(np.int64), np.full((len(vertices), 3), colour, np.uint8))
-
-
 def remeshed(mesh: Mesh, cells: int) -> Mesh:
     """The same surface from a grid of its signed distance, of so many cells along its longest side: triangles of one
     size, without those that lie inside it or go through each other."""
@@ -201,7 +197,7 @@ def remeshed(mesh: Mesh, cells: int) -> Mesh:
         first = np.unravel_index(int(np.argmax(regions == region)), shape)
         inside = triangles.winding(low + cell * np.array([first]))[0] > 0.5
         values[regions == region] = NEAR_CELLS * cell if inside else -NEAR_CELLS * cell
-    made = of_level(values, low, cell)
+    made = level_set(values, low, cell)
     away, nearest = cKDTree(mesh.vertices).query(made.vertices, BLENDED)
     weights = 1 / np.maximum(away, 1e-9)
     colours = (mesh.colours[nearest] * weights[..., None]).sum(1) / weights.sum(1, keepdims=True)

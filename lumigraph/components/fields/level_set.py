@@ -1,0 +1,23 @@
+"""Level sets of grids as meshes (Lorensen and Cline 1987)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from skimage.measure import marching_cubes
+
+from ...datasets.mesh import Mesh
+
+GREY = 160  # of a mesh that has no colours yet
+
+
+def level_set(values: Float[np.ndarray, "x y z"], low: Float[np.ndarray, " 3"], cell: float | np.ndarray) -> Mesh:
+    """The grey surface at which values on a grid are zero, positive inside; closed where the grid ends.
+
+    low:  place of the first corner
+    cell: distance of corners, one for all axes or one for each
+    """
+    closed = np.pad(values, 1, constant_values=min(float(values.min()), -1e-3))
+    vertices, faces, _, _ = marching_cubes(closed.astype(np.float32), 0.0, gradient_direction="ascent")
+    vertices = low + (vertices.astype(np.float64) - 1) * cell
+    return Mesh(vertices, faces.astype(np.int64), np.full((len(vertices), 3), GREY, np.uint8))

@@ -1,0 +1,181 @@
+"""Voxel fitting: soft occupancy and colour of voxels, fitted to photographs by gradients; a first mesh for mesh-fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
+from torch import Tensor, nn
+
+from ..components.fields.level_set import level_set
+from ..components.fields.voxels import VoxelGrid
+from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
+from ..components.sampling.spaces import space_of
+from ..components.training.photometric import backdrop
+from ..components.training.row_optimizers import LazyAdam
+from ..components.training.schedules import falling
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Batch, Frame, Scene
+from ..errors import LumigraphError
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, between
+from ..method import Field, FieldMethod
+from ..method.field import Colours, Densities, Directions, Points
+from ..volume import composite
+
+Voxels = Annotated[int, between(8, 1 << 28)]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Numbers of a small grid: no paper's. Voxels and opacity at first are those of Sun 2022."""
+
+    occupancy: OccupancyNumbers = OccupancyNumbers(1 << 18, transmittance_threshold=1e-3, occupancy_threshold=0.05)
+    first_voxels: Voxels = 64**3  # voxels at first; fewer are faster, and find the shape sooner
+    voxels: Voxels = 160**3  # voxels in the end; more show more detail, and cost memory and time
+    doublings: Annotated[int, between(0, 20)] = 4  # times that voxels grow in number, at even shares of the budget
+    growing_share: PositiveShare = 0.5  # share of the budget in which they happen
+    initial_opacity: PositiveShare = 0.01  # share of light that a voxel stops at first; higher is harder to clear
+    step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples, in voxels; larger is faster, and coarser
+    learning_rate: LearningRate = 0.3  # of the grid; larger is faster, and noisier
+    final_learning_rate: LearningRate = 0.03  # at the end of the budget
+    mask_weight: NonNegative = 0.1  # of the silhouettes' squared error
+    entropy_weight: NonNegative = 1e-3  # of rays' entropy of opacity; larger makes voxels full or empty
+    variation_weight: NonNegative = 1e-5  # of total variation; larger is smoother
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+MAX_SMOOTHED = 1 << 12  # voxels of a step whose variation counts
+MESH_BLUR = 0.6  # voxels of deviation by which occupancy is smoothed for a mesh
+CLEAR = 3.0  # logits beyond which a voxel is as good as full, or empty
+
+
+class VoxelField(Field):
+    """A grid of logits: how much light a voxel stops, and its colour from everywhere.
+
+        alpha = sigmoid(v_0)      density = -log(1 - alpha) / edge = softplus(v_0) / edge      rgb = sigmoid(v_1..3)
+
+    edge: of a voxel in the end, so that the same logits mean the same density at every resolution
+    """
+
+    cheap_density: ClassVar[bool] = True
+
+    def __init__(self, config: Config, frame: Frame):
+        super().__init__()
+        self.config = config
+        self.grid = VoxelGrid([list(corner) for corner in frame.bounds], config.first_voxels, 4)
+        self.shift = math.log(config.initial_opacity / (1 - config.initial_opacity))
+        volume = math.prod(high - low for low, high in zip(*frame.bounds, strict=True))
+        self.edge = (volume / config.voxels) ** (1 / 3)
+
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Float[Tensor, "point 3"]]:
+        values = self.grid(points)
+        return nn.functional.softplus(values[:, 0] + self.shift) / self.edge, values[:, 1:]
+
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
+        return features.sigmoid()
+
+    @property
+    def step_length(self) -> float:
+        return self.config.step_size * self.grid.edge
+
+
+class VoxelFit(FieldMethod):
+    """Voxels in the box of interest that learn, double and become a mesh."""
+
+    Config = Config
+    network: VoxelField
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        self.network = VoxelField(c, frame)
+        self.sampler = OccupancySampler(frame, space_of(frame), c.occupancy, GridSchedule(begins=0.02, early_steps=0))
+        self.register_buffer("doubled", torch.tensor(0))
+        self._adam: LazyAdam | None = None
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        c = Config(OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1))
+        return replace(c, first_voxels=48**3, voxels=112**3, doublings=3, step_size=0.8)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some thousand voxels that double once."""
+        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), first_voxels=12**3, voxels=20**3, doublings=1)
+        return replace(c, learning_rate=0.5, final_learning_rate=0.2)
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """The finest grid; while it learns also its gradient and two moments."""
+        return super().further_bytes(frame, config, learning) + 16 * config.voxels * (4 if learning else 1)
+
+    # Learning
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        if data.frame.is_open:
+            raise LumigraphError(
+                "voxel-fit fills the box of interest alone, and this capture goes on to the horizon; train dvgo, or "
+                "cut out the photographs' object and give them an alpha channel"
+            )
+        super().begin(data, seconds)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """Squared errors of colours and silhouettes, entropy of opacity, total variation."""
+        c, generator = self.config, self.random(step)
+        (samples,), terms = self.learn(batch.rays, generator)
+        look = samples.look(self.network)
+        background = backdrop(batch, self.background, generator)
+        seen = composite(look.samples, look.density, look.rgb, background)
+        error = (seen.rgb - batch.before(background)).square().mean()
+        self.figures["mse"] = float(error.detach())
+        terms |= {"colour": error}
+        if batch.alpha is not None and c.mask_weight:
+            terms["mask"] = c.mask_weight * (seen.opacity - batch.alpha).square().mean()
+        if c.entropy_weight:
+            a = seen.opacity.clamp(1e-6, 1 - 1e-6)
+            terms["entropy"] = c.entropy_weight * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
+        if c.variation_weight and len(look.samples):
+            points, _ = look.samples.along(batch.rays)
+            terms["variation"] = c.variation_weight * self.network.grid.variation(points, MAX_SMOOTHED, generator)
+        return terms
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        self._adam = LazyAdam([{"params": [self.network.grid.values], "name": "grid"}], betas=(0.9, 0.99))
+        return [self._adam, *super().optimizers()]
+
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
+        return {"grid": falling(self.config.learning_rate, self.config.final_learning_rate, progress)}
+
+    def before_step(self, step: int, progress: float) -> None:
+        """Double the number of voxels at even shares of the budget."""
+        c, grid = self.config, self.network.grid
+        due = min(c.doublings, int(progress / c.growing_share * (c.doublings + 1)))
+        if due > int(self.doubled):
+            grid.rebuild(
+                grid.box, round(c.first_voxels * (c.voxels / c.first_voxels) ** (due / c.doublings)), self._adam
+            )
+            self.doubled.fill_(due)
+            self.sampler.stale = True
+        super().before_step(step, progress)
+
+    # As a mesh
+
+    @torch.no_grad()
+    def mesh(self) -> Mesh:
+        """The surface between voxels that stop more than half of the light and those that stop less, with colours.
+        Raises LumigraphError where none does."""
+        grid = self.network.grid
+        values = (grid.values[:, 0] + self.network.shift).view(grid.shape).cpu().numpy().clip(-CLEAR, CLEAR)
+        values = gaussian_filter(values, MESH_BLUR)
+        if not (values > 0).any():
+            raise LumigraphError("No voxel stops half of the light, so there is no surface; train for longer")
+        low, high = grid.box.cpu().double().numpy()
+        made = level_set(values, low, (high - low) / (np.array(grid.shape) - 1))
+        points = torch.from_numpy(made.vertices).float().to(self.device)
+        rgb = (grid(points)[:, 1:].sigmoid() * 255).round().to(torch.uint8)
+        return replace(made, colours=rgb.cpu().numpy())
