@@ -1,4 +1,4 @@
-"""Shapes side by side: what each method's run holds at each level of detail, and completions of held-out members.
+"""Shapes side by side: scores of each run at each level of detail, and completions of held-out members.
 
 OUTPUT/shapes.json has all figures, OUTPUT/shapes.md the same as tables.
 """
@@ -28,7 +28,7 @@ FRAME_SIZE, FRAMES = 400, 3  # pixels a side of the pictures that are timed, and
 
 @dataclass(frozen=True)
 class Held:
-    """What a run holds of the shapes that it learnt, at a level of detail; 0 of methods without levels.
+    """Scores of a run's own shape at a level of detail; level 0 of methods without levels.
 
     seconds: of training;  bytes: of the model, or of what the level needs;  frame_seconds: of a picture
     """
