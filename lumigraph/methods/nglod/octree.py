@@ -17,7 +17,7 @@ from ...kernels.octree_cells import Tree, code_of
 
 CHILDREN = torch.cartesian_prod(*[torch.arange(2)] * 3)  # child 4 x + 2 y + z of a cell
 MARGIN = 0.1  # sides of a cell beyond its corners within which a surface still makes a cell
-FIRST_FEATURES = 0.01  # deviation of features at first
+FIRST_FEATURES = 1e-4  # deviation of features at first: a corner that few points reach adds little to coarser levels
 
 
 class LevelCells(nn.Module):
