@@ -1,4 +1,4 @@
-"""`bench shapes`: evidence of shapes, retrieval of the training shape that fits it, tables of levels and completions."""
+"""`bench shapes`: evidence of shapes, retrieval of the training shape that fits it, tables of both."""
 
 from __future__ import annotations
 

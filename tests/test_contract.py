@@ -422,6 +422,16 @@ def test_its_density_becomes_a_mesh(lenient):
     around(torch.from_numpy(mesh.vertices))
 
 
+def test_its_distance_becomes_a_mesh(lenient):
+    if not can(lenient.method, HasDistance):
+        return
+    mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, views=6, smooth=0)
+    around(torch.from_numpy(mesh.vertices))
+    with torch.no_grad():
+        distance = lenient.method.distance(torch.from_numpy(mesh.vertices).float().to(lenient.device))
+    assert float(distance.abs().median()) < 1 / 16
+
+
 def test_it_becomes_a_film(taught, tmp_path):
     cameras = camera_path("orbit", taught.cameras, taught.method.frame, 2, (16, 16)).to(taught.device)
     about = film(taught.method, cameras, tmp_path / "orbit.mp4", depth=True, pictures="png")

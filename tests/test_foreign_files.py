@@ -70,6 +70,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png", "bench/lock.json")
         + ("bench/runs/photographs-voxel-grid-1steps-seed0.log",),
     ),
+    "bench shapes": (
+        "bench shapes --methods distance-grid --shapes photographs --output bench --steps 1",
+        ("bench/shapes.json", "bench/shapes.md"),
+    ),
     "infer": ("infer prior photographs --output found", ("found/", "found", "found/lock.json")),
     "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
     "train, in blocks": (

@@ -96,7 +96,7 @@ def test_a_picture_shows_the_nearest_surface():
     disc = (
         torch.pi * (24 / torch.tan(torch.tensor(25.0).deg2rad()) * torch.tan(torch.asin(torch.tensor(0.9 / 2.6)))) ** 2
     )
-    assert float(shot.alpha.sum()) == pytest.approx(float(disc), rel=0.05)
+    assert float(shot.alpha.sum()) == pytest.approx(float(disc), rel=0.08)  # pixels of its edge count whole
     row = shot.rgb[24, :, 0][shot.alpha[24] > 0]
     assert row[len(row) // 2] > row[0] + 0.3 and row[len(row) // 2] > row[-1] + 0.3
 

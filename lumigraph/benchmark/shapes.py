@@ -1,4 +1,4 @@
-"""Shapes side by side: what each method's run holds at each level of detail, and completions of held-out members.
+"""Shapes side by side: scores of each run at each level of detail, and completions of held-out members.
 
 OUTPUT/shapes.json has all figures, OUTPUT/shapes.md the same as tables.
 """
@@ -12,11 +12,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
 
+import torch
+
 from .. import files
 from ..camera import ring
-from ..datasets.shapes import Shapes
+from ..datasets.shapes import Shape, Shapes
 from ..evaluation.completion import Completed, completions
-from ..evaluation.shapes import ShapeScore, evaluate_shapes
+from ..evaluation.shapes import ShapeScore, compare_shapes, surface_of
 from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasLevels, can, needs
@@ -28,7 +30,7 @@ FRAME_SIZE, FRAMES = 400, 3  # pixels a side of the pictures that are timed, and
 
 @dataclass(frozen=True)
 class Held:
-    """What a run holds of the shapes that it learnt, at a level of detail; 0 of methods without levels.
+    """Scores of a run's own shape at a level of detail; level 0 of methods without levels.
 
     seconds: of training;  bytes: of the model, or of what the level needs;  frame_seconds: of a picture
     """
@@ -70,14 +72,16 @@ def measure(
     files.write_bytes(output / "shapes.md", page(held, completed).encode(), "benchmark")
 
 
+@torch.no_grad()
 def levels_of(run: Run, shapes: Shapes, points: int, cells: int) -> Iterable[Held]:
     """A run's shape at each level of detail."""
-    method = run.method()
+    method, true = run.method(), shapes.members[0]
     levels = range(1, needs(method, HasLevels).levels + 1) if can(method, HasLevels) else [0]
     for level in levels:
         told = method.given(level=float(level)) if level else method
         told.eval()
-        (score,) = evaluate_shapes(told, shapes, "train", points=points, cells=cells).shapes
+        learnt = Shape(true.name, surface_of(told, true.frame, cells), true.frame)
+        score = compare_shapes(true, learnt, told, points)
         stored = needs(method, HasLevels).level_bytes(level) if level else run.model_bytes
         seconds = run.state.seconds
         yield Held(

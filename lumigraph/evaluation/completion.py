@@ -23,6 +23,7 @@ from .shapes import ShapeScore, compare_shapes, seen_points, surface_of
 
 SCAN_SIZE, SCAN_CAMERA = 128, 3  # pixels of the camera that scans a shape, and its number among a ring's
 CLOUD_POINTS = 300  # points of a cloud as evidence (Mescheder 2019, section 4.3)
+AWAY_COSINE = -0.3  # between a scanned normal and the way to the camera below which its face is turned
 PICTURE_SIZE, PICTURE_VIEWS = 64, 24  # pixels of a picture, and views of training shapes that it is compared with
 RETRIEVAL_POINTS = 2000  # points of each training shape that a cloud is compared with
 
@@ -62,7 +63,8 @@ def known_of(shape: Shape, kind: Evidence, generator: torch.Generator) -> Known:
         camera = ring(shape.frame.bounds, size=SCAN_SIZE)[SCAN_CAMERA]
         points, _ = seen_points(shape, camera)
         facing = shape.normals_near(points)  # turned as a scanner gives them: faces of a mesh may look away
-        away = (facing * (camera.position - points)).sum(-1, keepdim=True) < 0
+        towards = torch.nn.functional.normalize(camera.position - points, dim=-1)
+        away = (facing * towards).sum(-1, keepdim=True) < AWAY_COSINE
         normals = torch.where(away, -facing, facing).double().numpy()
     mesh = Mesh(points.double().numpy(), np.zeros((0, 3), np.int64), np.full((len(points), 3), 160, np.uint8))
     cloud = Shape(shape.name, mesh, shape.frame, normals)

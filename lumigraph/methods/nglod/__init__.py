@@ -57,6 +57,7 @@ class NGLOD(SurfaceMethod):
 
     Config = Config
     learning_rate = exponential_decay
+    rays_per_chunk = 1 << 18  # a whole picture: few samples are kept of each ray
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -70,8 +71,9 @@ class NGLOD(SurfaceMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller codes and decoders, and more points in a step."""
-        c = Config(features=16, hidden_width=64, points_per_step=1 << 13, learning_rate=1e-2)
-        return replace(c, final_learning_rate=5e-4)
+        points = PointNumbers(300_000, near_share=0.8, near_spread=0.04, fine_spread=0.006)
+        c = Config(points, features=16, hidden_width=64, points_per_step=1 << 13, learning_rate=1e-2)
+        return replace(c, final_learning_rate=5e-4, hit_distance=1e-3)
 
     @classmethod
     def smallest(cls) -> Any:

@@ -114,6 +114,13 @@ def trace(
                 if value < hit_distance:
                     if value < 0 and ahead > 0:
                         place = before + ahead / max(ahead - value, np.float32(1e-9)) * (place - before)
+                        x = origins[ray, 0] + place * directions[ray, 0]
+                        y = origins[ray, 1] + place * directions[ray, 1]
+                        z = origins[ray, 2] + place * directions[ray, 2]
+                        value_at(
+                            x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, inputs,
+                            hidden,
+                        )  # fmt: skip
                     t[ray] = place
                     slope_at(
                         x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, hidden,

@@ -17,10 +17,10 @@ from ...kernels.octree_cells import Tree, code_of
 
 CHILDREN = torch.cartesian_prod(*[torch.arange(2)] * 3)  # child 4 x + 2 y + z of a cell
 MARGIN = 0.1  # sides of a cell beyond its corners within which a surface still makes a cell
-FIRST_FEATURES = 0.01  # deviation of features at first
+FIRST_FEATURES = 1e-4  # deviation of features at first: a corner that few points reach adds little to coarser levels
 
 
-class Cells(nn.Module):
+class LevelCells(nn.Module):
     """Cells of one level: number (x n + y) n + z of each, rising, and which of its eight children are empty and inside
     of the shape, a bit for each.
 
@@ -79,7 +79,7 @@ class Level(nn.Module):
 
     def __init__(self, resolution: int, features: int, hidden_width: int):
         super().__init__()
-        self.cells = Cells(resolution)
+        self.cells = LevelCells(resolution)
         self.features = nn.Parameter(torch.zeros(0, features))
         self.decoder = MLP(features + 3, hidden_width, 1)
 
@@ -175,8 +175,8 @@ class CodeOctree(nn.Module):
         return 1.0 - 2.0 * (bits & 1)
 
     def tables(self, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of the levels up to one, end to end: rows of corners with the start of each level, then the start of each
-        level's features with these; see `loops.trace`."""
+        """Rows of corners with the start of each level, then the start of each level's features with these, of the
+        levels up to one, end to end; see `loops.trace`."""
         levels = [*self.levels][: last + 1]
         indices = [level.cells.made[1].index.flatten().numpy() for level in levels]
         features = [level.features.detach().numpy() for level in levels]

@@ -22,7 +22,7 @@ from ...datasets.shapes import PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Seed, Width, between
-from .networks import VOXELS, OccupancyDecoder, PictureEncoder, PointEncoder, VoxelEncoder
+from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
 Input = Literal["points", "voxels", "picture"]
 
@@ -79,7 +79,7 @@ class OccupancyNetwork(CodedSurface):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        encoders = {"points": PointEncoder, "voxels": VoxelEncoder, "picture": PictureEncoder}
+        encoders = {"points": PointEncoder, "voxels": VoxelEncoder, "picture": WholePictureEncoder}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             self.encoder = encoders[c.input](c.code, c.encoder_width)

@@ -62,7 +62,7 @@ class VoxelEncoder(nn.Module):
         return self.last(x.flatten(1).relu())
 
 
-class PictureEncoder(nn.Module):
+class WholePictureEncoder(nn.Module):
     """A small residual network of pictures in grey, in place of the paper's ResNet-18 with weights of ImageNet."""
 
     def __init__(self, code: int, width: int):
