@@ -16,6 +16,7 @@ from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.training.regularizers import (
     near_thickness,
     normalized_distance,
+    opacity_entropy,
     patches,
     roughness,
     unseen_cameras,
@@ -213,6 +214,21 @@ def test_the_loss_of_the_network_is_the_release_s():
             for j in range(SIDE - dj)
         ]
         torch.testing.assert_close(terms[name], depth * torch.stack(pairs).sum() / (2 * SIDE * (SIDE - 1)))
+
+
+def test_half_transparent_patches_of_objects_cost_their_entropy():
+    """Sun 2022, eq. 13: log 2 at an opacity of a half, none at 0 or 1; open captures are opaque everywhere."""
+    a = torch.tensor([0.0, 0.5, 1.0, 0.1])
+    expected = (math.log(2) - 0.1 * math.log(0.1) - 0.9 * math.log(0.9)) / 4
+    assert float(opacity_entropy(a)) == pytest.approx(expected, rel=1e-4)
+    scene, config = tiny.scene(), changed(RegNeRF.smallest(), opacity_weight=0.5, likelihood_weight=0.0)
+    for frame, there in (scene.frame, True), (replace(scene.frame, reach=4.0, has_alpha=False), False):
+        method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
+        method.before_step(0, 1.0)
+        terms = method.loss(method.batch(scene, chance()), 0)
+        assert ("opacity" in terms) == there
+        if there:
+            assert 0 < float(terms["opacity"].detach()) <= 0.5 * math.log(2)
 
 
 def test_noise_is_added_to_densities_in_training_alone():
