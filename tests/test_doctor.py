@@ -157,6 +157,17 @@ def test_the_worst_photographs_stand_in_the_report(learnt):
     assert checked is not None and checked.findings == found and len(checked.residuals) == len(wrong)
     page = write_report(run).read_text()
     assert "Photographs to look at" in page and "ball_10" in page and "mirrored" in page
+    asked = [
+        "numbers to learn",
+        "model",
+        "of a photograph",
+        "of training",
+        "PSNR of training",
+        "Photographs to",
+        "Settings",
+    ]
+    places = [page.index(f">{words}") for words in asked]
+    assert places == sorted(places)
     assert (run.folder / RESULT_FILE).exists()
 
 

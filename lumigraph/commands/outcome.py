@@ -82,11 +82,14 @@ def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str
     gap:   dB by which training photographs are better
     worst: names of held-out photographs, lowest PSNR first
     """
+    from ..capture.doctor import label
+
     priors = [name for part in method.parts for name in part.few_view_priors]
     applied = f"although priors were on ({', '.join(priors)})" if priors else "and no prior for few photographs was on"
-    near = f", first from near {' and '.join(worst[:WORST_VIEWS])}" if worst else ""
+    near = f", first from near {' and '.join(map(label, worst[:WORST_VIEWS]))}" if worst else ""
     steps = [f"more photographs help more than time{near}"]
-    if run.settings.config.get("few_views") not in (None, "yes") and not priors:
+    groups = [run.settings.config, *(x for x in run.settings.config.values() if isinstance(x, dict))]
+    if not priors and any(group.get("few_views") in ("auto", "no") for group in groups):
         steps.append("try --few-views yes")
     other = next(name for name in OTHER_METHODS if name != run.method_name)
     steps.append(f"compare: {typed('train', other, run.settings.scene.source)}")

@@ -22,7 +22,7 @@ ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
 HANDLE = 0.25  # length of a handle's arrows, in radii of the subject
 CIRCLE_SEGMENTS = 64  # pieces of a drawn circle
-NUMBER_STEP = 0.001  # scene units: step of the numbers
+NUMBER_STEP, DIGITS = 0.001, 3  # scene units: step of the numbers, which have as many digits
 STRENGTH_STEP = 0.02
 DOUBLE_CLICK_SECONDS = 0.5  # seconds between two clicks that are a double click, at most
 DOUBLE_CLICK_SHIFT = 0.02  # distance between them, as a share of the window
@@ -53,14 +53,14 @@ class CropPanel:
         self._listening, self._last_click = False, (-math.inf, (0.0, 0.0))  # its time and place
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
-        gui, (sphere, (lower, upper)) = client.gui, shared.subject_crops()
-        self._size, self.cleaned = sphere.radius, False
+        gui, (middle, radius, lower, upper) = client.gui, self._around_subject()
+        self._size, self.cleaned = radius, False
         with shared.tabs["Crop"]:
             self._shape = gui.add_dropdown("Show", (ALL, BOX, SPHERE))
             self._lower = gui.add_vector3("Lower", lower, step=NUMBER_STEP, visible=False)
             self._upper = gui.add_vector3("Upper", upper, step=NUMBER_STEP, visible=False)
-            self._middle = gui.add_vector3("Middle", sphere.middle, step=NUMBER_STEP, visible=False)
-            self._radius = gui.add_number("Radius", sphere.radius, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
+            self._middle = gui.add_vector3("Middle", middle, step=NUMBER_STEP, visible=False)
+            self._radius = gui.add_number("Radius", radius, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
             self._fit = gui.add_button("Fit to subject", hint="The sphere, or its box, around what the cameras look at")
             self._fit.on_click(lambda _: self.fit(SPHERE if self._shape.value == ALL else None))
             floats = shared.is_cloud and not shared.turns.training
@@ -102,16 +102,21 @@ class CropPanel:
 
     def fit(self, shape: str | None = None) -> None:
         """Set sphere and box to the subject of the capture. shape: shown from now on; None leaves it"""
-        sphere, (lower, upper) = self._shared.subject_crops()
+        middle, radius, lower, upper = self._around_subject()
         self._following = True
         try:
             if shape is not None:
                 self._shape.value = shape
-            self._middle.value, self._radius.value = sphere.middle, sphere.radius
+            self._middle.value, self._radius.value = middle, radius
             self._lower.value, self._upper.value = lower, upper
         finally:
             self._following = False
         self._update()
+
+    def _around_subject(self) -> tuple[Vector, float, Vector, Vector]:
+        """Middle and radius of the subject's sphere, and the corners of its box."""
+        sphere, (lower, upper) = self._shared.subject_crops()
+        return vector(sphere.middle), round(sphere.radius, DIGITS), vector(lower), vector(upper)
 
     @property
     def drawn(self) -> bool:
@@ -224,7 +229,8 @@ class CropPanel:
 
 
 def vector(values: Any) -> Vector:
-    x, y, z = (float(value) for value in values)
+    """A vector as the panel's numbers show it."""
+    x, y, z = (round(float(value), DIGITS) for value in values)
     return x, y, z
 
 
