@@ -32,6 +32,7 @@ MIN_POINTS = 16  # sparse points in the box, from which the first sphere is foun
 FIRST_RADIUS = 0.5  # radius of the first sphere, of that around all that is known to matter, section E.1
 ROOM_RADIUS = 0.9  # the same of a hollow sphere, seen from inside
 CLEAR_RADIUS = 0.5  # largest radius of it, of the distance from its middle to the nearest camera
+TAPS = 5  # evaluations of the hash table for each section: in its middle, and around it for the gradient
 MIN_OPACITY = 1e-3  # opacities of the mask term stay so far from 0 and 1, where its slope has no end
 
 
@@ -124,9 +125,11 @@ class NeuS(FieldMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        """Activations of a step of the networks, with those of their gradients."""
-        if config.field == "hash" or not learning:
+        """Activations of a step: of the networks with those of their gradients, or of the table with its taps."""
+        if not learning:
             return 0
+        if config.field == "hash":
+            return config.table.activation_bytes(TAPS * config.samples_per_step, config.hidden_width)
         n = config.network
         return 8 * config.rays.samples_per_step * config.hidden_width * (n.depth + n.colour_depth)
 
@@ -161,7 +164,8 @@ class NeuS(FieldMethod):
         anywhere = self.network.shape.surface(self._anywhere(len(batch), generator))
         terms["eikonal"] = c.eikonal_weight * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
         if c.curvature_weight and laplacian:
-            terms["curvature"] = c.curvature_weight * laplacian[0][inside].abs().mean()
+            bent = laplacian[0][inside].abs()
+            terms["curvature"] = c.curvature_weight * bent.sum() / max(len(bent), 1)
         if batch.alpha is not None and c.mask_weight:
             terms["mask"] = c.mask_weight * mask_error(rendering.opacity, batch.alpha)
         return terms
