@@ -130,7 +130,7 @@ class PlenOctrees(FieldMethod):
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
-        """As deep as the paper's octree, where photographs have so many pixels: coarser leaves lose detail for good."""
+        """The paper's depth, where photographs have so many pixels: coarser leaves lose detail for good."""
         return replace(cls.preset(device), octree_depth=cls.Config.octree_depth)
 
     @classmethod
