@@ -255,10 +255,9 @@ def tangents(
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
     weighted = np.hstack([along, turned]) * np.linalg.norm(face_normals(vertices, faces), axis=-1, keepdims=True)
     total = np.stack([np.bincount(faces.ravel(), np.repeat(x, 3), len(vertices)) for x in weighted.T], -1)
-    total[:, :3] -= (total[:, :3] * normals).sum(-1, keepdims=True) * normals
-    total[:, :3] /= np.maximum(np.linalg.norm(total[:, :3], axis=-1, keepdims=True), 1e-30)
-    total[:, 3] = np.where(total[:, 3] < 0, -1, 1)
-    return total
+    along = total[:, :3] - (total[:, :3] * normals).sum(-1, keepdims=True) * normals
+    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-30)
+    return np.hstack([along, np.where(total[:, 3:] < 0, -1.0, 1.0)])
 
 
 def face_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "face 3"]:
