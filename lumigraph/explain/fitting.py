@@ -23,6 +23,7 @@ from ..errors import LumigraphError
 from ..figures import Row, contact_sheet, save_picture
 from ..figures.charts import Series, line_chart, standalone
 from ..files import write_bytes, write_json
+from ..files.ranges import changed
 from ..methods.mesh_fit import Config, MeshFit
 from ..system.progress import track
 
@@ -31,7 +32,12 @@ LIGHT = (0.4, -0.5, 0.77)  # direction to the light of shaded surfaces
 AMBIENT = 0.3
 POINTS = 10_000  # on each surface, of the chamfer distance
 COLUMNS = 6  # steps that are drawn
-WAYS = {"large steps": {}, "plain steps": {"smoothness": 0.0}}
+CELLS = 64  # of the sphere's triangles along its longest side
+# Rates of about the same movement: the preconditioner shortens steps.
+WAYS: dict[str, dict[str, float]] = {
+    "large steps": {"learning_rate": 0.3, "final_learning_rate": 0.03},
+    "plain steps": {"learning_rate": 0.02, "final_learning_rate": 0.002, "smoothness": 0.0},
+}
 
 
 @dataclass(frozen=True)
@@ -65,8 +71,9 @@ def compare(data: Scene | Shapes, steps: int, seed: int = 0) -> tuple[Float[Tens
     else:
         target = scene.photograph(first).before(scene.frame.background)
     chosen = sorted({round((steps - 1) * (k / (COLUMNS - 1)) ** 2) for k in range(COLUMNS)})
-    config = replace(MeshFit.cpu_preset(), start="sphere", first_cells=32, remeshings=0, seed=seed, views_per_step=4)
-    return target, [fitted(scene, replace(config, **way), name, chosen, camera, shape) for name, way in WAYS.items()]
+    config = Config(first_cells=CELLS, remeshings=0, views_per_step=4, seed=seed)
+    ways = {name: changed(config, **way) for name, way in WAYS.items()}
+    return target, [fitted(scene, way, name, chosen, camera, shape) for name, way in ways.items()]
 
 
 def fitted(scene: Scene, config: Config, name: str, chosen: Sequence[int], camera: Camera, shape: Shape | None) -> Fit:

@@ -39,12 +39,12 @@ class Config:
 
     start: Literal["sphere", "hull"] = "sphere"  # first mesh: a sphere, or the hull of the photographs' silhouettes
     smoothness: NonNegative = 19.0  # lambda of I + lambda L, eq. 9; larger moves more of the surface at once
-    learning_rate: LearningRate = 1e-2  # of vertices, in scene units; larger is faster, and folds the mesh
-    final_learning_rate: LearningRate = 1e-3  # at the end of the budget; smaller settles finer detail
+    learning_rate: LearningRate = 0.3  # of u, in scene units; larger is faster, and folds the mesh
+    final_learning_rate: LearningRate = 0.03  # at the end of the budget; smaller settles finer detail
     colour_learning_rate: LearningRate = 0.03  # of the vertices' colours
-    first_cells: Annotated[int, between(8, 256)] = 24  # cells of first triangles along the longest side
-    cells: Annotated[int, between(8, 512)] = 96  # of the last ones; more show more detail, and cost time and noise
-    remeshings: Annotated[int, between(0, 20)] = 4  # from the first to the last; 0 keeps the first triangles
+    first_cells: Annotated[int, between(8, 256)] = 64  # cells of first triangles along the longest side
+    cells: Annotated[int, between(8, 512)] = 128  # of the last ones; more show more detail, and cost time and noise
+    remeshings: Annotated[int, between(0, 20)] = 2  # from the first to the last; 0 keeps the first triangles
     remeshing_until: Share = 0.6  # share of the budget in which they happen
     views_per_step: Annotated[int, between(1, 64)] = 8  # photographs of a step; more are steadier, and cost time
     mask_weight: NonNegative = 1.0  # of the silhouettes' absolute error
@@ -95,14 +95,15 @@ class MeshFit(Method):
     def cpu_preset(cls) -> Any:
         """From the hull, with a photograph or two a step and a little smoothness against the noise of that."""
         c = Config(start="hull", first_cells=48, cells=80, remeshings=2, views_per_step=2)
-        c = replace(c, learning_rate=2e-2, final_learning_rate=2e-3, colour_learning_rate=0.1)
+        c = replace(c, learning_rate=6e-2, final_learning_rate=6e-3, colour_learning_rate=0.1)
         return replace(c, laplacian_weight=0.01, normal_weight=0.02)
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred triangles that are remeshed once."""
-        c = Config(first_cells=8, cells=10, remeshings=1, remeshing_until=0.5, views_per_step=2, learning_rate=2e-2)
-        return replace(c, colour_learning_rate=0.2, laplacian_weight=0.01, normal_weight=0.01)
+        c = Config(first_cells=8, cells=10, remeshings=1, remeshing_until=0.5, views_per_step=2, learning_rate=3e-2)
+        c = replace(c, final_learning_rate=3e-3, colour_learning_rate=0.2)
+        return replace(c, laplacian_weight=0.01, normal_weight=0.01)
 
     @property
     def near_plane(self) -> float:
