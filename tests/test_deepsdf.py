@@ -81,7 +81,7 @@ def test_the_error_is_that_of_clamped_distances(monkeypatch):
     )
     terms = method.loss(batch, 0)
     assert float(terms["distance"]) == pytest.approx((0.02 + 0 + 0.12) / 3)
-    assert float(terms["code"]) == pytest.approx(0.5 * float(method.codes.rows[0].detach().square().sum()))
+    assert float(terms["code"].detach()) == pytest.approx(0.5 * float(method.codes.rows[0].detach().square().sum()))
 
 
 def test_dropout_follows_the_step_alone_and_ends_with_it():

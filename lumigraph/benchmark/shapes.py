@@ -45,6 +45,7 @@ class Held:
     frame_seconds: float
 
 
+@torch.no_grad()
 def measure(
     runs: Sequence[Path], members: int, points: int, cells: int, output: Path, tell: Callable[[str], object]
 ) -> None:
@@ -72,7 +73,6 @@ def measure(
     files.write_bytes(output / "shapes.md", page(held, completed).encode(), "benchmark")
 
 
-@torch.no_grad()
 def levels_of(run: Run, shapes: Shapes, points: int, cells: int) -> Iterable[Held]:
     """A run's shape at each level of detail."""
     method, true = run.method(), shapes.members[0]

@@ -117,7 +117,6 @@ def seen(picture: Photograph) -> Float[Tensor, "height width"]:
     return picture.before((1.0, 1.0, 1.0)).mean(-1)
 
 
-@torch.no_grad()
 def completions(
     named: Sequence[tuple[str, Any]], shapes: Shapes, members: Sequence[int], points: int, cells: int
 ) -> Iterator[Completed]:

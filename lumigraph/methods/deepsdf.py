@@ -174,7 +174,7 @@ class DeepSDF(CodedSurface):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
-        codes = {"params": [self.codes.rows], "name": "codes"}
+        codes: dict[str, Any] = {"params": [self.codes.rows], "name": "codes"}
         return [torch.optim.Adam([{"params": [*self.decoder.parameters()]}, codes], c.learning_rate, foreach=True)]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:

@@ -29,7 +29,7 @@ class CodedSurface(SurfaceMethod):
     taken_kinds: kinds of evidence that it was made for
     """
 
-    accepts = (Shapes,)
+    accepts: ClassVar[tuple[type, ...]] = (Shapes,)
     taken_kinds: ClassVar[tuple[Evidence, ...]] = ("mesh",)
 
     def __init__(self, frame: Frame, config: Any):
@@ -66,7 +66,7 @@ class CodedSurface(SurfaceMethod):
         for piece in taken[-1:]:
             if isinstance(piece, Shapes) and len(piece) != 1:
                 raise LumigraphError(f"{piece.source} holds {len(piece)} shapes, and one is completed; name its file")
-            one = piece.members[0] if isinstance(piece, Shapes) else piece
+            one: Any = piece.members[0] if isinstance(piece, Shapes) else piece
             if isinstance(one, Shape):
                 told.frame = one.frame
             told._show(told.find(one))

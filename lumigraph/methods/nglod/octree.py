@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Iterator
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -66,7 +67,8 @@ class LevelCells(nn.Module):
             n, rows = self.resolution, self.rows
             index = torch.full((n**3,), -1, dtype=torch.int32, device=rows.device)
             index[rows[:, 0].long()] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
-            codes = code_of(*self.where.unbind(-1), n.bit_length() - 1).int()
+            x, y, z = self.where.unbind(-1)
+            codes = code_of(x, y, z, n.bit_length() - 1).int()
             tables = index, Nodes.of(self.corners, (n + 1, n + 1, n + 1)), Tree.of(codes)
             made = self._made = rows, rows._version, tables
         return made[2]
@@ -103,11 +105,13 @@ class Level(nn.Module):
 class CodeOctree(nn.Module):
     """Levels from coarse to fine. All cells of the first are there; of the others, those that the surface may pass."""
 
+    levels: Any  # a ModuleList of Level
+
     def __init__(self, base_resolution: int, levels: int, features: int, hidden_width: int):
         super().__init__()
         self.levels = nn.ModuleList(Level(base_resolution << level, features, hidden_width) for level in range(levels))
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Level]:
         return iter(self.levels)
 
     def __len__(self) -> int:
