@@ -225,3 +225,15 @@ def test_the_number_of_rays_follows_the_sections_that_matter():
         found.append(sampler.batch_size)
     assert found[:4] == [first // 2, int(1.2 * (first // 2)), int(1.2 * (first // 2)), first // 4]
     assert found[-1] == 4 * first
+
+
+def test_where_the_hull_is_empty_the_distance_becomes_positive():
+    """A sphere that sticks out of the visual hull costs something, and less once it is inside."""
+    scene = tiny.scene()
+    method, costs = NeuS(scene.frame, NeuS.smallest()), []
+    method.begin(scene)
+    batch = scene.sample_rays(192, torch.Generator().manual_seed(0))
+    for radius in (0.95, 0.3):
+        method.network.shape.begin_as(torch.zeros(3), radius, False)
+        costs.append(float(method.loss(batch, 0)["empty"].detach()))
+    assert costs[0] > 1e-3 and costs[1] < 1e-4

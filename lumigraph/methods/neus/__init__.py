@@ -161,7 +161,10 @@ class NeuS(FieldMethod):
         self.figures |= {"mse": float(residual.detach().square().mean()), "s": float(self.network.sharpness.detach())}
         shown = 1.0 if batch.alpha is None else batch.alpha.mean().clamp_min(1e-2)
         terms["colour"] = residual.abs().mean() / shown
-        anywhere = self.network.shape.surface(self._anywhere(len(batch), generator))
+        points = self._anywhere(len(batch), generator)
+        anywhere, filled = self.network.shape.surface(points), self.sampler.empty.may_hold(points)
+        if filled is not None:  # nothing else is learnt where the mask says that nothing is
+            terms["empty"] = ((-anywhere.distance).clamp_min(0) * ~filled).mean()
         terms["eikonal"] = c.eikonal_weight * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
         if c.curvature_weight and laplacian:
             bent = laplacian[0][inside].abs()
