@@ -226,6 +226,8 @@ def spread_to_unseen(
 ) -> Float[np.ndarray, "texel 3"]:
     """Colours with those of unseen texels replaced by the mean of the nearest seen ones in space, weighted by
     1 / distance."""
+    if known.all():
+        return colours
     there = np.flatnonzero(known)
     there = there[:: max(1, len(there) // SEEN_TEXELS)]
     if not len(there):
