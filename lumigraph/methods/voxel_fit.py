@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_fill_holes, gaussian_filter
 from torch import Tensor, nn
 
 from ..components.fields.level_set import level_set
@@ -171,6 +171,7 @@ class VoxelFit(FieldMethod):
         Raises LumigraphError where none does."""
         grid = self.network.grid
         values = (grid.values[:, 0] + self.network.shift).view(grid.shape).cpu().numpy().clip(-CLEAR, CLEAR)
+        values[binary_fill_holes(values > 0) & (values <= 0)] = CLEAR  # what no camera sees is solid
         values = gaussian_filter(values, MESH_BLUR)
         if not (values > 0).any():
             raise LumigraphError("No voxel stops half of the light, so there is no surface; train for longer")
