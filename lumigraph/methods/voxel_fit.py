@@ -54,7 +54,7 @@ MESH_BLUR = 0.6  # voxels of deviation by which occupancy is smoothed for a mesh
 CLEAR = 3.0  # logits beyond which a voxel is as good as full, or empty
 
 
-class VoxelField(Field):
+class SoftVoxels(Field):
     """A grid of logits: how much light a voxel stops, and its colour from everywhere.
 
         alpha = sigmoid(v_0)      density = -log(1 - alpha) / edge = softplus(v_0) / edge      rgb = sigmoid(v_1..3)
@@ -88,12 +88,12 @@ class VoxelFit(FieldMethod):
     """Voxels in the box of interest that learn, double and become a mesh."""
 
     Config = Config
-    network: VoxelField
+    network: SoftVoxels
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        self.network = VoxelField(c, frame)
+        self.network = SoftVoxels(c, frame)
         self.sampler = OccupancySampler(frame, space_of(frame), c.occupancy, GridSchedule(begins=0.02, early_steps=0))
         self.register_buffer("doubled", torch.tensor(0))
         self._adam: LazyAdam | None = None

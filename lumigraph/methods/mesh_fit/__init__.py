@@ -30,7 +30,7 @@ from ...method.capabilities import HasMesh, can, needs
 from ...system.work import at_work
 from .optimizer import UniformAdam
 from .picture import Picture, picture
-from .surface import Surface, face_normals, remeshed, vertex_normals
+from .surface import MeshSurface, face_normals, remeshed, vertex_normals
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class MeshFit(Method):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        self.surface = Surface(sphere(frame, c.first_cells), c.smoothness)
+        self.surface = MeshSurface(sphere(frame, c.first_cells), c.smoothness)
         self.register_buffer("remeshings", torch.tensor(0))
         self._optimizers: tuple[torch.optim.Optimizer | None, ...] = (None, None)
 

@@ -65,7 +65,7 @@ class _Smooth(torch.autograd.Function):
         return ctx.solver(grad * (limit / length.clamp_min(1e-30)).clamp(max=1.0)), None
 
 
-class Surface(Part):
+class MeshSurface(Part):
     """Triangles of which places and colours of vertices are learnt.
 
     places:  u = (I + smoothness L) x of vertices x (Nicolet 2021, eq. 9)
