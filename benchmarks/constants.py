@@ -24,6 +24,7 @@ from lumigraph.files import write_json
 from lumigraph.files.ranges import changed
 from lumigraph.run import build, processor
 from lumigraph.system.console import console
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 VIEWS = 4  # held-out photographs
@@ -107,7 +108,7 @@ def held_out(name: str, data: Any, numbers: dict[str, Any], options: Options) ->
     kind = methods.find(name)
     config = changed(kind.Config(), **numbers)
     method = build(kind, data.frame, config, torch.device("cpu"), options.seed, learning=True)
-    fit(method, data, steps=options.steps, seed=options.seed, show=False)
+    go_on_unless(fit(method, data, steps=options.steps, seed=options.seed, show=False).signal)
     scores = evaluate(method, data, views=VIEWS)
     return {"psnr": round(scores.psnr, 2), "ssim": round(scores.ssim, 3), "halves": scores.protocol["halves"]}
 

@@ -87,7 +87,7 @@ def test_info_is_not_cut_where_the_terminal_ends(photographs, tmp_path, capsys):
     folder = shutil.copytree(photographs, tmp_path / ("far" * 30))
     assert main(["info", str(folder)]) == 0
     first, *others = capsys.readouterr().out.splitlines()
-    assert first.endswith("a scene of 12 photographs") and max(map(len, others)) < 100
+    assert first.endswith("a scene of 12 photographs") and not any("far" * 30 in line for line in others)
 
 
 def test_pausing_and_resuming(photographs, tmp_path, capsys):

@@ -43,7 +43,7 @@ class TwoLooks(Seen):
         end[count - 1 :: count] = self.last_end
         samples = Samples(start, end, count * torch.arange(len(rays) + 1))
         points, _ = samples.along(rays)
-        return Look(name, samples, SIGMA * (self.distance(points) < 0).float(), painted(points))
+        return Look(name, samples, SIGMA * (self.shape(points) < 0).float(), painted(points))
 
     def render_rays(self, rays, background):
         look = self.looks(rays)[-1]

@@ -16,7 +16,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.kernels import neighbours
 from lumigraph.methods.mesh_fit import MeshFit, surface_of
 from lumigraph.methods.mesh_fit.optimizer import UniformAdam
-from lumigraph.methods.mesh_fit.surface import Solver, Surface, remeshed
+from lumigraph.methods.mesh_fit.surface import MeshSurface, Solver, remeshed
 from lumigraph.methods.voxel_fit import VoxelFit
 
 pytestmark = budget("methods", 8)
@@ -48,7 +48,7 @@ def teach(method, data, steps: int):
 def test_preconditioned_places_give_the_vertices_back():
     """u = (I + lambda L) x, and the solver returns x; L of a constant is zero, so a translation of u is one of x."""
     mesh = ball(subdivisions=2)
-    surface = Surface(mesh, 19.0)
+    surface = MeshSurface(mesh, 19.0)
     x = torch.from_numpy(mesh.vertices).float()
     torch.testing.assert_close(surface.vertices(), x, atol=1e-5, rtol=0)
     with torch.no_grad():

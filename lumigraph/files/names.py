@@ -26,7 +26,7 @@ def meant(name: str, known: Sequence[str]) -> str | None:
     """The known name that a user most likely meant by another; None where none is close.
 
     Letters alone count: the same ones ("instantngp"), a part of a name ("splat"), its words' initials ("3dgs", "ff"),
-    and last what differs least from the name or a word of it.
+    and last what differs least from the name or a word of it. Of several, one of fewest words comes first.
     """
     said = letters(name)
     if not said:
@@ -36,10 +36,12 @@ def meant(name: str, known: Sequence[str]) -> str | None:
         lambda other: said in letters(other) or letters(other) in said,
         lambda other: said.endswith(initials(other)) and len(initials(other)) > 1,
     ):
-        if found := sorted(filter(fits, known), key=len):
+        if found := sorted(filter(fits, known), key=lambda other: other.count("-")):
             return found[0]
     whole = {letters(other): other for other in known}
-    parts = {part: other for other in known for part in other.split("-")} | whole  # a whole name before another's part
+    parts = {
+        part: other for other in reversed(known) for part in other.split("-")
+    } | whole  # a whole name before another's part
     near = difflib.get_close_matches(said, parts, n=1)
     return parts[near[0]] if near else None
 

@@ -101,7 +101,7 @@ class MeshFit(Method):
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred triangles that are remeshed once."""
-        c = Config(first_cells=8, cells=10, remeshings=1, remeshing_until=0.5, views_per_step=2, learning_rate=3e-2)
+        c = Config(first_cells=16, cells=18, remeshings=1, remeshing_until=0.5, views_per_step=2, learning_rate=3e-2)
         c = replace(c, final_learning_rate=3e-3, colour_learning_rate=0.2)
         return replace(c, laplacian_weight=0.01, normal_weight=0.01)
 
