@@ -24,6 +24,7 @@ from ..figures import Row, contact_sheet, save_picture
 from ..figures.charts import Series, line_chart, standalone
 from ..files import write_bytes, write_json
 from ..files.ranges import changed
+from ..geometry import unit
 from ..methods.mesh_fit import Config, MeshFit
 from ..system.progress import track
 
@@ -124,8 +125,8 @@ def holding(frame: Frame, mesh: Mesh) -> MeshFit:
 def shaded(method: MeshFit, camera: Camera) -> Float[Tensor, "height width 3"]:
     """The surface in grey under one light, before white."""
     seen = method.render(camera)
-    light = torch.tensor(LIGHT) / np.linalg.norm(LIGHT)
-    grey = AMBIENT + (1 - AMBIENT) * (seen.extra["normals"] @ light.float() + 1) / 2
+    light = unit(torch.tensor(LIGHT))
+    grey = AMBIENT + (1 - AMBIENT) * (seen.extra["normals"] @ light + 1) / 2
     return (1 + seen.opacity * (grey - 1))[..., None].expand(-1, -1, 3)
 
 

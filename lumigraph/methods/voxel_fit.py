@@ -89,6 +89,8 @@ class VoxelFit(FieldMethod):
 
     Config = Config
     network: SoftVoxels
+    sampler: OccupancySampler
+    doubled: Tensor  # times so far
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()

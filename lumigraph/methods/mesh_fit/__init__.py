@@ -83,6 +83,7 @@ class MeshFit(Method):
 
     Config = Config
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH
+    remeshings: Tensor  # done so far
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()

@@ -54,12 +54,12 @@ class _Smooth(torch.autograd.Function):
     each vertex first: where a triangle is seen nearly edge-on, the slope of its colours has no bound."""
 
     @staticmethod
-    def forward(ctx: Any, u: Tensor, solver: Solver) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, u: Tensor, solver: Solver) -> Tensor:
         ctx.solver = solver
         return solver(u)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Any:
         length = grad.norm(dim=-1, keepdim=True)
         limit = MAX_GRADIENT * length[length > 0].mean().nan_to_num()
         return ctx.solver(grad * (limit / length.clamp_min(1e-30)).clamp(max=1.0)), None
@@ -73,7 +73,6 @@ class MeshSurface(Part):
     """
 
     grows: ClassVar[tuple[str, ...]] = ("places", "colours")
-    faces: Tensor
 
     def __init__(self, mesh: Mesh, smoothness: float):
         super().__init__()
@@ -83,7 +82,7 @@ class MeshSurface(Part):
         self.replace(mesh)
 
     @property
-    def faces(self) -> Tensor:  # type: ignore[no-redef]
+    def faces(self) -> Tensor:
         return self.corners.faces
 
     def replace(self, mesh: Mesh, optimizers: tuple[torch.optim.Optimizer | None, ...] = (None, None)) -> None:
@@ -151,12 +150,12 @@ class _Product(torch.autograd.Function):
     """A x of a constant symmetric sparse matrix."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: sparse.csc_array) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, x: Tensor, matrix: sparse.csc_array) -> Tensor:
         ctx.matrix = matrix
         return torch.from_numpy(matrix @ x.detach().cpu().numpy()).to(x)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Any:
         return torch.from_numpy(ctx.matrix @ grad.cpu().numpy()).to(grad), None
 
 
