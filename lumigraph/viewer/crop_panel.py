@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, cast
@@ -53,6 +54,7 @@ class CropPanel:
         self._listening, self._last_click = False, (-math.inf, (0.0, 0.0))  # its time and place
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
+        self._updating = threading.RLock()  # messages of one client are answered by several threads
         gui, (middle, radius, lower, upper) = client.gui, self._around_subject()
         self._size, self.cleaned = radius, False
         with shared.tabs["Crop"]:
@@ -126,17 +128,18 @@ class CropPanel:
     def _update(self) -> None:
         if self._following:
             return
-        shape = self._shape.value
-        for handle, shown in (
-            *((x, shape == BOX) for x in (self._lower, self._upper)),
-            *((x, shape == SPHERE) for x in (self._middle, self._radius)),
-            (self._remove, self.strength > 0),
-        ):
-            if handle.visible != shown:
-                handle.visible = shown
-        self._place_handles()
-        self._outline()
-        self._listen(shape != ALL)
+        with self._updating:
+            shape = self._shape.value
+            for handle, shown in (
+                *((x, shape == BOX) for x in (self._lower, self._upper)),
+                *((x, shape == SPHERE) for x in (self._middle, self._radius)),
+                (self._remove, self.strength > 0),
+            ):
+                if handle.visible != shown:
+                    handle.visible = shown
+            self._place_handles()
+            self._outline()
+            self._listen(shape != ALL)
         self._changed()
 
     def _listen(self, wanted: bool) -> None:
