@@ -11,7 +11,7 @@ import pytest
 import tiny
 import torch
 from budgets import budget
-from conftest import PACKAGE
+from shape_checks import PACKAGE
 from test_cleaning import soiled
 
 import lumigraph
