@@ -30,7 +30,6 @@ from ...files.ranges import (
     LearningRate,
     NonNegative,
     Positive,
-    PositiveShare,
     Seed,
     Share,
     Width,
@@ -61,7 +60,7 @@ class Config:
     occupancy_weight: NonNegative = 1.0  # weight of L_occupancy, for rays of the object that miss the surface
     depth_weight: NonNegative = 0.0  # weight of L_depth, for photographs with depth; 0: depth is not read
     normal_weight: NonNegative = 0.05  # weight of L_normal; higher smooths the surface
-    neighbour_distance: Positive = 1e-3  # L_normal compares a normal with one so far away at most, along each axis
+    neighbour_distance: Positive = 2e-3  # side of the cube around a point from which L_normal draws its neighbour
     difference_step: Positive = 2e-3  # scene units between two values whose difference is a normal's component
     coarse_to_fine: Share = 0.0  # share of the budget in which levels of the hash table are added; 0: at once
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge

@@ -18,9 +18,7 @@ Features = Float[Tensor, "member ray feature"]
 
 def perceptron(*widths: int, normalised: bool = True) -> nn.Sequential:
     """Linear layers, each with layer normalisation and ReLU but for the last one, unless that is `normalised` too."""
-    layers = [
-        x for a, b in pairwise(widths) for x in (nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU())
-    ]
+    layers = [x for a, b in pairwise(widths) for x in (nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU())]
     return nn.Sequential(*(layers if normalised else layers[:-2]))
 
 
@@ -62,7 +60,7 @@ def scene_features(layers: list[Layer], points: Float[Tensor, "member ray 3"]) -
 class RayMarcher(nn.Module):
     """An LSTM that finds each ray's surface (algorithm 1): its state after a look at Phi gives the next step's length.
 
-        (h, c)_i+1 = LSTM(Phi(x_i), (h, c)_i),    d_i+1 = d_i + w . h_i+1 + b,    x_i+1 = o + d_i+1 r
+    (h, c)_i+1 = LSTM(Phi(x_i), (h, c)_i),    d_i+1 = d_i + w . h_i+1 + b,    x_i+1 = o + d_i+1 r
     """
 
     def __init__(self, features: int, state: int, steps: int):
