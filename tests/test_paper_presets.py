@@ -397,6 +397,46 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "points_per_step": 512,
         "learning_rate": 1e-3,
     },
+    "srn": {  # vsitzmann/scene-representation-networks, srns.py, custom_layers.py, train.py, train_configs/chairs.yml
+        "code": 256,
+        "code_deviation": 0.01,
+        "hyper_layers": 2,  # one hidden layer behind the first one
+        "hidden_width": 256,
+        "depth": 4,
+        "pixel_layers": 5,  # four hidden layers behind the first one
+        "march_steps": 10,
+        "marcher_state": 16,
+        "start": "camera",
+        "start_distance": 0.05,
+        "start_deviation": 5e-4,
+        "members_per_step": 64,
+        "rays_per_member": 4096,  # a whole picture of 64 x 64
+        "targets": 1,
+        "colour_weight": 200.0,
+        "depth_weight": 10.0,  # reg_weight 1e-3, times 10 000 in get_regularization_loss
+        "code_weight": 1.0,
+        "learning_rate": 4e-5,
+    },
+    "dvr": {  # autonomousvision/differentiable_volumetric_rendering, configs/default.yaml, multi_view_reconstruction
+        "field": "network",
+        "hidden_width": 512,  # im2mesh/dvr/models/decoder.py
+        "blocks": 5,
+        "threshold": 0.5,  # im2mesh/dvr/models/depth_function.py, as the next three
+        "march_steps": 128,
+        "first_march_steps": 16,
+        "secant_steps": 8,
+        "hull_cells": 0,
+        "rays_per_step": 2048,
+        "colour_weight": 1.0,
+        "freespace_weight": 1.0,
+        "occupancy_weight": 1.0,
+        "depth_weight": 0.0,
+        "normal_weight": 0.05,
+        "neighbour_distance": 2e-3,  # 1e-3 in a cube half as long, as the next one
+        "difference_step": 2e-3,
+        "learning_rate": 1e-4,
+        "final_learning_rate": 2.5e-5,  # two milestones, a half each
+    },
     "occupancy-network": {  # autonomousvision/occupancy_networks, configs/default.yaml
         "code": 512,
         "picture_size": 224,

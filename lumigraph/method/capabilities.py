@@ -170,7 +170,7 @@ LACKING = {
     FromField: "cannot begin as what another method holds; `lumigraph convert --list` says which can",
     HasOctree: "is no octree; `lumigraph convert` makes one of it, as plenoctrees",
     HasAtlas: "is no atlas of baked values; `lumigraph convert` makes one of it, as snerg",
-    HasDistance: "holds no distance to surfaces; neus does, and so do methods that learn from shapes",
+    HasDistance: "holds no distance to surfaces; neus and dvr do, and so do methods that learn from shapes",
     HasLevels: "has no levels of detail; nglod has",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     RefinesPoses: "learns no poses of photographs; give --refine-cameras to a method that can",
