@@ -28,7 +28,7 @@ class SurfaceMethod(RayMethod):
     shadings: choices of the control of that name, the default first
     """
 
-    learns_from = Shapes
+    learns_from: ClassVar[type] = Shapes
     efforts: ClassVar[Efforts] = {"draft": Effort(20, 500), "good": Effort(200, 4000), "best": Effort(1000, 30_000)}
     march: ClassVar[March] = March()
     shadings: ClassVar[tuple[str, ...]] = SHADINGS
