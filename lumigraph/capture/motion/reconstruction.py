@@ -473,7 +473,7 @@ class Reconstruction:
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)
-        found = findings(read_transforms(self.folder), diagnosis.left_out)
+        found = findings(read_transforms(self.folder), diagnosis.left_out, judged=self.photos)
         result = self.summary(key, model, place, diagnosis) | {"findings": [asdict(finding) for finding in found]}
         write_json(self.folder / RESULT_FILE, result, "capture")
         return read_json(self.folder / RESULT_FILE)
