@@ -42,7 +42,9 @@ def sensor_faults(scene: Scene) -> list[str]:
     known = [i for i in scene.splits["train"].tolist() if layer.planes[i] is not None]
     told = []
     if missing := len(scene.splits["train"]) - len(known):
-        told.append(f"{scene.source}: {missing} of {len(scene.splits['train'])} photographs have no depth, and are left out")
+        told.append(
+            f"{scene.source}: {missing} of {len(scene.splits['train'])} photographs have no depth, and are left out"
+        )
     ratios, medians = [], []
     for i in evenly(known, CHECKED_VIEWS):
         photograph = scene.photograph(i, ("depth",))
@@ -57,9 +59,10 @@ def sensor_faults(scene: Scene) -> list[str]:
         return told
     ratio = float(torch.tensor(ratios).median()) if ratios else 1.0
     if not 1 / MAX_RATIO < ratio < MAX_RATIO:
+        factor = 10 ** round(abs(math.log10(ratio)))
         told.append(
             f"{scene.source}: depth is {ratio:.3g} times as large as the sparse points are far away; its unit is "
-            f"probably {ratio:.1g} times too large, so correct the depth's unit or the points"
+            f"probably wrong by a factor of {factor:,}, so correct that, or the poses' unit"
         )
     typical = float(torch.tensor(medians).median())
     if not ratios and not MIN_ROOM < typical < MAX_ROOM:

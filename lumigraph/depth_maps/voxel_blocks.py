@@ -19,7 +19,7 @@ from .pinholes import pinhole_maps
 GROWTH = 1.5  # times the blocks that memory is taken for, when it is used up
 MAX_LOAD = 0.5  # blocks to a slot of the table
 EDGE = 0.08  # of the least depth of four neighbouring pixels, from which on they show two surfaces
-EMPTY_DISTANCE = 0.99  # of the truncation: a block without a voxel nearer to a surface shows none
+EMPTY_DISTANCE = 0.9  # of the truncation: a block without a voxel nearer to a surface shows none
 BYTES_PER_BLOCK = VOXELS * CHANNELS * 4 + 12
 
 

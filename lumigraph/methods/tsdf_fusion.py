@@ -112,7 +112,9 @@ class TSDFFusion(RayMethod):
     @torch.no_grad()
     def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
         """Fuse one depth map."""
-        self._fuse(DepthMap.measured(batch.camera, batch.extra["depth"], batch.before(self.frame.background)), batch.mask)
+        self._fuse(
+            DepthMap.measured(batch.camera, batch.extra["depth"], batch.before(self.frame.background)), batch.mask
+        )
         return {}
 
     def _fuse(self, seen: DepthMap, mask: Tensor | None = None) -> None:

@@ -84,7 +84,7 @@ def _loops(case: int) -> list[list[int]]:
 
 
 def _fans(loop: list[int]) -> list[tuple[int, int, int]]:
-    return [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
+    return [(loop[0], loop[i + 1], loop[i]) for i in range(1, len(loop) - 1)]
 
 
 @cache
