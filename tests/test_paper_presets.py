@@ -350,6 +350,12 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "laplacian_weight": 0.0,
         "normal_weight": 0.0,
     },
+    "tsdf-fusion": {  # niessner/VoxelHashing's parameters, as in theNded/MeshHashing, include/hash_param.h
+        "voxel_size": 0.004,
+        "truncation": 5.0,  # 0.02 m
+        "max_weight": 255.0,
+        "max_depth": 4.0,
+    },
     "voxel-fit": {  # no paper's; voxels, opacity and step of sunset1995/DirectVoxGO, configs/default.py
         "voxels": 160**3,
         "initial_opacity": 1e-2,

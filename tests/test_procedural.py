@@ -459,3 +459,39 @@ def test_a_scene_written_as_a_blender_folder_reads_back(tmp_path):
     assert truth["normals"].shape == (24, 24, 3)
     with pytest.raises(FileExistsError):
         procedural.write_blender(stage, tmp_path / "toys")
+
+
+def test_a_depth_camera_has_noise_quantisation_shadows_and_a_loop():
+    """Noise and steps of disparity against the published model; holes where the projector casts its shadow."""
+    stage = scenes.stage("room", size=64, views=200, depth=1)
+    assert stage.depth_camera is not None
+    cameras, sensor, unit = stage.cameras["train"], stage.depth_camera, stage.unit
+    assert (cameras.position[0] - cameras.position[190]).norm() * unit < 0.1  # 190 / 199 of 1.05 loops
+    wall = World((Object(Cuboid((9.0, 9.0, 0.5)), CHALK, Pose.at(0, 0, 2.5)),))
+    ahead = pinhole(np.eye(4)[None, :3], (64, 48), 62.7)
+    found = replace(sensor, unit=1.0).measure(wall, ahead)  # 2 m away
+    levels = 351.3 / (found[found > 0] / 1000)
+    assert np.abs(levels - np.rint(levels)).max() < 0.05  # within a millimetre
+    assert found.min() > 0 and np.median(found) == pytest.approx(2000, abs=6)
+    spread = 4 / 351.3 * 1000 * math.hypot(0.5, 12**-0.5)  # mm: half a level of noise, rounded to levels
+    assert found.std() == pytest.approx(spread, rel=0.05)
+    assert not replace(sensor, unit=1.0, range=(0.4, 1.9)).measure(wall, ahead).any()
+
+    post = replace(wall, objects=(*wall.objects, Object(Cuboid((0.1, 9.0, 0.1)), CHALK, Pose.at(0, 0, 1.0))))
+    row = replace(sensor, unit=1.0).measure(post, ahead)[24]
+    width = 0.075 * (1 / 0.9 - 1 / 2) * 64 / (2 * math.tan(math.radians(62.7 / 2)))  # pixels: b (1/z - 1/Z) f
+    assert (row[:32] == 0).sum() == pytest.approx(width, abs=1.5) and (row[32:] == 0).sum() <= 1
+
+
+def test_a_film_of_the_room_is_in_metres_with_the_truth_beside():
+    scene = open_scene("procedural:room,depth,views=10,size=32,seed=3")
+    assert scene.cameras.size[0].tolist() == [32, 24] and scene.frame.to_source.scale == pytest.approx(2.6)
+    photo = scene.photograph(0, ("depth", "exact_depth"))
+    measured, exact = photo.extra["depth"], photo.extra["exact_depth"]
+    near = (2.6 * (measured - exact).abs())[measured.isfinite()]
+    assert near.median() < 0.03 and exact.isfinite().all() and 0.3 < float(2.6 * exact.min())
+    stage = scenes.stage("room", size=32, views=10, seed=3, depth=1)
+    place = scene.frame.to_source.points(photo.camera.position) / 2.6
+    assert float((place - stage.cameras["test"].position[0]).norm()) < 1e-5
+    with pytest.raises(LumigraphError, match="no option 'depth'"):
+        open_scene("procedural:still-life,depth")

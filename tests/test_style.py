@@ -83,11 +83,11 @@ def test_a_riddle_is_noticed(source):
 
 
 def namesakes(sources: Sources) -> list[str]:
-    """Public classes of one name in several modules, but for Config, which every method has."""
+    """Public classes of one name in several modules, but for Config of methods and Options of procedural scenes."""
     places: dict[str, list[str]] = {}
     for module, source in sources.items():
         for node in ast.walk(parsed(source)):
-            if isinstance(node, ast.ClassDef) and node.name != "Config" and not node.name.startswith("_"):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith(("_", "Config", "Options")):
                 places.setdefault(node.name, []).append(module)
     return [f"{name}: {', '.join(modules)}" for name, modules in sorted(places.items()) if len(modules) > 1]
 

@@ -9,6 +9,7 @@
     write_blender(stage, folder)                          the same for other tools
 
     open_scene("procedural:city,crossings=6")             scenes may have options of their own
+    open_scene("procedural:room,depth,views=300")         a depth camera's film, in metres; `exact_depth` is the truth
 
     open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
     open_dataset("procedural:toys,count=20,turned=1")     the same, each in a random pose
@@ -29,6 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Pinhole
@@ -37,6 +39,7 @@ from ..capture.raw import RawPhoto, facts, planes
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
+from .depth_camera import MILLIMETRES, UNMEASURED
 from .members import is_category as is_category
 from .members import is_collection as is_collection
 from .members import member_stage
@@ -94,7 +97,7 @@ def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None 
     shots = [
         Shot(
             name=f"{split}_{i:04d}",
-            pose=said[split].pose[i].double().numpy(),
+            pose=in_source(stage, said[split].pose[i]),
             lens=cameras.lens[i],
             size=(int(cameras.size[i, 0]), int(cameras.size[i, 1])),
             image=partial(picture, stage, cameras[i]),
@@ -108,9 +111,23 @@ def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None 
         for i in range(len(cameras))
     ]
     background = (0.0, 0.0, 0.0) if visible else (1.0, 1.0, 1.0)
+    low, high = (tuple(stage.unit * x for x in corner) for corner in stage.bounds)
     return Capture(
-        source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background, kept=kept
+        source,
+        shots,
+        bounds=(low, high),
+        reach=stage.unit * stage.reach,
+        near=stage.unit * stage.near,
+        background=background,
+        kept=kept,
     )
+
+
+def in_source(stage: SyntheticStage, pose: Tensor) -> np.ndarray:
+    """A pose in the source's frame and unit."""
+    found = pose.double().numpy().copy()
+    found[:, 3] *= stage.unit
+    return found
 
 
 def identity(stage: SyntheticStage, camera: Camera) -> str:
@@ -140,8 +157,14 @@ def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]
         light = partial(radiance, stage.world_of(camera), camera)
         truth = PixelPlane(light, "linear", dtype=np.dtype(np.float32), channels=3)
         lasting |= planes(taken_raw(stage, camera)) | {"radiance": truth}
+    exact = {"depth": replace(plane("depth", "distance", np.float32), scale=stage.unit)}
+    if stage.depth_camera is not None:
+        values = partial(stage.depth_camera.measure, stage.world_of(camera), camera)
+        millimetres = np.dtype(np.uint16)
+        measured = PixelPlane(values, "z-depth", 1 / MILLIMETRES, unknown=(UNMEASURED,), dtype=millimetres)
+        exact = {"depth": measured, "exact_depth": exact["depth"]}
     return lasting | {
-        "depth": plane("depth", "distance", np.float32),
+        **exact,
         "normals": plane("normals", "direction", np.float32, 3),
         "labels": plane("labels", "index", np.int64, names=stage.world.names),
         "albedo": plane("albedo", "linear", np.float32, 3),
@@ -150,7 +173,7 @@ def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]
 
 def known_facts(stage: SyntheticStage, camera: Camera, jittered: bool) -> dict[str, Any]:
     """Facts of one photograph. jittered: whether its pose is perturbed; the true one is then included"""
-    known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
+    known = {TRUE_POSE: in_source(stage, camera.pose[0])} if jittered else {}
     if stage.facts is not None and camera.image_index is not None:
         known |= stage.facts(int(camera.image_index))
     if stage.turn is not None:

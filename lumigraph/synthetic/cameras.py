@@ -83,3 +83,25 @@ def stroll(count: int, radius: float, random: np.random.Generator):
         gaze = sphere_point(azimuth + math.pi + 1.2 * math.sin(8 * math.pi * share), math.radians(-3.0))
         poses.append(look_at(eye, eye + (gaze if share < 0.5 else gaze * (-1, -1, 1))))
     return np.stack(poses)
+
+
+def hand_held(count: int, half_axes: tuple[float, float], random: np.random.Generator, loops: float = 1.05):
+    """Poses of a camera that is carried around the origin, looking outward: translation, rotation, tremor, a loop.
+
+    half_axes: of the ellipse that is walked, scene units
+    loops:     times around; above 1 the end sees the beginning again
+    """
+    start, phase = random.uniform(0, 2 * math.pi), random.uniform(0, 2 * math.pi, (6, 3))
+    poses = []
+    for share in np.arange(count) / max(count - 1, 1) * loops:
+        turn = 2 * math.pi * share
+        # Whole numbers of waves in one loop, so that its end meets its beginning.
+        bob = np.sin(3 * turn + phase[0]) * (0.03, 0.03, 0.05)
+        tremor = 0.002 * (np.sin(37 * turn + phase[1]) + np.sin(53 * turn + phase[2]))
+        eye = np.array([half_axes[0] * math.cos(start + turn), half_axes[1] * math.sin(start + turn), 0.0])
+        swing, nod, roll = np.sin(turn * np.array([2, 5, 4]) + phase[3]) * (0.35, 0.45, 0.08)
+        shake = 0.004 * np.sin(41 * turn + phase[4])
+        gaze = sphere_point(start + turn + swing + shake[0], nod - 0.12 + shake[1])
+        up = (math.sin(roll) * math.sin(start + turn), -math.sin(roll) * math.cos(start + turn), math.cos(roll))
+        poses.append(look_at(eye + bob + tremor, eye + bob + tremor + gaze, up))
+    return np.stack(poses)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 from ..camera import Camera
 from ..errors import LumigraphError
 from ..files.ranges import Seed, between, typed
+from .depth_camera import DepthCamera
 from .sensor import Sensor
 from .world import Rotation, Vector, World
 
 MAX_DIGITS = 20  # of a number
+Flag = Annotated[int, between(0, 1)]  # an option that its name alone turns on
 Options = TypeVar("Options")
 
 
@@ -35,6 +37,8 @@ class SyntheticStage:
     facts:   what a photograph says of itself, by its `image_index`; see `Scene.about`
     called:  a name for all that the world of a photograph depends on, by its `image_index`, under which its picture is
              kept; None where pictures are not kept
+    depth_camera: measures depth beside the pictures, which the cameras' `image_index` counts; None where depth is exact
+    unit:    of the source's frame to a unit of the world
     error:   the length of which errors of poses are so many percent; None for the longest side of the bounds
     """
 
@@ -50,6 +54,8 @@ class SyntheticStage:
     sensor: Sensor | None = None
     facts: Callable[[int], dict[str, Any]] | None = None
     called: Callable[[int], str] | None = None
+    depth_camera: DepthCamera | None = None
+    unit: float = 1.0
     error: float | None = None
 
     def world_of(self, camera: Camera) -> World:
@@ -80,11 +86,13 @@ def told(kind: type[Options], request: str) -> tuple[str, Options]:
 
 
 def parse(kind: type, request: str, text: str) -> tuple[str, int]:
-    """One option, "size=400"."""
-    name, _, value = text.strip().partition("=")
+    """One option, "size=400", or a flag, "depth"."""
+    name, equals, value = text.strip().partition("=")
     known = [field.name for field in fields(kind)]
     if name not in known:
         raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(known)}")
+    if not equals and get_type_hints(kind, include_extras=True)[name] == Flag:
+        return name, 1
     if not value.isdecimal() or len(value) > MAX_DIGITS:
         raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
     return name, int(value)

@@ -1,19 +1,29 @@
-"""A study at home: a closed room, seen from inside in all directions. A unit is some 2.6 metres; eyes are at z = 0."""
+"""A study at home: a closed room, seen from inside in all directions. A unit is some 2.6 metres; eyes are at z = 0.
+
+procedural:room,depth,views=300,size=320        a hand-held depth camera once around it; pictures of 320x240, metres
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
-from ..cameras import GOLDEN_ANGLE, look_at, pinhole, sphere_point
+from ...camera import Camera
+from ..cameras import GOLDEN_ANGLE, hand_held, look_at, pinhole, sphere_point
+from ..depth_camera import DepthCamera
 from ..shapes import Ball, Cone, Cuboid, Cylinder, Torus
-from ..stage import SyntheticStage
+from ..stage import Flag, Pictures, SyntheticStage
 from ..textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
 from ..world import Lamp, Material, Object, Pose, Sky, World
 
 HALF_X, HALF_Y, FLOOR, CEILING = 0.95, 0.75, -0.50, 0.42
 WALL = 0.02  # half of its thickness
+METRES_PER_UNIT = 2.6
+DEPTH_FIELD_OF_VIEW = 62.7  # degrees across, of the depth camera: 525 pixels at 640
+WALK, NARROW_WALK = (0.30, 0.22), (0.22, 0.14)  # half-axes of the path around the middle: its own, of held-out views
 
 CREAM, RUST, PETROL, OCHRE, INK = (
     (0.93, 0.88, 0.78), (0.70, 0.30, 0.20), (0.13, 0.36, 0.41), (0.86, 0.62, 0.25), (0.14, 0.16, 0.22),
@@ -151,11 +161,36 @@ def inside(count: int, random: np.random.Generator, reach: float = 0.28):
     return np.stack(poses)[order]
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
-    """The room from near its middle, in all directions; held-out views likewise."""
+@dataclass(frozen=True)
+class Options(Pictures):
+    """Options of every scene, and:
+
+    depth: a depth camera on a hand-held path instead of photographs all around; pictures three quarters as high as wide
+    """
+
+    depth: Flag = 0
+
+
+def stage(size: int = 200, views: int = 100, seed: int = 0, depth: int = 0) -> SyntheticStage:
+    """The room from near its middle, in all directions; held-out views likewise. depth: see `Options`."""
     random = np.random.default_rng(seed)
+    bounds = (-1.0, -0.8, -0.56), (1.0, 0.8, 0.5)
+    if depth:
+        path, beside = hand_held(views, WALK, random), hand_held(max(views // 10, 1), NARROW_WALK, random)
+        shape = (size, size * 3 // 4)
+        cameras = {
+            "train": counted(pinhole(path, shape, DEPTH_FIELD_OF_VIEW), 0),
+            "test": counted(pinhole(beside, shape, DEPTH_FIELD_OF_VIEW), views),
+        }
+        sensor = DepthCamera(METRES_PER_UNIT, seed=seed)
+        return SyntheticStage(world(), cameras, bounds, reach=1.0, near=0.1, depth_camera=sensor, unit=METRES_PER_UNIT)
     cameras = {
         "train": pinhole(inside(views, random), size, 80.0),
         "test": pinhole(inside(max(views * 2 // 5, 1), random, 0.22), size, 80.0),
     }
-    return SyntheticStage(world(), cameras, ((-1.0, -0.8, -0.56), (1.0, 0.8, 0.5)), reach=1.0, near=0.1)
+    return SyntheticStage(world(), cameras, bounds, reach=1.0, near=0.1)
+
+
+def counted(cameras: Camera, first: int) -> Camera:
+    """Cameras whose pictures are numbered."""
+    return replace(cameras, image_index=torch.arange(first, first + len(cameras)))
