@@ -226,33 +226,26 @@ def hollow(kind):
 
 
 @njit(**INNER_OPTIONS)
-def straightened(size, p):
-    """A point beside the axis of a soft capsule: how far towards +x and +y of it, and where along it, beyond its ends
-    along their tangents."""
-    x, y, z = p
-    bend, half = size[2], size[1] * size[3]
-    if abs(bend) < MIN_CURVATURE:
-        return (x, y, z)
-    radius = 1.0 / bend
-    side = math.copysign(1.0, bend)
-    along = math.atan2(side * z, side * (radius - x)) / bend
-    if abs(along) <= half:
-        return (radius - side * math.sqrt((radius - x) ** 2 + z * z), y, along)
-    end = math.copysign(half, along)
-    cos, sin = math.cos(bend * end), math.sin(bend * end)
-    x, z = x - (1.0 - cos) * radius, z - sin * radius
-    return (x * cos - z * sin, y, end + x * sin + z * cos)
-
-
-@njit(**INNER_OPTIONS)
 def at_rest(kind, size, p):
-    """A point of the surface where it lies when the body is not deformed; textures are fixed there."""
+    """A point of a body where it lies when it is not deformed; textures are fixed there. Beyond the ends of a soft
+    capsule's axis, along their tangents. It calls nothing compiled, so that Python may call it."""
     if kind != CAPSULE:
         return p
-    x, y, z = straightened(size, p)
-    across, half = math.sqrt(size[3]), size[1] * size[3]
-    on_axis = min(max(z, -half), half)
-    return (x * across, y * across, on_axis / size[3] + (z - on_axis) * across)
+    x, y, z = p
+    bend, half, across = size[2], size[1] * size[3], math.sqrt(size[3])
+    along = z
+    if abs(bend) >= MIN_CURVATURE:
+        radius, side = 1.0 / bend, math.copysign(1.0, bend)
+        along = math.atan2(side * z, side * (radius - x)) / bend
+        if abs(along) <= half:
+            x = radius - side * math.sqrt((radius - x) ** 2 + z * z)
+        else:
+            end = math.copysign(half, along)
+            cos, sin = math.cos(bend * end), math.sin(bend * end)
+            u, w = x - (1.0 - cos) * radius, z - sin * radius
+            x, along = u * cos - w * sin, end + u * sin + w * cos
+    on_axis = min(max(along, -half), half)
+    return (x * across, y * across, on_axis / size[3] + (along - on_axis) * across)
 
 
 @njit(**INNER_OPTIONS)
@@ -314,9 +307,9 @@ def distance(kind, size, p):
         flat = 0.0 if min(below, min(right, left)) >= 0.0 else min(first, min(second, third))
         return math.sqrt(flat + z * z) - size[5]
     if kind == CAPSULE:
-        x, y, z = straightened(size, p)
-        beyond = max(abs(z) - size[1] * size[3], 0.0)
-        return math.sqrt(x * x + y * y + beyond * beyond) - size[0] / math.sqrt(size[3])
+        x, y, z = at_rest(kind, size, p)
+        z = max(abs(z) - size[1], 0.0)
+        return (math.sqrt(x * x + y * y + z * z) - size[0]) / math.sqrt(size[3])
     return z  # a plane
 
 
