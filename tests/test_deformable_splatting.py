@@ -88,10 +88,9 @@ def test_gaussians_that_hardly_move_stand_still():
 
 def test_a_rigid_motion_does_not_bend():
     """A motion field that turns all as one, in place of the planes: no bending; one that stretches: its square."""
-    motion = PlaneMotion(FRAME, DeformableSplatting.smallest().motion, 50)
-    generator = torch.Generator().manual_seed(0)
-    cloud = replace(DeformableSplatting(FRAME, DeformableSplatting.smallest()).filtered())
-    motion.moves = torch.ones(len(cloud), dtype=torch.bool)
+    cloud = DeformableSplatting(FRAME, DeformableSplatting.smallest()).filtered()
+    motion, generator = PlaneMotion(FRAME, DeformableSplatting.smallest().motion, 50), torch.Generator().manual_seed(0)
+    motion.follow_cloud(cloud.means.detach())
     angle = torch.tensor([0.0, 0.0, 0.7])
     turn = torch.tensor([torch.cos(angle[2] / 2), 0, 0, torch.sin(angle[2] / 2)])
 
@@ -106,6 +105,12 @@ def test_a_rigid_motion_does_not_bend():
     assert float(motion.bending(cloud, 2.0, generator)) < 1e-8
     motion.offsets = stretching
     assert float(motion.bending(cloud, 2.0, generator)) == pytest.approx(0.01, rel=1e-3)
+    keep = torch.arange(len(cloud)) % 3 > 0
+    places = cloud.means.detach()
+    before = places[motion.neighbours]
+    motion.prune(keep)
+    found, own = places[keep][motion.neighbours], places[keep][:, None]
+    assert ((found == before[keep]) | (found == own)).all() and (found != own).any()
 
 
 def test_points_are_followed_with_the_gaussians_around_them():

@@ -122,17 +122,19 @@ def read(folder: Path) -> Capture:
         )
     if not testing:
         shots = [replace(shot, split=None) for shot in shots]
-    return Capture(str(folder), shots, missing=missing, near=near, **read_points(folder / "points.npy"))
+    points = read_points(folder / "points.npy")
+    colours = None if points is None else np.full(points.shape, GREY, np.uint8)
+    return Capture(str(folder), shots, points, colours, missing=missing, near=near)
 
 
-def read_points(path: Path) -> dict[str, np.ndarray]:
-    """Points of the background, grey; nothing where there is no such file. Raises LumigraphError for other arrays."""
+def read_points(path: Path) -> np.ndarray | None:
+    """Points of the background; None where there is no such file. Raises LumigraphError for other arrays."""
     if not is_file(path):
-        return {}
+        return None
     try:
         points = np.array(load_array(path)).astype(np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"it has shape {points.shape}")
     except Exception as fault:  # np.load keeps no list of what it raises
         raise LumigraphError(f"{path} is no array of 3 numbers to a point ({fault}); restore or remove it") from fault
-    return {"points": points, "point_colours": np.full(points.shape, GREY, np.uint8)}
+    return points

@@ -60,8 +60,8 @@ def film(size: int, views: int, seed: int, rig: int, radius: float = 3.6) -> dic
 def taken(stops: list, size: int, radius: float, aside: np.ndarray) -> Camera:
     """Cameras that look at the origin. stops: azimuth from the front and elevation, degrees, and time of each;
     aside: degrees by which all are moved"""
-    angles = [np.radians((FRONT + azimuth + aside[0], elevation + aside[1])) for azimuth, elevation, _ in stops]
-    poses = np.stack([look_at(sphere_point(*angle, radius), np.zeros(3)) for angle in angles])
+    around, up = np.radians([(FRONT + azimuth + aside[0], elevation + aside[1]) for azimuth, elevation, _ in stops]).T
+    poses = np.stack([look_at(sphere_point(a, b, radius), np.zeros(3)) for a, b in zip(around, up, strict=True)])
     return timed(pinhole(poses, size, FIELD_OF_VIEW), np.array([stop[2] for stop in stops]))
 
 

@@ -63,10 +63,10 @@ class DeformableSplatting(CloudMethod):
         super().__init__(frame, c)
         count = len(self.cloud)
         self.poses = None
+        self.density_control = AdaptiveDensity(c.refine, c.adaptive, count)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
-            self.motion = PlaneMotion(frame, c.motion, count)
-        self.density_control = AdaptiveDensity(c.refine, c.adaptive, count)
+            self.motion = PlaneMotion(frame, c.motion, count)  # it follows what density control does to the cloud
         self.tidying = Tidying(c.tidying)
 
     @classmethod

@@ -96,12 +96,14 @@ class PlaneMotion(Addition):
     """Positions, rotations and sizes of Gaussians at a moment, as offsets from the canonical cloud (Wu 2024, eq. 7).
 
     moves:      which Gaussians move; the others cost nothing
-    neighbours: of each Gaussian, for rigidity
+    neighbours: of each Gaussian among those that move, for rigidity
     active:     whether anything moves yet
     """
 
-    grows: ClassVar[tuple[str, ...]] = ("moves",)
+    grows: ClassVar[tuple[str, ...]] = ("moves", "neighbours")
+    box: Tensor
     moves: Tensor
+    neighbours: Tensor
     active: Tensor
 
     def __init__(self, frame: Frame, numbers: MotionNumbers, count: int):
@@ -116,9 +118,9 @@ class PlaneMotion(Addition):
         nn.init.zeros_(self.heads.weight)
         nn.init.zeros_(self.heads.bias)
         self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
+        self.register_buffer("neighbours", torch.arange(count)[:, None].repeat(1, NEIGHBOURS))
         self.register_buffer("active", torch.tensor(False))
         self.progress, self.extent = 0.0, 1.0
-        self.neighbours: Int[Tensor, "gaussian neighbour"] | None = None
 
     # The cloud at a moment
 
@@ -153,10 +155,32 @@ class PlaneMotion(Addition):
     # Learning
 
     def begin_cloud(self, method: Any) -> None:
-        self.moves, self.neighbours = torch.ones(len(method.cloud), dtype=torch.bool, device=self.moves.device), None
+        self.follow_cloud(method.cloud.means.detach())
+
+    @torch.no_grad()
+    def follow_cloud(self, means: Float[Tensor, "gaussian 3"]) -> None:
+        """Tell static Gaussians from moving ones, and find neighbours of these."""
+        count, device = len(means), means.device
+        self.moves = torch.ones(count, dtype=torch.bool, device=device)
+        if self.active and self.progress >= self.numbers.told_apart:
+            first, last = self.times or (0.0, 1.0)
+            moments = torch.linspace(first, last, PROBED_MOMENTS).tolist()
+            farthest = torch.stack([self.offsets(means, t)[0].norm(dim=-1) for t in moments]).amax(0)
+            self.moves = farthest > self.numbers.still_offset * self.diagonal
+        self.neighbours = torch.arange(count, device=device)[:, None].repeat(1, NEIGHBOURS)
+        rows = self.moves.nonzero()[:, 0]
+        if len(rows) > NEIGHBOURS:
+            points = means[rows].cpu().numpy()
+            _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
+            self.neighbours[rows] = rows[torch.from_numpy(nearest[:, 1:]).to(device)]
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        self.moves, self.neighbours = self.moves[keep], None
+        """A neighbour that is pruned becomes the Gaussian itself, which costs nothing."""
+        kept = torch.arange(len(self.moves), device=self.moves.device)[keep]
+        own = torch.arange(len(kept), device=kept.device)
+        place = torch.full_like(self.moves, -1, dtype=torch.long).index_copy(0, kept, own)
+        left = place[self.neighbours[kept]]
+        self.moves, self.neighbours = self.moves[kept], torch.where(left < 0, own[:, None], left)
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
         self.progress, self.extent = progress, float(method.cloud.extent)
@@ -180,15 +204,11 @@ class PlaneMotion(Addition):
         """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
         distance; of some, at random."""
         rows = self.moves.nonzero()[:, 0]
-        if len(rows) <= NEIGHBOURS:
+        if not len(rows):
             return cloud.means.sum() * 0
-        if self.neighbours is None or len(self.neighbours) != len(rows):
-            points = cloud.means[rows].detach().cpu().numpy()
-            _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
-            self.neighbours = torch.from_numpy(nearest[:, 1:]).to(rows.device)
-        drawn = torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)
+        drawn = rows[torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)]
         both = torch.cat([drawn[:, None], self.neighbours[drawn]], 1)
-        there = cloud.means.detach()[rows[both.flatten()]]
+        there = cloud.means.detach()[both.flatten()]
         offset, turn, _ = self.offsets(there, time)
         before, after = (x.view(*both.shape, 3) for x in (there, there + offset))
         frame = to_matrix(turn.view(*both.shape, 4)[:, 0])
@@ -197,20 +217,9 @@ class PlaneMotion(Addition):
         near = apart.square().sum(-1).clamp_min(MIN_DISTANCE**2)
         return (change.square().sum(-1) / near).mean()
 
-    @torch.no_grad()
     def after_step(self, method: Any, step: int) -> None:
-        """Tell static Gaussians from moving ones whenever density control is due."""
-        changed = len(self.moves) != len(method.cloud)
-        if not (changed or method.current.due):
-            return
-        self.neighbours = None
-        means = method.cloud.means
-        self.moves = torch.ones(len(means), dtype=torch.bool, device=means.device)
-        if self.active and self.progress >= self.numbers.told_apart:
-            first, last = self.times or (0.0, 1.0)
-            moments = torch.linspace(first, last, PROBED_MOMENTS).tolist()
-            farthest = torch.stack([self.offsets(means, t)[0].norm(dim=-1) for t in moments]).amax(0)
-            self.moves = farthest > self.numbers.still_offset * self.diagonal
+        if method.current.due or len(self.moves) != len(method.cloud):
+            self.follow_cloud(method.cloud.means.detach())
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         n = self.numbers

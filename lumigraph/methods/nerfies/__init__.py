@@ -232,7 +232,8 @@ class Nerfies(FieldMethod):
         if isinstance(canonical, SlicedHash):
             own = canonical.optimizers_at(c.learning_rate)
         else:
-            own = [torch.optim.Adam([*canonical.parameters(), *self.network.first.parameters()], c.learning_rate)]
+            both = [canonical, self.network.first] if self.network.first is not None else [canonical]
+            own = [torch.optim.Adam([p for each in both for p in each.parameters()], c.learning_rate)]
         return [*own, torch.optim.Adam(groups, c.learning_rate), *super().optimizers()]
 
     # Motion

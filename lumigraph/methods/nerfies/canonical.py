@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ...components.fields.coordinate_field import CoordinateField
+from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ...components.fields.coordinate_network import CoordinateNetwork
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import HashField, side_by_side
 from ...components.fields.layers import MLP, in_chunks
+from ...components.sampling.spaces import Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 from .warp import MotionField, SliceField
@@ -40,10 +41,10 @@ class SlicedHash(HashField):
 class SliceEncoding(nn.Module):
     """Waves of a position beside waves of ambient coordinates."""
 
-    def __init__(self, position: nn.Module, ambient: int):
+    def __init__(self, position: FrequencyEncoding, ambient: int):
         super().__init__()
         self.position, self.ambient = position, FrequencyEncoding(ambient, SLICE_BANDS, base=1.0)
-        self.width = position.width + self.ambient.width
+        self.width = self.position.width + self.ambient.width
 
     def forward(self, coordinates: Tensor, weights: Tensor | None = None) -> Tensor:
         position, ambient = coordinates.split([3, coordinates.shape[1] - 3], 1)
@@ -53,14 +54,17 @@ class SliceEncoding(nn.Module):
 class SlicedNetwork(CoordinateField):
     """The paper's network, of positions and ambient coordinates."""
 
-    def __init__(self, *arguments: Any, code: int = 0, ambient: int = 0, **named: Any):
-        super().__init__(*arguments, code=code, **named)
+    def __init__(
+        self, numbers: NetworkNumbers, hidden_width: int, space: Space, code: int = 0, ambient: int = 0, **named: Any
+    ):
+        super().__init__(numbers, hidden_width, space, code, **named)
         self.joint = False  # type: ignore[misc]  # features are kept also without an appearance
         if ambient:
-            n, width = self.numbers, arguments[1]
-            self.encode_position = SliceEncoding(self.encode_position, ambient)
-            inputs = self.encode_position.width, self.encode_direction.width + code
-            self.network = CoordinateNetwork(*inputs, n.depth, width, n.skip_layer, not n.bfloat16)
+            n = numbers
+            encoding = SliceEncoding(self.encode_position, ambient)  # type: ignore[arg-type]
+            inputs = encoding.width, self.encode_direction.width + code
+            self.encode_position = encoding
+            self.network = CoordinateNetwork(*inputs, n.depth, hidden_width, n.skip_layer, not n.bfloat16)
 
     def encode(self, coordinates: Float[Tensor, "point coordinate"]) -> Float[Tensor, "point width"]:
         return self.encode_position(coordinates, self.octave_weights())
