@@ -31,6 +31,8 @@ from .part import part_of
 from .part import places_of as places_of
 from .pictures import list_images
 from .raw import with_raw
+from .unposed import Unposed as Unposed
+from .unposed import unposed as without_poses
 from .views import multiscale as multiscale
 from .views import with_all_views, with_fewer_views
 
@@ -124,6 +126,7 @@ def open_scene(
     before: Before | None = None,
     whole: bool | None = None,
     part: CapturePart | dict[str, Any] | None = None,
+    unposed: Unposed | dict[str, Any] | None = None,
 ) -> Scene:
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
@@ -137,6 +140,7 @@ def open_scene(
     before:    how they were opened for a run; see `Before`
     whole:     learn from every photograph, also from those that test, unless the source itself says which do
     part:      some photographs of a large capture alone, of one place in it
+    unposed:   leave out the poses of a depth camera's frames, for they are to be found; options of `unposed.unposed`
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
     if requested(source) is not None:
@@ -145,6 +149,8 @@ def open_scene(
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
         capture = read_capture(source, reader)
+    if unposed is not None:
+        capture = without_poses(capture, typed(Unposed, unposed, str(source)) if isinstance(unposed, dict) else unposed)
     if part is not None:
         capture = part_of(capture, typed(CapturePart, part, str(source)) if isinstance(part, dict) else part)
     scene = assemble(capture, downscale, memory, cache, before)

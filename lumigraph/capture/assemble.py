@@ -18,16 +18,14 @@ from ..datasets.images import ImageSource, in_parallel, load
 from ..datasets.scene import Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
-from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
-from .capture import Capture, Shot
+from .capture import MAX_COORDINATE, Capture, Shot, checked_pose
 from .normalise import find_forward, find_place, similarity
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
-MAX_COORDINATE = 1e8  # units of the source, from its origin; maps in metres reach 1e7
 MAX_NAMES = 20  # missing files in a warning; further ones are counted
 
 
@@ -149,23 +147,6 @@ def split(source: str, shots: list[Shot], whole: bool = True) -> dict[str, Int[T
                 f"or remove those lists so that every {HOLD_OUT}th is held out"
             )
     return {purpose: images for purpose, images in found.items() if len(images)}
-
-
-def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
-    """The pose with an exact rotation. Raises LumigraphError for what is no rigid pose."""
-    axes = shot.pose[:, :3]
-    if not np.isfinite(shot.pose).all():
-        fault = "holds NaN or infinite numbers"
-    elif np.abs(shot.pose[:, 3]).max() > MAX_COORDINATE:
-        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {MAX_COORDINATE:g} are the most"
-    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID_TOLERANCE:
-        fault = "is not rigid, for its axes are not of unit length and at right angles"
-    elif np.linalg.det(axes) < 0:
-        fault = "is mirrored"
-    else:
-        u, _, vt = np.linalg.svd(axes)
-        return np.concatenate([u @ vt, shot.pose[:, 3:]], -1)
-    raise LumigraphError(f"{source}: the pose of {shot.name} {fault}; correct it or remove that photograph")
 
 
 def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:

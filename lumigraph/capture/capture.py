@@ -12,7 +12,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
+from ..errors import LumigraphError
+from ..geometry import RIGID_TOLERANCE
 
+MAX_COORDINATE = 1e8  # units of the source, from its origin; maps in metres reach 1e7
 Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha last, colours not multiplied by it
 
 
@@ -121,3 +124,20 @@ class Capture:
             None if x is None else x[kept] for x in (self.points, self.point_colours, self.sightings)
         )
         return replace(self, points=points, point_colours=colours, sightings=sightings)
+
+
+def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
+    """The pose with an exact rotation. Raises LumigraphError for what is no rigid pose."""
+    axes = shot.pose[:, :3]
+    if not np.isfinite(shot.pose).all():
+        fault = "holds NaN or infinite numbers"
+    elif np.abs(shot.pose[:, 3]).max() > MAX_COORDINATE:
+        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {MAX_COORDINATE:g} are the most"
+    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID_TOLERANCE:
+        fault = "is not rigid, for its axes are not of unit length and at right angles"
+    elif np.linalg.det(axes) < 0:
+        fault = "is mirrored"
+    else:
+        u, _, vt = np.linalg.svd(axes)
+        return np.concatenate([u @ vt, shot.pose[:, 3:]], -1)
+    raise LumigraphError(f"{source}: the pose of {shot.name} {fault}; correct it or remove that photograph")

@@ -12,8 +12,8 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
 from ..files.ranges import Point, Positive
-from .assemble import HOLD_OUT, checked_pose, in_order
-from .capture import Capture, Shot
+from .assemble import HOLD_OUT, in_order
+from .capture import Capture, Shot, checked_pose
 from .normalise import upright_of
 
 MAX_POINT_RADII = 16.0  # radii of a part within which sparse points are kept: beyond is the sky

@@ -49,6 +49,7 @@ from .methods import Methods
 from .render import Render
 from .report import Report
 from .resume import Resume
+from .track import Track
 from .train import Train, with_options_of
 from .view import ViewCommand
 
@@ -108,6 +109,7 @@ COMMANDS: dict[str, type] = {
     "demo": Demo,
     "capture": CaptureCommand,
     "train": Train,
+    "track": Track,
     "resume": Resume,
     "infer": Infer,
     "eval": Eval,
@@ -131,6 +133,7 @@ DESCRIPTION = """Train radiance fields from photographs, and render films, meshe
   lumigraph capture PHOTOS_OR_VIDEO     find the camera poses of photographs
   lumigraph train instant-ngp PHOTOS    train on a folder of photographs or a video
   lumigraph train surface PHOTOS        train the default method for meshes; then `lumigraph export mesh`
+  lumigraph track imap RECORDING        find the poses of a depth camera's frames, and map what it sees
   lumigraph eval runs/PHOTOS-instant-ngp-1     compare with held-out photographs
   lumigraph train my-method PHOTOS --method-file my.py    train a method of your own; all commands take the option"""
 
@@ -200,7 +203,7 @@ def parse(arguments: list[str]) -> Any:
     arguments = without_method_files(arguments)
     commands, first, rest = dict(COMMANDS), "".join(arguments[:1]), arguments[1:]
     there = {*methods.available(), *(methods.ALIASES if first == "train" else ())}
-    named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert") else []
+    named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert", "track") else []
     if named:  # the options of the method too
         commands[first] = with_options_of(named[0], rest, commands[first])
     kinds = []

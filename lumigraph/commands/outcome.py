@@ -28,9 +28,13 @@ NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "e
 def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Print the state of a Run after an Outcome, and the next commands."""
     from ..evaluation.photographs import RESULT_FILE
+    from ..evaluation.tracking import tracks
     from ..metrics.rows import last_psnr
     from ..training.verdict import cameras_moved, loss_trend
+    from .track import show_tracking
 
+    if tracks(method):
+        return show_tracking(run, outcome, method, data)
     state, budget = outcome.state, Budget.from_json(run.settings.budget)
     besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
     rows = {"run": str(run.folder), "training": f"{state.step} steps in {state.seconds:.1f} s (besides: {besides})"}

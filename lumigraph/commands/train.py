@@ -286,7 +286,9 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
     kind = methods.find(name)
     device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
-    extra: dict[str, tuple[Any, Any]] = {"quality": (Annotated[Quality | None, asked], None)}
+    extra: dict[str, tuple[Any, Any]] = {}
+    if "quality" in {x.name for x in dataclasses.fields(command)}:
+        extra["quality"] = Annotated[Quality | None, asked], None
     if in_blocks:
         blocks = derived(BlockOptions, kind.Config, {})
         extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()

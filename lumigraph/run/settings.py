@@ -10,7 +10,7 @@ import torch
 
 from .. import files, methods
 from ..budget import Budget
-from ..capture import CapturePart
+from ..capture import CapturePart, Unposed
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, typed, value_of
@@ -32,6 +32,7 @@ class SourceOptions:
     whole: bool | None = None
     part: CapturePart | None = None
     partial: bool | None = None
+    unposed: Unposed | None = None
 
 
 @dataclass(frozen=True)

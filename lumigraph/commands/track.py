@@ -1,0 +1,131 @@
+"""`lumigraph track`: find the poses of a moving depth camera while its surroundings are mapped."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional
+
+from .. import methods
+from ..budget import Budget
+from ..errors import LumigraphError
+from ..files.ranges import Count, Downscale, Port, Positive, Steps
+from .common import choose_device, exit_code, method_config, next_free, say, scene_name, show, typed
+from .options import DeviceOption, ReaderOption, SeedOption, needed, option
+
+TRACKED_SIDE = 320  # pixels along the longer side of a frame, about, where the user says nothing
+MAX_LOST_NAMES = 5  # of lost frames that are told
+
+
+@dataclass(frozen=True)
+class Track:
+    """Find the poses of a depth camera's frames in order, and map what it sees.
+
+    RECORDING is a folder of colour and depth, or procedural:room,depth. Poses in it are used for errors alone. RUN is
+    an ordinary run (`view`, `render`, `eval`, `export mesh`), and trajectory.txt has the pose of each frame in TUM's
+    format. tracking.json has ATE and RPE as evo defines them, drift.svg shows the error along the path. Ctrl-C saves;
+    `lumigraph resume` continues. `lumigraph track METHOD --help` adds the method's own options.
+    """
+
+    method: Annotated[Positional[str], needed("METHOD")]
+    """Method that tracks and maps: imap."""
+    recording: Annotated[Positional[str], needed("RECORDING")]
+    """Frames with depth: a folder, or procedural:room,depth."""
+    output: Annotated[Path | None, option("RUN", "runs/RECORDING-METHOD-N")] = None
+    """New folder for the run."""
+    frames: Annotated[Count | None, option("N", "all")] = None
+    """Track only the first frames."""
+    downscale: Annotated[Downscale | None, option("N", f"to about {TRACKED_SIDE} pixels")] = None
+    """Reduce frames by this whole number; a larger one is faster, and maps less detail."""
+    extent: Annotated[Positive | None, option("M", "1.5 times the farthest depth of the first frame")] = None
+    """Half-size of the mapped box around the first camera, in metres; larger holds more, and less detail."""
+    steps_after: Annotated[Steps | None, option("N", "none")] = None
+    """Steps of mapping after the last frame; more give a better map."""
+    reader: ReaderOption = None
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
+    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
+    """Stop after this number of frames as if interrupted."""
+    view: bool = False
+    """Show the map in the browser meanwhile, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
+    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
+    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
+    """Port that --view listens at."""
+
+    def run(self) -> int:
+        from ..capture import confirm, open_scene
+        from ..run import Run, build, check_new
+        from ..training import fit
+        from .view import keep_showing, watching
+
+        kind, device = methods.find(self.method), choose_device(self.device)
+        if "tracking" not in {x.name for x in dataclasses.fields(kind.Config)}:
+            there = [n for n in methods.available() if hasattr(methods.find(n).Config, "tracking")]
+            raise LumigraphError(f"{self.method} finds no poses; track with {' or '.join(there)}")
+        confirm(self.recording)
+        output = self.output or next_free(f"runs/{scene_name(self.recording)}-{methods.check(self.method)}")
+        check_new(output)
+        asked = {"extent": self.extent, "frames": self.frames}
+        unposed = {name: value for name, value in asked.items() if value is not None}
+        options: dict[str, Any] = {"reader": self.reader, "downscale": self.downscale, "unposed": unposed}
+        if self.downscale is None:
+            options["downscale"] = tracked_downscale(self.recording, self.reader)
+        data = open_scene(self.recording, **options)
+        config = method_config(self, self.method)
+        config = replace(config, tracking=replace(config.tracking, track=True))
+        seed = getattr(config, "seed", self.seed)
+        method: Any = build(kind, data.frame, config, device, seed, learning=True)
+        budget = Budget(len(method.sequence(data)) + (self.steps_after or 0))
+        run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
+        with watching(self.view, method, data, run, self.host, self.port) as watch:
+            begin = time.process_time()
+            with run.kept_if_learnt():
+                outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
+            show_tracking(run, outcome, method, data, time.process_time() - begin)
+            keep_showing(watch, outcome.signal)
+        return exit_code(outcome.signal)
+
+
+def tracked_downscale(recording: str, reader: str | None) -> int:
+    """Whole number by which the frames of a recording are reduced for tracking."""
+    from ..capture import read_capture
+
+    sizes = [max(shot.size) for shot in read_capture(recording, reader).shots[:1] if shot.size]
+    return max(1, round(max(sizes, default=TRACKED_SIDE) / TRACKED_SIDE))
+
+
+def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
+    """Write the trajectory of a run and print its errors, lost frames and next commands."""
+    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, write_tracking
+    from .outcome import next_commands
+
+    state, sequence = outcome.state, method.sequence(data)
+    followed = min(state.step, len(sequence))
+    speed = followed / max(state.seconds, 1e-9)
+    figures = {"frames_per_second": speed}
+    rows = {"run": str(run.folder), "tracking": f"{followed} frames in {state.seconds:.1f} s, {speed:.2f} frames/s"}
+    if processor_seconds is not None and followed:
+        figures["processor_seconds_per_frame"] = processor_seconds / followed
+        rows["tracking"] += f", {processor_seconds / followed:.2f} processor seconds a frame"
+    found = write_tracking(run, method, data, figures)
+    if not outcome.finished:
+        say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
+    rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
+    if found.lost:
+        names = ", ".join(data.names[i] for i in found.lost[:MAX_LOST_NAMES])
+        more = f" and {len(found.lost) - MAX_LOST_NAMES} more" if len(found.lost) > MAX_LOST_NAMES else ""
+        rows["lost"] = (
+            f"tracking failed at {names}{more}; these frames have no pose in {TRAJECTORY_FILE}, and the map holds "
+            "nothing of them; the map and all other poses are kept"
+        )
+    if (errors := found.errors) is not None:
+        rows |= {score.name: str(score) for score in errors.scores}
+        rows["drift"] = f"{run.folder / DRIFT_FILE}, {100 * errors.largest:.2f} cm at most in {errors.path:.2f} m"
+    show(rows | (next_commands(run) if outcome.finished else {}))

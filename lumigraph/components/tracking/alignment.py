@@ -1,0 +1,94 @@
+"""Alignment of a depth frame with a signed distance field: Gauss-Newton on its pose.
+
+The map is an implicit surface, so that back-projected points need no correspondences: their distance is the residual of
+point-to-plane ICP (Bylow 2013, section III). Colours of the field at the same points are a second residual.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .trajectory import Pose, moved
+
+HUBER = 1.5  # deviations from which on a residual counts by its size, not its square
+DAMPING = 1e-4  # of the normal matrix's diagonal
+GREY = (0.299, 0.587, 0.114)  # of red, green, blue in luminance
+MIN_POINTS = 50  # in the band of the field, below which a pose is not determined
+SMALL_TURN, SMALL_SHIFT = 1e-5, 1e-5  # radians and scene units of a last step
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """A pose, and the share of the points that lie within half the field's truncation."""
+
+    pose: Pose
+    share: float
+
+
+Field = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]]
+
+
+def aligned(
+    field: Field,
+    pose: Pose,
+    points: Float[Tensor, "point 3"],
+    rgb: Float[Tensor, "point 3"],
+    deviation: Float[Tensor, " point"],
+    colour_deviation: float,
+    iterations: int,
+) -> Aligned:
+    """The pose at which points lie on the field's surface.
+
+    field:     signed distance over the truncation, and sRGB-encoded colour, at points of the world
+    points:    in the camera's frame
+    deviation: standard deviation of each point's distance, over the truncation
+    colour_deviation: of luminance; 0: distance alone
+    Luminance is compared after a gain and an offset by least squares, for the camera's exposure changes.
+    """
+    grey, share = rgb @ rgb.new_tensor(GREY), 0.0
+    for _ in range(iterations):
+        world = (points @ pose[:, :3].T + pose[:, 3]).requires_grad_()
+        distance, colour = field(world)
+        (slope,) = torch.autograd.grad(distance.sum(), world, retain_graph=colour_deviation > 0)
+        band = distance.detach().abs() < 0.95
+        share = float((distance.detach().abs() < 0.5).float().mean())
+        if int(band.sum()) < MIN_POINTS:
+            break
+        arm = world.detach() - pose[:, 3]
+        hessian, gradient = normal_equations(distance.detach() / deviation, slope / deviation[:, None], arm, band)
+        if colour_deviation:
+            lum = colour @ colour.new_tensor(GREY)
+            (slope,) = torch.autograd.grad(lum.sum(), world)
+            gain, error = exposed(lum.detach(), grey, band)
+            more = normal_equations(error / colour_deviation, gain * slope / colour_deviation, arm, band)
+            hessian, gradient = hessian + more[0], gradient + more[1]
+        damped = hessian + DAMPING * hessian.diagonal().diag() + 1e-9 * torch.eye(6).to(hessian)
+        step = -torch.linalg.solve(damped, gradient)
+        pose = moved(pose[None], step[None].to(pose))[0]
+        if step[:3].norm() < SMALL_TURN and step[3:].norm() < SMALL_SHIFT:
+            break
+    return Aligned(pose, share)
+
+
+def normal_equations(residual: Tensor, slope: Tensor, arm: Tensor, band: Tensor) -> tuple[Tensor, Tensor]:
+    """J^T W J and J^T W r in double precision. J = (arm x slope, slope) of rotation about the camera and shift; W are
+    Huber's weights.
+
+    residual: in deviations; slope: of it by the point; arm: from the camera to the point; band: points that count
+    """
+    weight = (HUBER / residual.abs().clamp_min(1e-9)).clamp(max=1) * band
+    jacobian = torch.cat([torch.linalg.cross(arm, slope), slope], -1).double()
+    weighted = jacobian * weight[:, None].double()
+    return weighted.T @ jacobian, weighted.T @ residual.double()
+
+
+def exposed(seen: Tensor, target: Tensor, band: Tensor) -> tuple[Tensor, Tensor]:
+    """Gain, and what luminance differs by, after the gain and the offset of least squares."""
+    a, b = seen - seen[band].mean(), target - target[band].mean()
+    gain = ((a * b)[band].sum() / a[band].square().sum().clamp_min(1e-6)).clamp(0.5, 2.0)
+    return gain, gain * a - b

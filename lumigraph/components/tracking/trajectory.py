@@ -1,0 +1,100 @@
+"""Trajectory: the pose of each frame of a moving camera, and which of them are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ...camera import Camera
+from ...datasets.scene import Scene
+from ...geometry import rotated
+from ...method import Part
+
+UNKNOWN, LOST, KNOWN = 0, 1, 2  # states of a frame
+
+Pose = Float[Tensor, "3 4"]
+Twist = Float[Tensor, "pose 6"]  # rotation vector in the world's axes about the camera, then shift in scene units
+
+
+class Trajectory(Part):
+    """Poses of all frames, camera-to-world, scene units, by their image number.
+
+    state:  UNKNOWN before a frame's turn, LOST where tracking failed, KNOWN
+    anchor: keyframe that a frame was tracked beside: it moves along when the keyframe's pose is corrected
+    tracks: whether poses are found; otherwise they are those of the cameras
+    """
+
+    moves_cameras: ClassVar[bool] = True
+    poses: Tensor
+    state: Tensor
+    anchor: Tensor
+
+    def __init__(self, image_count: int):
+        super().__init__()
+        self.register_buffer("poses", torch.eye(3, 4).repeat(image_count, 1, 1))
+        self.register_buffer("state", torch.zeros(image_count, dtype=torch.int64))
+        self.register_buffer("anchor", torch.full((image_count,), -1))
+
+    @torch.no_grad()
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        self.poses.copy_(data.cameras.pose)
+
+    def know(self, index: int, pose: Pose, anchor: int) -> None:
+        self.poses[index] = rigid(pose[None])[0]
+        self.state[index], self.anchor[index] = KNOWN, anchor
+
+    def lose(self, index: int, pose: Pose) -> None:
+        """Keep the last known pose for a frame where tracking failed."""
+        self.poses[index], self.state[index] = pose, LOST
+
+    def predicted(self, before: list[int]) -> Pose:
+        """Pose of the next frame at constant velocity. before: the two frames before, the later one first"""
+        last = self.poses[before[0]]
+        if len(before) < 2 or (self.state[before[:2]] != KNOWN).any():
+            return last.clone()
+        turn, shift = relative(self.poses[before[1]], last)
+        return torch.cat([last[:, :3] @ turn, (last[:, :3] @ shift + last[:, 3])[:, None]], -1)
+
+    @torch.no_grad()
+    def correct(self, keyframes: Int[Tensor, " keyframe"], twists: Twist) -> None:
+        """Move keyframes by twists, and with each the frames that were tracked beside it."""
+        corrected = rigid(moved(self.poses[keyframes], twists))
+        for keyframe, pose in zip(keyframes.tolist(), corrected, strict=True):
+            beside = self.anchor == keyframe
+            turn, shift = relative(self.poses[keyframe], self.poses[beside])
+            there = torch.cat([pose[:, :3] @ turn, (shift @ pose[:, :3].T + pose[:, 3])[:, :, None]], -1)
+            self.poses[beside] = rigid(there)
+            self.poses[keyframe] = pose
+
+    @torch.no_grad()
+    def refined(self, cameras: Camera) -> Camera:
+        """Cameras of frames at the poses that were found; others stay."""
+        if cameras.image_index is None:
+            return cameras
+        index = cameras.image_index.to(self.poses.device)
+        found = (self.state[index] != UNKNOWN)[:, None, None]
+        pose = torch.where(found, self.poses[index], cameras.pose.to(self.poses))
+        return replace(cameras, pose=pose.to(cameras.pose))
+
+
+def relative(first: Pose, second: Float[Tensor, "*frame 3 4"]) -> tuple[Tensor, Tensor]:
+    """Rotation and shift of poses in the frame of the first: first^-1 second."""
+    back = first[:, :3].T
+    return back @ second[..., :3], (second[..., 3] - first[:, 3]) @ back.T
+
+
+def moved(poses: Float[Tensor, "pose 3 4"], twists: Twist) -> Float[Tensor, "pose 3 4"]:
+    """Poses turned about their own positions and shifted; differentiable in the twists."""
+    omega, shift = twists.split(3, -1)
+    axes = [rotated(poses[:, :, i], omega) for i in range(3)]
+    return torch.stack([*axes, poses[:, :, 3] + shift], -1)
+
+
+def rigid(poses: Float[Tensor, "pose 3 4"]) -> Float[Tensor, "pose 3 4"]:
+    """Poses with the nearest exact rotations."""
+    u, _, vt = torch.linalg.svd(poses[:, :, :3].double())
+    return torch.cat([(u @ vt).to(poses), poses[:, :, 3:]], -1)

@@ -1,0 +1,94 @@
+"""Trajectories that were found by tracking: files, errors against known poses, a plot of the drift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .. import files
+from ..components.tracking.frames import order_of
+from ..components.tracking.trajectory import KNOWN, LOST
+from ..datasets.scene import Scene
+from ..figures.charts import Series, line_chart, standalone
+from ..method import Method
+from ..metrics.trajectory import Poses, TrajectoryErrors, position_errors, relative_errors, to_tum
+from .held_out_poses import TRUE_POSE
+
+TRAJECTORY_FILE, TRUTH_FILE, ERRORS_FILE, DRIFT_FILE = "trajectory.txt", "truth.txt", "tracking.json", "drift.svg"
+MIN_POSES = 3  # frames that errors are measured on
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Poses that a method found, in the source's frame.
+
+    images:  their numbers in the scene, in the order of exposure; lost: those of frames where tracking failed
+    moments: seconds, or the number of the frame where the source knows no times
+    truth:   poses of the source; None where it knows none
+    """
+
+    images: list[int]
+    lost: list[int]
+    moments: list[float]
+    poses: Poses
+    truth: Float[np.ndarray, "pose 3 4"] | None
+
+    @staticmethod
+    def of(method: Any, scene: Scene) -> Tracked:
+        """method: one with a `trajectory`"""
+        state, order = method.trajectory.state.cpu(), order_of(scene.cameras)
+        chosen = order[state[order] == KNOWN]
+        cameras = method.refined(scene.cameras[chosen]).transformed(scene.frame.to_source.matrix)
+        times = scene.cameras.time
+        moments = (order.argsort()[chosen] if times is None else times[chosen]).tolist()
+        truth = scene.about.get(TRUE_POSE)
+        known = None if truth is None else truth[chosen].double().numpy()
+        poses = cameras.pose.double().cpu().numpy()
+        return Tracked(chosen.tolist(), order[state[order] == LOST].tolist(), moments, poses, known)
+
+    @property
+    def errors(self) -> TrajectoryErrors | None:
+        if self.truth is None or len(self.images) < MIN_POSES:
+            return None
+        return TrajectoryErrors.of(self.poses, self.truth)
+
+    @property
+    def drift(self) -> str:
+        """Chart of the position's error along the true path, and of the relative error; empty without truth."""
+        if self.truth is None or len(self.images) < MIN_POSES:
+            return ""
+        away, (shift, _) = 100 * position_errors(self.poses, self.truth), relative_errors(self.poses, self.truth)
+        steps = np.linalg.norm(np.diff(self.truth[:, :, 3], axis=0), axis=-1)
+        path = np.concatenate([[0.0], np.cumsum(steps)]).tolist()
+        curves = [
+            Series("position, aligned", path, away.tolist()),
+            Series("frame to frame", path[1:], (100 * shift).tolist()),
+        ]
+        return line_chart(curves, "metres of the path", "error, cm", smoothed=False)
+
+
+def tracks(method: Method) -> bool:
+    """True for a method that finds poses in order: see `lumigraph track`."""
+    tracking = getattr(method.config, "tracking", None)
+    return bool(tracking is not None and tracking.track)
+
+
+def write_tracking(run: Any, method: Method, scene: Scene, figures: dict[str, float]) -> Tracked:
+    """Write RUN/trajectory.txt and, where poses are known, truth.txt, the errors and the plot of the drift.
+
+    figures: further ones for tracking.json
+    """
+    found = Tracked.of(method, scene)
+    files.write_bytes(run.folder / TRAJECTORY_FILE, to_tum(found.moments, found.poses).encode(), ours=True)
+    about: dict[str, Any] = {"frames": len(scene), "known": len(found.images)} | figures
+    about["lost"] = [scene.names[i] for i in found.lost]
+    if (errors := found.errors) is not None:
+        assert found.truth is not None
+        files.write_bytes(run.folder / TRUTH_FILE, to_tum(found.moments, found.truth).encode(), ours=True)
+        files.write_bytes(run.folder / DRIFT_FILE, standalone(found.drift), ours=True)
+        about["scores"] = [score.to_json() for score in errors.scores]
+    files.write_json(run.folder / ERRORS_FILE, about)
+    return found

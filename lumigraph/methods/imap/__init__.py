@@ -1,0 +1,460 @@
+"""iMAP: tracking and mapping of a depth camera by one small field (Sucar et al. 2021, arXiv 2103.12352)."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ...budget import BY_PHOTOGRAPH, Efforts
+from ...camera.rays import Rays
+from ...color.blending import before
+from ...components.fields.hash_field import TINY_TABLE, HashNumbers
+from ...components.sampling.spaces import Box
+from ...components.tracking.alignment import aligned
+from ...components.tracking.frames import DepthFrame, Moment, order_of
+from ...components.tracking.trajectory import KNOWN, Pose, Trajectory, moved, relative
+from ...components.training.pose_refinement import PoseAdam
+from ...datasets.scene import Frame, Scene
+from ...errors import LumigraphError
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...method import FieldMethod, Pass
+from ...method.method import Descend
+from ...volume import composite
+from .fields import DistanceTable, MapNetwork
+from .sampler import MapSampler, RayNumbers
+
+Iterations = Annotated[int, between(0, 10_000)]
+FREQUENCY_ROWS = 93  # of B, section 3.1
+REGIONS = 8  # along each side of a frame, of which active sampling keeps losses (section 3.4)
+UNKNOWN_LOSS = 1.0  # of a region that has not been compared yet
+MIN_LOSS = 1e-3  # added to losses, so that each region and keyframe can be drawn
+SURFACE_BAND = 0.7  # truncations from a table's surface within which a point is explained
+SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness term, and metres between them
+MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
+SENSOR_DEVIATION = 0.005, 0.0025  # metres: of depth, and of its square by the metre (Khoshelham and Elberink 2012)
+COLOUR_DEVIATION = 0.08  # of luminance in alignment
+EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
+MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
+
+
+@dataclass(frozen=True)
+class TrackingNumbers:
+    """A Config's numbers of tracking (section 3.3)."""
+
+    track: bool = False  # find the poses of frames in order, as `lumigraph track` does; else they are those given
+    first_estimate: Literal["velocity", "surface"] = (
+        "velocity"  # first pose: constant velocity, or aligned with the map
+    )
+    alignment_points: BatchSize = 3000  # pixels of a frame that are aligned with the map's surface
+    alignment_iterations: Iterations = 12  # Gauss-Newton steps of that
+    tracking_iterations: Iterations = 50  # descents on a frame's pose; more follow faster motion, slower
+    tracking_pixels: BatchSize = 200  # pixels of each of these descents, section 3.4
+    tracking_rate: LearningRate = 3e-3  # Adam's rate of a frame's pose, radians and scene units
+    lost_share: Share = 0.3  # share of explained pixels below which a frame is lost
+
+
+@dataclass(frozen=True)
+class MappingNumbers:
+    """A Config's numbers of joint mapping (sections 3.3 and 3.4)."""
+
+    mapping_iterations: Iterations = 10  # descents on map and keyframes' poses for each frame; more learn more, slower
+    first_iterations: Iterations = 200  # descents on the map for the first frame
+    window: Annotated[int, between(1, 1000)] = 5  # keyframes W of a descent, with the latest and the current one
+    pixels_per_frame: BatchSize = 200  # pixels of each frame in the window, section 3.4
+    active_sampling: bool = True  # draw pixels and keyframes by their loss, section 3.4; else evenly
+    keyframe_pose_rate: LearningRate = 3e-3  # Adam's rate of keyframes' poses; 0: they stay
+    keyframe_share: Share = 0.65  # t_P, share of explained pixels below which a frame becomes a keyframe
+    depth_tolerance: Share = 0.1  # t_D, relative error of depth up to which a pixel is explained
+
+
+@dataclass(frozen=True)
+class LossNumbers:
+    """A Config's weights of the loss; those of a distance are Co-SLAM's (Wang 2023, eqs. 6 to 9)."""
+
+    colour_weight: NonNegative = 5.0  # lambda_p, weight of colours, eq. 7
+    depth_weight: NonNegative = 1.0  # weight of depth, eq. 6
+    distance_weight: NonNegative = 0.0  # weight of the distance within the truncation, with --field hash
+    free_weight: NonNegative = 0.0  # weight of free space in front of surfaces, with --field hash
+    smooth_weight: NonNegative = 0.0  # weight of differences between neighbours in the table, with --field hash
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, by section; those without one are not in the paper."""
+
+    table: HashNumbers = HashNumbers(sh_bands=1)
+    rays: RayNumbers = RayNumbers()
+    tracking: TrackingNumbers = TrackingNumbers()
+    mapping: MappingNumbers = MappingNumbers()
+    terms: LossNumbers = LossNumbers()
+    field: Literal["network", "hash"] = "network"  # map: the paper's network, or a faster hash table of a distance
+    layers: Annotated[int, between(1, 16)] = 4  # hidden layers of the network, section 3.1
+    hidden_width: Width = 256  # channels of a hidden layer, section 3.1; wider holds more detail, and costs time
+    frequency_deviation: Positive = 25.0  # sigma of the Fourier features, section 3.1; higher holds finer detail
+    truncation: Positive = 0.1  # metres at which the distance is truncated, with --field hash
+    sharpness: Positive = 10.0  # steepness of density at a surface, per truncation, with --field hash
+    learning_rate: LearningRate = 1e-3  # Adam's rate of the map; higher: faster, may diverge
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+class IMap(FieldMethod):
+    """One step is one frame: find its pose in the map, decide whether it is a keyframe, then descend on the map and the
+    poses of keyframes together. Steps after the last frame map on.
+
+    is_keyframe: of each image
+    losses:      of each image and region of active sampling, as they were last measured; those of keyframes count
+    snapshot:    the map when the latest keyframe was added, by which frames are judged (section 3.4)
+    turn:        number of frames that were followed
+    """
+
+    Config = Config
+    efforts: ClassVar[Efforts] = BY_PHOTOGRAPH
+    network: MapNetwork | DistanceTable
+    sampler: MapSampler
+    is_keyframe: Tensor
+    losses: Tensor
+    turn: Tensor
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        self.unit = 1 / frame.to_source.scale  # scene units of a metre
+        space, hashed = Box(frame.bounds, frame.near), c.field == "hash"
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            if hashed:
+                self.network = DistanceTable(c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness)
+            else:
+                self.network = MapNetwork(c.layers, c.hidden_width, FREQUENCY_ROWS, c.frequency_deviation)
+        self.sampler = MapSampler(space, c.rays, c.truncation * self.unit if hashed else None)
+        self.trajectory = Trajectory(frame.image_count)
+        self.snapshot = copy.deepcopy(self.network).requires_grad_(False)
+        self.register_buffer("is_keyframe", torch.zeros(frame.image_count, dtype=torch.bool))
+        self.register_buffer("losses", torch.full((frame.image_count, REGIONS * REGIONS), UNKNOWN_LOSS))
+        self.register_buffer("turn", torch.tensor(0))
+        self.rehearses = False
+        self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
+        table = HashNumbers(8, 2, 16, 16, 512, geometry_features=16, colour_layers=1, sh_bands=1)
+        tracking = TrackingNumbers(first_estimate="surface", tracking_iterations=0)
+        mapping = MappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
+        mapping = replace(mapping, keyframe_pose_rate=2e-4)
+        c = Config(table, RayNumbers(16, 10), tracking, mapping, LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3), "hash")
+        return replace(c, hidden_width=32, learning_rate=1e-2)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A tiny hash table and few descents a frame."""
+        mapping = MappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
+        terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-4)
+        c = Config(replace(TINY_TABLE, sh_bands=1), RayNumbers(12, 8), TrackingNumbers(), mapping, terms, "hash")
+        return replace(c, hidden_width=16, truncation=0.2, sharpness=4.0, learning_rate=2e-2)
+
+    # The sequence
+
+    def steps_per_pass(self, data: Any) -> float:
+        return len(self.sequence(data))
+
+    def sequence(self, data: Scene) -> list[int]:
+        """Images in the order of their exposure: all where poses are to be found, else those to learn from."""
+        order, learnt = order_of(data.cameras).tolist(), set(data.splits["train"].tolist())
+        return order if self.config.tracking.track else [i for i in order if i in learnt]
+
+    def compile_begin(self) -> None:
+        super().compile_begin()
+        self.rehearses = True
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        super().begin(data, seconds)
+        if self.config.tracking.track and "depth" not in data.layers:
+            raise LumigraphError(
+                f"{data.source} has no depth, which tracking needs; train with the poses of its photographs"
+            )
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Moment:
+        """The frame that is next, and the scene."""
+        sequence, turn = self.sequence(data), int(self.turn)
+        return Moment(data, self._frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
+
+    def _frame(self, data: Scene, index: int) -> DepthFrame:
+        if index not in self._held:
+            return DepthFrame.of(data, index, self.device, next(iter(self._held.values()), None))
+        return self._held[index]
+
+    def step(self, batch: Moment, step: int, descend: Descend) -> dict[str, Tensor]:
+        """Follow the next frame, then map."""
+        c, chance, frame, first = self.config.mapping, self.random(step), batch.frame, int(self.turn) == 0
+        if frame is not None:
+            known = self.follow(frame, batch, chance)
+            learns = known and bool((batch.scene.splits["train"] == frame.index).any())
+            if learns and (
+                not self.is_keyframe.any() or self.explained(self.snapshot, frame, chance) < c.keyframe_share
+            ):
+                self.add_keyframe(frame)
+            frame = frame if learns else None
+            self.turn += 1
+        return self.map(
+            frame,
+            batch,
+            1 if self.rehearses else c.first_iterations if first else c.mapping_iterations,
+            chance,
+            descend,
+        )
+
+    # Keyframes (section 3.4)
+
+    @torch.no_grad()
+    def explained(self, field: Any, frame: DepthFrame, chance: torch.Generator) -> float:
+        """Share P of pixels whose depth a map explains (eq. 9): of a table, whose surface is near what was measured."""
+        pixels = frame.drawn(EXPLAINED_PIXELS, chance, measured=True)
+        if not len(pixels):
+            return 0.0
+        rays, depth = self.world_rays(frame.rays[pixels], self.trajectory.poses[frame.index][None]), frame.depth[pixels]
+        if isinstance(field, DistanceTable):
+            distance = field.distance_of(field.geometry(rays.at(depth))[1])
+            return float((distance.abs() < SURFACE_BAND).float().mean())
+        pixels = pixels[: self.config.mapping.pixels_per_frame]
+        rays, depth = rays[: len(pixels)], depth[: len(pixels)]
+        (seen,) = self.sampler.sample(rays, field)
+        look = seen.look(field)
+        found = composite(look.samples, look.density, look.rgb)
+        error = (found.depth * found.opacity).nan_to_num(0, 0) - depth
+        return float((error.abs() / depth < self.config.mapping.depth_tolerance).float().mean())
+
+    def add_keyframe(self, frame: DepthFrame) -> None:
+        self.is_keyframe[frame.index] = True
+        self.trajectory.anchor[frame.index] = frame.index
+        self._held[frame.index] = frame
+        self.snapshot.load_state_dict(self.network.state_dict())
+
+    def keyframes(self) -> list[int]:
+        """Images that are keyframes, in the order of their exposure if their numbers are."""
+        return self.is_keyframe.nonzero()[:, 0].tolist()
+
+    # Tracking (section 3.3)
+
+    def follow(self, frame: DepthFrame, batch: Moment, chance: torch.Generator) -> bool:
+        """Find the pose of the next frame. False if tracking is lost: the last known pose is kept for it then."""
+        t, trajectory = self.config.tracking, self.trajectory
+        given = batch.scene.cameras.pose[frame.index].to(self.device)
+        anchor = max(self.keyframes(), default=frame.index)
+        if not t.track or not batch.before:
+            trajectory.know(frame.index, given, anchor)
+            return True
+        known = [i for i in batch.before if trajectory.state[i] == KNOWN][::-1]
+        steady = batch.before[-1:] == known[:1]
+        starts = (
+            [trajectory.predicted(known[:2]), trajectory.poses[known[0]]] if steady else [trajectory.poses[known[0]]]
+        )
+        for start in starts:
+            pose = self.tracked(frame, start, chance)
+            trajectory.know(frame.index, pose, anchor)
+            share = self.explained(self.network, frame, chance)
+            if share > t.lost_share and self.plausible(trajectory.poses[known[0]], pose):
+                self.figures["explained"] = share
+                return True
+        trajectory.lose(frame.index, trajectory.poses[known[0]])
+        return False
+
+    def plausible(self, last: Pose, pose: Pose) -> bool:
+        """True for a motion that a hand can make between two frames."""
+        turn, shift = relative(last, pose)
+        angle = torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))
+        return float(shift.norm()) < MAX_STEP[0] * self.unit and float(angle) < MAX_STEP[1]
+
+    def tracked(self, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
+        """The frame's pose: aligned with the map's surface, or as given, then by descents on the loss of its pixels."""
+        t = self.config.tracking
+        with frozen(self.network):
+            if t.first_estimate == "surface" and isinstance(self.network, DistanceTable):
+                pose = self.aligned(frame, pose, chance)
+            twist = torch.zeros(1, 6, device=self.device, requires_grad=True)
+            optimizer = PoseAdam([twist], t.tracking_rate)
+            for i in range(t.tracking_iterations):
+                optimizer.param_groups[0]["lr"] = t.tracking_rate * (1 - i / t.tracking_iterations)
+                pixels = frame.drawn(t.tracking_pixels, chance, measured=True)
+                rays = self.world_rays(frame.rays[pixels], moved(pose[None], twist))
+                terms, _ = self.errors(rays, frame.rgb[pixels], frame.depth[pixels], chance)
+                (twist.grad,) = torch.autograd.grad(torch.stack(list(terms.values())).sum(), [twist])
+                optimizer.step()
+            return moved(pose[None], twist.detach())[0]
+
+    def aligned(self, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
+        t, field, unit = self.config.tracking, self.network, self.unit
+        assert isinstance(field, DistanceTable)
+        pixels = frame.drawn(t.alignment_points, chance, measured=True)
+        points = frame.rays[pixels].at(frame.depth[pixels])
+        metres = frame.depth[pixels] / unit
+        deviation = (SENSOR_DEVIATION[0] + SENSOR_DEVIATION[1] * metres.square()) * unit / field.truncation
+
+        def seen(world: Tensor) -> tuple[Tensor, Tensor]:
+            _, features = field.geometry(world)
+            return field.distance_of(features), field.colour(features, world)  # the direction does not matter
+
+        rgb = frame.rgb[pixels]
+        return aligned(seen, pose, points, rgb, deviation, COLOUR_DEVIATION, t.alignment_iterations).pose
+
+    # Mapping (section 3.3)
+
+    def map(
+        self, current: DepthFrame | None, batch: Moment, iterations: int, chance: torch.Generator, descend: Descend
+    ) -> dict[str, Tensor]:
+        """Descend on the map and the poses of keyframes together. current: the frame that joins the keyframes"""
+        c, terms = self.config.mapping, dict[str, Tensor]()
+        joined = sorted({*self.keyframes(), *([] if current is None else [current.index])})
+        numbers, poses = torch.tensor(joined), self.trajectory.poses[joined]
+        twists = torch.zeros(len(joined), 6, device=self.device, requires_grad=self.config.tracking.track)
+        optimizer = PoseAdam([twists], c.keyframe_pose_rate)
+        for _ in range(iterations):
+            window = self.window(joined, current, chance)
+            frames = [
+                current if current and current.index == joined[i] else self.held(batch.scene, joined[i]) for i in window
+            ]
+            drawn = [(f, self.pixels(f, chance)) for f in frames]
+            moving = moved(poses, twists * (numbers != joined[0])[:, None].to(twists))  # the first frame stays
+            rays = [self.world_rays(f.rays[p], moving[i][None]) for i, (f, p) in zip(window, drawn, strict=True)]
+            rgb = torch.cat(
+                [before(f.rgb[p], None if f.alpha is None else f.alpha[p], self.background) for f, p in drawn]
+            )
+            terms, error = self.errors(joined_rays(rays), rgb, torch.cat([f.depth[p] for f, p in drawn]), chance)
+            descend(terms)
+            if twists.grad is not None and c.keyframe_pose_rate:
+                optimizer.step()
+                twists.grad = None
+            self.remember(drawn, error)
+        if self.config.tracking.track:
+            self.trajectory.correct(numbers, twists.detach() * (numbers != joined[0])[:, None])
+        self.figures["keyframes"] = int(self.is_keyframe.sum())
+        return terms
+
+    def held(self, data: Scene, index: int) -> DepthFrame:
+        """A keyframe's pixels, which are kept."""
+        if index not in self._held:
+            self._held[index] = self._frame(data, index)
+        return self._held[index]
+
+    def window(self, joined: list[int], current: DepthFrame | None, chance: torch.Generator) -> list[int]:
+        """Places in `joined` of the frames of one descent: the current and the latest keyframe, others by their mean
+        loss or evenly."""
+        latest = [i for i, index in enumerate(joined) if current is not None and index == current.index]
+        latest = list(dict.fromkeys([*latest, len(joined) - 1]))
+        others = [i for i in range(len(joined)) if i not in latest]
+        count = min(len(others), max(self.config.mapping.window - len(latest), 0))
+        if not count:
+            return latest
+        weights = (
+            self.losses[[joined[i] for i in others]].mean(-1)
+            if self.config.mapping.active_sampling
+            else torch.ones(len(others))
+        )
+        chosen = torch.multinomial(weights.cpu() + MIN_LOSS, count, generator=chance)
+        return latest + [others[i] for i in chosen.tolist()]
+
+    def pixels(self, frame: DepthFrame, chance: torch.Generator) -> Int[Tensor, " pixel"]:
+        """Pixels of a frame: by the loss of their regions, which share them out (eq. 10), or evenly."""
+        count, (width, height) = self.config.mapping.pixels_per_frame, frame.size
+        if not self.config.mapping.active_sampling:
+            return frame.drawn(count, chance)
+        region = torch.multinomial(self.losses[frame.index].cpu() + MIN_LOSS, count, replacement=True, generator=chance)
+        place = torch.rand(2, count, generator=chance)
+        column = ((region % REGIONS + place[0]) * (width / REGIONS)).long().clamp(max=width - 1)
+        row = ((region // REGIONS + place[1]) * (height / REGIONS)).long().clamp(max=height - 1)
+        return (row * width + column).to(self.device)
+
+    @torch.no_grad()
+    def remember(self, drawn: Sequence[tuple[DepthFrame, Tensor]], error: Float[Tensor, " ray"]) -> None:
+        """Keep the mean error of the regions that were drawn from."""
+        if not self.config.mapping.active_sampling:
+            return
+        for (frame, pixels), own in zip(drawn, error.split([len(p) for _, p in drawn]), strict=True):
+            width, height = frame.size
+            region = pixels // width * REGIONS // height * REGIONS + pixels % width * REGIONS // width
+            total, count = (torch.zeros(REGIONS * REGIONS, device=own.device) for _ in range(2))
+            total.index_add_(0, region, own)
+            count.index_add_(0, region, torch.ones_like(own))
+            self.losses[frame.index] = torch.where(count > 0, total / count.clamp_min(1), self.losses[frame.index])
+
+    def world_rays(self, rays: Rays, pose: Float[Tensor, "1 3 4"]) -> Rays:
+        """Rays of a camera at the origin, for a camera at a pose."""
+        turn, place = pose[0, :, :3], pose[0, :, 3]
+        return replace(rays, origins=rays.origins @ turn.T + place, directions=rays.directions @ turn.T)
+
+    def errors(
+        self, rays: Rays, rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], chance: torch.Generator
+    ) -> tuple[dict[str, Tensor], Float[Tensor, " ray"]]:
+        """Terms of the loss along rays, and the error of each ray's colour and depth, for active sampling.
+
+        rgb: sRGB-encoded, before the background; depth: distance along the ray, NaN where nothing was measured
+        """
+        c, known = self.config.terms, depth.isfinite()
+        (seen,) = self.sampler.sample(rays, self.network, None, chance, depth)
+        look, t = seen.look(self.network), seen.samples.t[:, None]
+        found = composite(look.samples, look.density, look.rgb, self.background, moments=torch.cat([t, t * t], -1))
+        residual, (mean, square) = found.rgb - rgb, found.extra["moments"].unbind(-1)
+        away = torch.where(known, mean - depth.nan_to_num(0, 0, 0), 0.0)
+        count = known.sum().clamp_min(1)
+        self.figures["mse"] = float(residual.detach().square().mean())
+        if isinstance(self.network, MapNetwork):  # eqs. 5 to 7
+            variance = (square - 2 * mean * mean + mean * mean * found.opacity).detach().clamp_min(MIN_VARIANCE)
+            away = away.abs() / variance.sqrt()
+            colour, depths = residual.abs().mean(-1), away
+        else:  # Wang 2023, eqs. 6 and 7
+            colour, depths = residual.square().mean(-1), (away / self.unit).square()
+        terms = {"colour": c.colour_weight * colour.mean(), "depth": c.depth_weight * depths.sum() / count}
+        if isinstance(self.network, DistanceTable):
+            terms |= self.distance_terms(self.network, seen, depth, chance)
+        if not known.any():
+            terms = {"colour": terms["colour"]} | {name: terms[name] for name in ("smooth",) if name in terms}
+        return terms, (c.colour_weight * colour + c.depth_weight * depths).detach()
+
+    def distance_terms(
+        self, field: DistanceTable, seen: Pass, depth: Float[Tensor, " ray"], chance: torch.Generator
+    ) -> dict[str, Tensor]:
+        """The distance near what was measured, free space before it (Wang 2023, eqs. 8 and 9), smoothness (eq. 10)."""
+        c, ray = self.config.terms, seen.samples.ray_index
+        ahead = (depth[ray] - seen.samples.t) / field.truncation  # truncations to the surface; NaN where unknown
+        distance = field.distance_of(seen.features)
+        near, free = ahead.abs() < 1, ahead >= 1
+        error = torch.where(near, distance - ahead.nan_to_num(0, 0, 0), 0.0).square().sum() / near.sum().clamp_min(1)
+        clear = torch.where(free, distance - 1, 0.0).square().sum() / free.sum().clamp_min(1)
+        terms = {"distance": c.distance_weight * error, "free": c.free_weight * clear}
+        if c.smooth_weight:
+            low, high = self.background.new_tensor(self.frame.bounds)
+            points = torch.lerp(low, high, torch.rand(SMOOTH_POINTS, 3, generator=chance).to(low))
+            beside = points + SMOOTH_STEP * self.unit * torch.randn(SMOOTH_POINTS, 3, generator=chance).to(low)
+            first, second = field.encode(torch.cat([points, beside])).chunk(2)
+            terms["smooth"] = c.smooth_weight * (first - second).square().sum(-1).mean()
+        return terms
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        if isinstance(self.network, DistanceTable):
+            return self.network.optimizers_at(self.config.learning_rate)
+        return [torch.optim.Adam(self.network.parameters(), self.config.learning_rate)]
+
+
+@contextlib.contextmanager
+def frozen(field: torch.nn.Module) -> Iterator[None]:
+    """A field whose parameters get no gradient meanwhile."""
+    learnt = [p for p in field.parameters() if p.requires_grad]
+    try:
+        for p in learnt:
+            p.requires_grad_(False)
+        yield
+    finally:
+        for p in learnt:
+            p.requires_grad_(True)
+
+
+def joined_rays(parts: Sequence[Rays]) -> Rays:
+    return Rays(*(torch.cat([getattr(x, name) for x in parts]) for name in ("origins", "directions", "radius")))

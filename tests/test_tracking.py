@@ -1,0 +1,162 @@
+"""Trajectories, their errors and files, recordings without poses, and alignment of a frame with a surface."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from budgets import budget
+
+from lumigraph.camera.lens import Pinhole
+from lumigraph.capture import Unposed, without_poses
+from lumigraph.capture.capture import Capture, PixelPlane, Shot
+from lumigraph.components.tracking.alignment import aligned
+from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
+from lumigraph.errors import LumigraphError
+from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
+
+pytestmark = budget("methods", 4)
+
+
+def walk(count: int = 20, seed: int = 0) -> np.ndarray:
+    """Poses on a crooked path."""
+    random = torch.Generator().manual_seed(seed)
+    steps = 0.1 * torch.randn(count, 6, generator=random).double()
+    pose, poses = torch.eye(3, 4, dtype=torch.float64)[None], []
+    for step in steps:
+        pose = moved(pose, step[None])
+        poses.append(pose[0])
+    return torch.stack(poses).numpy()
+
+
+def under(poses: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    return np.concatenate([rotation @ poses[:, :, :3], (poses[:, :, 3] @ rotation.T + shift)[:, :, None]], -1)
+
+
+def test_errors_ignore_the_frame_of_the_world():
+    truth = walk()
+    turn = moved(torch.eye(3, 4, dtype=torch.float64)[None], torch.tensor([[0.4, -0.7, 1.1, 0, 0, 0]]).double())
+    there = under(truth, turn[0, :, :3].numpy(), np.array([3.0, -2.0, 1.0]))
+    found = TrajectoryErrors.of(there, truth)
+    assert found.ate < 1e-12 and found.rpe < 1e-12 and found.rpe_degrees < 1e-5
+    assert found.path == pytest.approx(np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=-1).sum())
+
+
+def test_a_wrong_scale_is_an_error():
+    """Umeyama's alignment without scale: positions of twice the size are off by their distance from the middle."""
+    truth = walk()
+    double = truth.copy()
+    double[:, :, 3] *= 2
+    away = truth[:, :, 3] - truth[:, :, 3].mean(0)
+    np.testing.assert_allclose(position_errors(double, truth), np.linalg.norm(away, axis=-1), atol=1e-9)
+
+
+def test_the_relative_error_is_of_motions_not_of_places():
+    """One step of 3 cm and 2 degrees too much in the middle of a path: one pair is wrong, all others are right."""
+    truth = walk()
+    found, extra = truth.copy(), np.eye(4)
+    angle = math.radians(2)
+    extra[:3, :3] = [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]
+    extra[2, 3] = 0.03
+    for i in range(10, 20):  # all later poses: Q_9 E Q_9^-1 Q_i
+        a, b = (np.vstack([truth[k], [0, 0, 0, 1]]) for k in (9, i))
+        found[i] = (a @ extra @ np.linalg.inv(a) @ b)[:3]
+    shift, turn = relative_errors(found, truth)
+    assert (shift > 1e-9).sum() == 1 and turn[9] == pytest.approx(2) and turn.max() == turn[9]
+
+
+def test_a_line_of_tum_is_moment_position_quaternion():
+    pose = np.array([[[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]])  # a quarter turn about z
+    comment, line = to_tum([1.5], pose).splitlines()
+    assert comment.startswith("#")
+    numbers = [float(x) for x in line.split()]
+    assert numbers[:4] == [1.5, 1, 2, 3]
+    assert np.abs(numbers[4:]) == pytest.approx([0, 0, math.sqrt(0.5), math.sqrt(0.5)]) and numbers[6] * numbers[7] > 0
+
+
+def test_frames_move_along_with_their_keyframe():
+    trajectory = Trajectory(4)
+    poses = torch.from_numpy(walk(4)).float()
+    for i, anchor in enumerate((0, 0, 2, 2)):
+        trajectory.know(i, poses[i], anchor)
+    before = [relative(trajectory.poses[a], trajectory.poses[b]) for a, b in ((0, 1), (2, 3))]
+    others = trajectory.poses[:2].clone()
+    trajectory.correct(torch.tensor([2]), torch.tensor([[0.1, 0, -0.2, 0.3, 0.1, 0]]))
+    after = [relative(trajectory.poses[a], trajectory.poses[b]) for a, b in ((0, 1), (2, 3))]
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=0)
+    assert torch.equal(trajectory.poses[:2], others) and not torch.allclose(trajectory.poses[2], poses[2], atol=0.1)
+
+
+def test_velocity_is_constant():
+    trajectory, step = Trajectory(3), torch.tensor([[0.02, -0.01, 0.03, 0.1, 0.0, 0.05]])
+    first = rigid(torch.from_numpy(walk(1)).float())
+    trajectory.know(0, first[0], 0)
+    trajectory.know(1, moved(first, step)[0], 0)
+    guess = trajectory.predicted([1, 0])
+    turn, shift = relative(trajectory.poses[0], trajectory.poses[1])
+    again, further = relative(trajectory.poses[1], guess)
+    torch.testing.assert_close((again, further), (turn, shift), atol=1e-5, rtol=0)
+    trajectory.lose(1, trajectory.poses[0])
+    assert torch.equal(trajectory.predicted([1, 0]), trajectory.poses[1])
+    assert trajectory.state.tolist() == [KNOWN, LOST, 0]
+
+
+@pytest.mark.parametrize("colours", [0.0, 0.05])
+def test_alignment_finds_the_motion(colours):
+    """A corner of three planes, whose colours vary: rotation and shift are found from points on it. With two planes
+    alone, colours find the shift along both."""
+    chance = torch.Generator().manual_seed(0)
+    points = torch.rand(3000, 3, generator=chance)
+    planes = 2 if colours else 3
+    points[torch.arange(3000), torch.arange(3000) % planes] = 0.0
+
+    def field(at):
+        outside = at[:, :planes]
+        wave = (5 * at).sin().mean(-1)
+        return outside.amin(-1) / 0.3, 0.5 + 0.4 * wave[:, None].expand(-1, 3)
+
+    truth = rigid(moved(torch.eye(3, 4)[None], torch.tensor([[0.03, -0.05, 0.02, 0.04, -0.03, 0.02]])))[0]
+    rgb = field(points)[1] * 0.8 + 0.05  # another exposure
+    local = (points - truth[:, 3]) @ truth[:, :3]
+    found = aligned(field, torch.eye(3, 4), local, rgb, torch.full((3000,), 0.03), colours, 25)
+    turn, shift = relative(truth, found.pose)
+    assert shift.norm() < 2e-3 and (turn - torch.eye(3)).norm() < 4e-3 and found.share > 0.99
+
+
+def recording(depth: np.ndarray | None) -> Capture:
+    lens, poses = Pinhole(torch.tensor([[20.0, 20.0]]), torch.tensor([[8.0, 6.0]])), walk(12)
+    planes = {} if depth is None else {"depth": PixelPlane(depth, "z-depth", 1e-3, unknown=(0,))}
+    picture = np.zeros((12, 16, 3), np.uint8)
+    return Capture(
+        "a recording", [Shot(f"{i}", p, lens, (16, 12), picture, planes=planes) for i, p in enumerate(poses)]
+    )
+
+
+def test_a_recording_without_poses_begins_at_the_first():
+    depth = np.full((12, 16), 2000, np.uint16)
+    depth[0] = 0
+    found = without_poses(recording(depth), Unposed())
+    assert all((shot.pose == found.shots[0].pose).all() for shot in found.shots) and found.shots[0].split == "train"
+    np.testing.assert_allclose(found.shots[5].about["true_pose"], walk(12)[5], atol=1e-9)
+    assert found.bounds is not None
+    low, high = np.array(found.bounds)
+    np.testing.assert_allclose(high - low, 2 * 1.5 * 2.0)
+    np.testing.assert_allclose(0.5 * (low + high), walk(12)[0, :, 3])
+    assert len(without_poses(recording(depth), Unposed(frames=5, extent=3.0)).shots) == 5
+
+
+@pytest.mark.parametrize(("depth", "told"), [(None, "no depth"), (1, "millimetres"), (0, "measured no depth")])
+def test_faults_of_a_recording_are_told(depth, told):
+    plane = None if depth is None else np.full((12, 16), 2_000_000 * depth, np.uint32)
+    with pytest.raises(LumigraphError, match=told):
+        without_poses(recording(plane), Unposed())
+
+
+def test_some_frames_without_depth_are_named():
+    capture = recording(np.full((12, 16), 2000, np.uint16))
+    shots = [*capture.shots[:3], replace(capture.shots[3], planes={}), *capture.shots[4:]]
+    with pytest.raises(LumigraphError, match="no depth for 3"):
+        without_poses(replace(capture, shots=shots), Unposed())
