@@ -14,16 +14,29 @@ VOXELS = 32  # voxels a side that the encoder of voxels takes
 
 
 class ResNetLayers(nn.Module):
-    """x' = S x + W_1 relu(W_0 relu(x)); S is the identity where the widths agree (appendix A, figure 2)."""
+    """x' = S x + W_1 relu(W_0 relu(x)) (appendix A, figure 2)."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
         self.first, self.second = nn.Linear(inputs, outputs), nn.Linear(outputs, outputs)
-        self.shortcut = nn.Identity() if inputs == outputs else nn.Linear(inputs, outputs, bias=False)
+        self.shortcut = nn.Linear(inputs, outputs, bias=False)
         nn.init.normal_(self.second.weight, std=SMALL)
 
-    def forward(self, x: Float[Tensor, "*batch input"]) -> Float[Tensor, "*batch output"]:
-        return self.shortcut(x) + self.second(self.first(x.relu()).relu())
+    def forward(
+        self, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+    ) -> Float[Tensor, "member point output"]:
+        """Of points' features and those of their whole cloud, which are multiplied once for each cloud."""
+        inner = joined(self.first, x.relu(), whole.relu())
+        return joined(self.shortcut, x, whole) + self.second(inner.relu())
+
+
+def joined(
+    layer: nn.Linear, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+) -> Float[Tensor, "member point output"]:
+    """A layer of [x, whole], where `whole` is the same for all points of a member."""
+    width = x.shape[-1]
+    once = F.linear(whole, layer.weight[:, width:], layer.bias)
+    return F.linear(x, layer.weight[:, :width]) + once[:, None]
 
 
 class PointEncoder(nn.Module):
@@ -37,11 +50,11 @@ class PointEncoder(nn.Module):
 
     def forward(self, points: Float[Tensor, "member point 3"]) -> Float[Tensor, "member code"]:
         x = self.first(points)
-        for number, layer in enumerate(self.layers):
-            if number:
-                x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
-            x = layer(x)
-        return self.last(x.amax(1).relu())
+        whole = x[:, 0, :0]  # the first layer sees single points
+        for layer in self.layers:
+            x = layer(x, whole)
+            whole = x.amax(1)
+        return self.last(whole.relu())
 
 
 class VoxelEncoder(nn.Module):
