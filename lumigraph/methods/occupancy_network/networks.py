@@ -13,6 +13,23 @@ from ...components.fields.layers import FIRST_DEVIATION, ResNetLayers
 VOXELS = 32  # voxels a side that the encoder of voxels takes
 
 
+def of_cloud(
+    block: ResNetLayers, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+) -> Float[Tensor, "member point output"]:
+    """Residual layers of points' features and those of their whole cloud, which are multiplied once for each cloud."""
+    inner = joined(block.first, x.relu(), whole.relu())
+    return joined(block.shortcut, x, whole) + block.second(inner.relu())
+
+
+def joined(
+    layer: nn.Linear, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+) -> Float[Tensor, "member point output"]:
+    """A layer of [x, whole], where `whole` is the same for all points of a member."""
+    width = x.shape[-1]
+    once = F.linear(whole, layer.weight[:, width:], layer.bias)
+    return F.linear(x, layer.weight[:, :width]) + once[:, None]
+
+
 class PointEncoder(nn.Module):
     """PointNet with residual layers: after each the largest of all points' features joins them (appendix A)."""
 
@@ -24,11 +41,11 @@ class PointEncoder(nn.Module):
 
     def forward(self, points: Float[Tensor, "member point 3"]) -> Float[Tensor, "member code"]:
         x = self.first(points)
-        for number, layer in enumerate(self.layers):
-            if number:
-                x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
-            x = layer(x)
-        return self.last(x.amax(1).relu())
+        whole = x[:, 0, :0]  # the first layer sees single points
+        for layer in self.layers:
+            x = of_cloud(layer, x, whole)
+            whole = x.amax(1)
+        return self.last(whole.relu())
 
 
 class VoxelEncoder(nn.Module):
