@@ -98,6 +98,7 @@ def assemble(
         place.frame,
         has_alpha=images.has_alpha,
         image_count=len(images),
+        train_count=len(splits["train"]),
         source_from_scene=tuple((a, b, c, d) for a, b, c, d in np.linalg.inv(matrix).tolist()),
         times=span(cameras.time),
         origin=capture.origin,
