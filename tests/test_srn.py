@@ -14,7 +14,7 @@ from torch.nn.functional import layer_norm
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.srn import SRN
-from lumigraph.methods.srn.networks import SceneHyperNetwork, RayMarcher, scene_features
+from lumigraph.methods.srn.networks import RayMarcher, SceneHyperNetwork, scene_features
 from lumigraph.run import build
 
 pytestmark = budget("methods", 6)
@@ -79,7 +79,7 @@ def test_places_behind_the_camera_are_penalised():
         with torch.no_grad():
             method.marcher.length.weight.zero_()
             method.marcher.length.bias.fill_(bias)
-        assert float(method.loss(lesson, 0)["depth"]) == pytest.approx(expected, rel=1e-4)
+        assert float(method.loss(lesson, 0)["depth"].detach()) == pytest.approx(expected, rel=1e-4)
 
 
 def test_colours_are_compared_between_minus_one_and_one_and_codes_stay_small():
