@@ -25,7 +25,7 @@ class ResNetLayers(nn.Module):
     def forward(
         self, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
     ) -> Float[Tensor, "member point output"]:
-        """Of points' features and those of their whole cloud, which are multiplied once for each cloud."""
+        """Layers of the features of points and of their whole cloud, which are multiplied once for each cloud."""
         inner = joined(self.first, x.relu(), whole.relu())
         return joined(self.shortcut, x, whole) + self.second(inner.relu())
 
