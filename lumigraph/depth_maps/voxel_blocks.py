@@ -67,8 +67,8 @@ class VoxelBlocks(nn.Module):
             side = SIDE * self.edge
             new = kernels.band_blocks(depth, pose, lens, self.blocks, self.table, side, self.truncation)
             room = self._add(new) and room
-            given = depth, rgb, trusted, pose, lens, self.edge, self.truncation, EDGE, self.max_weight
-            kernels.fuse_depth(self.voxels, self.blocks, *given, in_place=True)
+            numbers = self.edge, self.truncation, EDGE, self.max_weight
+            kernels.fuse_depth(self.voxels, self.blocks, depth, rgb, trusted, pose, lens, *numbers, in_place=True)
         return room
 
     def _add(self, new: Int32[Tensor, "new 3"]) -> bool:
@@ -138,6 +138,6 @@ def _extended(rows: Tensor, new: Tensor) -> Tensor:
         larger = rows.new_empty(max(count, int(GROWTH * len(rows))), *rows.shape[1:])
         larger[: len(rows)] = rows
         rows = larger
-    grown = rows.new_empty(0).set_(rows.untyped_storage(), 0, shape)
+    grown = rows.new_empty(0).set_(rows.untyped_storage(), 0, shape)  # type: ignore[call-overload]
     grown[count - len(new) :] = new
     return grown
