@@ -335,7 +335,7 @@ def test_a_table_grows_finer_and_reaches_farther():
     """At first its coarsest level is there alone, and an object is sampled in the middle of each ray."""
     scene = tiny.scene()
     config = changed(
-        RegNeRF.smallest(), field="hash", coarse_to_fine=0.5, annealing=0.5, levels=4, log2_hashmap_size=11
+        RegNeRF.smallest(), field="hash", table_coarse_to_fine=0.5, annealing=0.5, levels=4, log2_hashmap_size=11
     )
     method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
     rays, points = scene.sample_rays(64, chance()).rays, torch.rand(8, 3, generator=chance()) - 0.5
