@@ -82,8 +82,8 @@ class MapSampler(Sampler):
             known = depth.isfinite()
             ends = torch.where(known, (depth + self.band).minimum(ends).maximum(near + MIN_INTERVAL), ends)
             coarse = self._evenly(near, ends, n.coarse_samples, generator)
-            first, last = (torch.where(known, depth + x, y) for x, y in ((-self.band, near), (self.band, ends)))
-            fine = torch.lerp(first[:, None], last[:, None], again)
+            start, last = (torch.where(known, depth + x, y) for x, y in ((-self.band, near), (self.band, ends)))
+            fine = torch.lerp(start[:, None], last[:, None], again)
         t = torch.cat([coarse, fine], -1).maximum(near[:, None]).minimum(ends[:, None]).sort(-1).values
         return Samples.rows(t, ends)
 
