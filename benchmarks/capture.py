@@ -1,5 +1,7 @@
 """Lumigraph's captures beside COLMAP's own defaults: photographs placed, reprojection error, points, seconds.
 
+Seconds are given twice: elapsed, and those of all processors, which other programs on the machine hardly change.
+
     python benchmarks/capture.py FOLDER [FOLDER ...] [--count 12 25] [--no-exif] [--half] [--output F.json]
 
 Each folder of photographs (or its `images`) is given to `lumigraph capture` and to pycolmap's feature extraction,
@@ -10,6 +12,7 @@ A video becomes ten frames, chosen evenly. With --count, also so many photograph
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import tempfile
@@ -56,6 +59,7 @@ class Placed:
     error: float
     points: int
     seconds: float
+    processor_seconds: float
 
 
 def frames_of(video: Path, folder: Path) -> list[Path]:
@@ -84,36 +88,40 @@ def prepare(photographs: list[Path], folder: Path, options: Options) -> None:
             picture.convert("RGB").save(target, **({"exif": exif} if exif else {}), quality=95)
 
 
-def measured(models: Path, seconds: float) -> Placed:
+def timed(command: list[str]) -> tuple[subprocess.CompletedProcess[str], tuple[float, float]]:
+    """A command's result, and its seconds: elapsed, and of all processors, its own child processes included."""
+    started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    log = subprocess.run(command, capture_output=True, text=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return log, (time.perf_counter() - started, processor)
+
+
+def measured(models: Path, seconds: tuple[float, float]) -> Placed:
     found = [pycolmap.Reconstruction(place) for place in models.iterdir() if (place / "images.bin").is_file()]
     found.sort(key=lambda model: -model.num_reg_images())
     if not found:
-        return Placed(0, [], 0.0, 0, seconds)
+        return Placed(0, [], 0.0, 0, *seconds)
     best = found[0]
     apart = [model.num_reg_images() for model in found[1:]]
-    return Placed(best.num_reg_images(), apart, best.compute_mean_reprojection_error(), best.num_points3D(), seconds)
+    return Placed(best.num_reg_images(), apart, best.compute_mean_reprojection_error(), best.num_points3D(), *seconds)
 
 
 def compare(photographs: Path, work: Path) -> tuple[Placed, Placed]:
     """Results of Lumigraph and of COLMAP's defaults."""
-    started = time.perf_counter()
-    ours = work / "ours"
-    command = [sys.executable, "-m", "lumigraph", "capture", str(photographs), "--output", str(ours)]
-    log = subprocess.run(command, capture_output=True, text=True)
+    ours, models = work / "ours", work / "models"
+    log, seconds = timed([sys.executable, "-m", "lumigraph", "capture", str(photographs), "--output", str(ours)])
     if log.returncode:
         console().print(log.stdout[-300:] + log.stderr[-300:])
     (ours / "sparse").mkdir(parents=True, exist_ok=True)
-    first = measured(ours / "sparse", time.perf_counter() - started)
-    started = time.perf_counter()
-    models = work / "models"
+    first = measured(ours / "sparse", seconds)
     models.mkdir()
-    command = [sys.executable, "-c", DEFAULTS, str(work / "database.db"), str(photographs), str(models)]
-    subprocess.run(command, capture_output=True)
-    return first, measured(models, time.perf_counter() - started)
+    _, seconds = timed([sys.executable, "-c", DEFAULTS, str(work / "database.db"), str(photographs), str(models)])
+    return first, measured(models, seconds)
 
 
 def main(options: Options) -> None:
-    names = "placed", "apart", "error, px", "points", "seconds"
+    names = "placed", "apart", "error, px", "points", "seconds", "processor seconds"
     table = Table("capture", "photographs", *names, caption="Lumigraph / COLMAP's defaults")
     rows = []
     for source in options.folders:
@@ -134,7 +142,14 @@ def main(options: Options) -> None:
             name = source.stem if source.name[:6] not in ("images", "video.") else f"{source.parent.name}/{source.name}"
             rows.append([name, len(chosen), *map(asdict, results)])
             cells = [
-                (r.photographs, " ".join(map(str, r.apart)) or "-", f"{r.error:.2f}", r.points, f"{r.seconds:.0f}")
+                (
+                    r.photographs,
+                    " ".join(map(str, r.apart)) or "-",
+                    f"{r.error:.2f}",
+                    r.points,
+                    f"{r.seconds:.0f}",
+                    f"{r.processor_seconds:.0f}",
+                )
                 for r in results
             ]
             pairs = [f"{ours} / {theirs}" for ours, theirs in zip(*cells, strict=True)]

@@ -40,6 +40,7 @@ SCENES = {  # by method, where that is no object
     "pixelnerf": "procedural:toys,count=10,size=32,views=10",
     "rawnerf": "procedural:night,size=64,views=40",
     "regnerf": "procedural:courtyard,size=64,views=3",
+    "srn": "procedural:chairs,count=10,size=32,views=10",
 }
 
 
@@ -100,6 +101,8 @@ def smaller_batch(config: Any, evaluations: int) -> dict[str, int]:
     """The numbers of a Config that make a step as small as some evaluations of the field."""
     if isinstance(rays := getattr(config, "rays", None), RayNumbers):
         few = {"rays_per_step": max(8, evaluations // (rays.coarse_samples + rays.fine_samples))}
+    elif holds(config, "first_march_steps"):
+        few = {"rays_per_step": max(8, evaluations // config.march_steps)}
     elif holds(config, "members_per_step"):
         few = {"members_per_step": 1, "rays_per_member": evaluations // 128}
     else:

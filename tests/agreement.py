@@ -16,8 +16,8 @@ from unittest import mock
 
 import numba
 import torch
-from conftest import PACKAGE
 from proofs import sources
+from shape_checks import PACKAGE
 from torch import Tensor
 
 from lumigraph import kernels

@@ -133,6 +133,33 @@ def write_llff(folder: Path, tiny: Tiny) -> Path:
     return folder
 
 
+def write_nerfies(folder: Path, tiny: Tiny) -> Path:
+    """Two sizes of each photograph, moments in steps of two, units of a tenth, and points of the background."""
+    tiny.write_images(folder / "rgb/1x")
+    tiny.write_images(folder / "rgb/2x", times=2)
+    ids = [name.removesuffix(".png") for name in tiny.names]
+    split = {"val_ids": ids[:3], "train_ids": ids[3:]}
+    write_json(folder / "dataset.json", {"count": len(ids), "ids": ids, **split})
+    write_json(folder / "metadata.json", {name: {"warp_id": 2 * i, "camera_id": 0} for i, name in enumerate(ids)})
+    write_json(folder / "scene.json", {"scale": 0.1, "center": [0.0, 0.0, 0.0], "near": 0.2, "far": 0.6})
+    for name, pose in zip(ids, tiny.poses, strict=True):
+        camera = {"orientation": pose[:3, :3].T.tolist(), "position": pose[:3, 3].tolist(), "focal_length": FOCAL}
+        camera |= {"principal_point": [WIDTH / 2, HEIGHT / 2], "image_size": [WIDTH, HEIGHT]}
+        write_json(folder / "camera" / f"{name}.json", camera)
+    np.save(folder / "points.npy", tiny.points)
+    return folder
+
+
+def write_nr_nerf(folder: Path, tiny: Tiny) -> Path:
+    tiny.write_images(folder / "images")
+    poses = []
+    for pose in tiny.poses:
+        right, down, forward, position = pose[:3].T
+        poses.append(np.stack([right, -down, -forward, position, [HEIGHT, WIDTH, FOCAL]], -1).tolist())
+    write_json(folder / "precomputed.json", {"poses": poses, "bds": [[2.0, 6.0]] * len(poses), "i_test": 2})
+    return folder
+
+
 def write_json(path: Path, value: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(value))
@@ -145,4 +172,6 @@ WRITERS = {
     "colmap binary": write_colmap,
     "colmap text": lambda folder, tiny: write_colmap(folder, tiny, text=True),
     "llff": write_llff,
+    "nerfies": write_nerfies,
+    "nr-nerf": write_nr_nerf,
 }

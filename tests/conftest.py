@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 # A process for each processor: threads that look for work hold up the others. The process that starts them has set how
@@ -21,40 +18,21 @@ from typing import Any
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= {"OMP_NUM_THREADS": "1", "GOMP_SPINCOUNT": "0"}
 
-import lumigraph  # isort: skip
+import lumigraph  # noqa: F401  # isort: skip
 import pytest  # isort: skip
+import shape_checks  # isort: skip
 import torch  # isort: skip
 from browser import chromium, faults, page  # noqa: F401  # isort: skip
 from budgets import MUCH, Ledger, busy, share_of  # isort: skip
-from jaxtyping import install_import_hook  # isort: skip
 from numba.core import event  # isort: skip
 
 LIMIT = 300  # seconds of waiting, in whatever state the machine is, that a test's setup, body or end may take
-PACKAGE = Path(lumigraph.__file__).parent
 FIRST_FILES = ["test_contract", "test_bounds", "test_seeded_faults"]  # the last two run kernels as plain Python
-JIT = re.compile(r"^\s*(import|from) (numba|triton)\b", re.MULTILINE)
-
-
-def module_name(path: Path) -> str:
-    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
-def checked_modules() -> set[str]:
-    """All modules but those that hold compiled functions, which the compilers could not read with checks inside."""
-    return {module_name(path) for path in PACKAGE.rglob("*.py") if not JIT.search(path.read_text(encoding="utf-8"))}
-
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
 
-own = {"lumigraph.system", "lumigraph.system.threads"}  # must come before PyTorch, and has no shapes
-loaded = sorted(name for name in sys.modules if name.startswith("lumigraph.") and name not in own)
-assert not loaded, f"loaded before their shapes could be checked: {loaded}"
-checker = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int will do for a float
-manager = install_import_hook(["lumigraph"], checker)
-covered = checked_modules()
-manager.hook.should_instrument = covered.__contains__  # type: ignore[method-assign, attr-defined]
+shape_checks.install()
 
 from lumigraph.system.allocation import settle_memory  # noqa: E402
 
@@ -85,6 +63,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     before = LEDGER.readings()
+    shape_checks.next_test()
     done = yield
     LEDGER.note(item.path.stem, share_of(item.get_closest_marker("budget")), before)
     return done

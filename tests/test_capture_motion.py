@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from hashlib import sha256
@@ -27,7 +28,7 @@ from lumigraph.capture.coverage import use_of
 from lumigraph.capture.motion import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
-from lumigraph.capture.motion.lenses import group_by_lens, prior
+from lumigraph.capture.motion.lenses import group_by_lens, prior, write_database
 from lumigraph.capture.motion.pairs import aggregated, alike, choose_matching, exhaustive, sequential
 from lumigraph.capture.motion.pairs import near as near_by
 from lumigraph.capture.motion.reconstruction import Reconstruction
@@ -282,14 +283,44 @@ def test_rows_are_counted_by_a_relative_path(tmp_path, since, counts):
             counter.stdin.close()
 
 
+@pytest.mark.parametrize(("share", "octave"), [(0.4, 0), (1.5, -1)])
+def test_the_octave_of_twice_the_size_is_left_out_where_it_adds_nothing(tmp_path, share, octave):
+    """Where a photograph has more features than asked for without it, a full search finds nearly the same ones."""
+    names = list(write_views(tmp_path / "images", 2))
+    with Image.open(tmp_path / "images" / names[0]) as image:
+        photos = [photo(name, size=image.size) for name in names]
+    job = {"images": str(tmp_path / "images"), "masks": None, "max_size": 1000, "threads": 1, "contrast": 1.0}
+    job |= {"names": names, "features": 100_000}
+
+    def found(name: str, run: Callable[[str], None]) -> list[set[tuple[int, int]]]:
+        path = tmp_path / name
+        write_database(path, [photos], "SIMPLE_RADIAL")
+        run(str(path))
+        with closing(pycolmap.Database.open(path)) as opened:
+            features = [opened.read_keypoints(i.image_id) for i in opened.read_all_images()]
+        return [set(map(tuple, each[:, :2].round().astype(int).tolist())) for each in features]
+
+    own = found("own.db", lambda path: worker.extract(path, job, names, 0))
+    job["features"] = round(share * min(map(len, own)))
+    full, quick, chosen = (
+        found("full.db", lambda path: worker.extract(path, job, names, -1)),
+        found("quick.db", lambda path: worker.extract(path, job, names, octave)),
+        found("chosen.db", lambda path: worker.find_features(job | {"database": path, "coarse": names})),
+    )
+    assert chosen == quick
+    for one, other in zip(full, chosen, strict=True):
+        assert abs(len(one) - len(other)) <= 0.05 * len(one) and len(one & other) > 0.7 * len(one)
+
+
 def test_the_worker_ends_when_nobody_listens(tmp_path):
     """As after a kill of the process that started it."""
     write_views(tmp_path / "images", 3)
     job = {"stage": "matching", "database": str(tmp_path / "none.db"), "pairs": "/dev/stdin"}
     process = subprocess.Popen(
-        [sys.executable, "-P", str(WORKER), json.dumps(job)],
-        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        [sys.executable, "-P", str(WORKER)],
+        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
+    process.stdin.write(json.dumps(job) + "\n")
     process.stdin.close()
     assert process.wait(timeout=20) == 1
 

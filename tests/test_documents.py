@@ -1,8 +1,11 @@
-"""Python in the documents: each block runs as it is written, on small scenes. CONTRIBUTING.md has a test of its own."""
+"""Python in the documents: each block runs as it is written, on small scenes; CONTRIBUTING.md has a test of its own.
+Commands in the documents: their options exist."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
+from functools import cache
 from pathlib import Path
 from textwrap import indent
 from typing import Any
@@ -11,10 +14,11 @@ import pytest
 import tiny
 import torch
 from budgets import budget
-from conftest import PACKAGE
+from shape_checks import PACKAGE
 from test_cleaning import soiled
 
 import lumigraph
+from lumigraph import methods
 from lumigraph.components.sampling.importance import importance
 from lumigraph.exchange.packing import Stored, most_important
 from lumigraph.methods.instant_ngp import InstantNGP
@@ -121,3 +125,74 @@ def test_structure_from_motion_has_the_names_it_is_called_by():
     )
     settings = sfm.FeatureExtractionOptions()
     assert hasattr(settings.sift, "max_num_features") and hasattr(sfm.ImageReaderOptions(), "camera_params")
+
+
+# Commands in the documents have options that are there
+
+
+def commands(text: str) -> list[str]:
+    """Commands of a page: lines of code blocks, and code in prose, which may run over the end of a line."""
+    lines = [line for block in re.findall(r"(?ms)^```\n(.*?)^```", text) for line in block.splitlines()]
+    prose = re.sub(r"(?ms)^```.*?^```", "", text)
+    lines += [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
+    parts = [part.strip() for line in lines for part in re.split(r"[;#]", line)]
+    return [part for part in parts if part.startswith(("lumigraph ", "python benchmarks/"))]
+
+
+def config_names(config: Any) -> set[str]:
+    """Names of a config's numbers, and of those of its parts."""
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return set(values).union(*map(config_names, filter(dataclasses.is_dataclass, values.values())))
+
+
+@cache
+def names_in(*sources: Path) -> set[str]:
+    """Names of fields, and words in quotes, of Python files."""
+    text = "".join(path.read_text("utf-8") for path in sources)
+    return {
+        word.replace("-", "_") for pair in re.findall(r"(?m)^ +(\w+):|\"(?:--)?(\w[\w-]*)\"", text) for word in pair
+    }
+
+
+@cache
+def names_of(method: str) -> set[str]:
+    return config_names(methods.find(method).Config())
+
+
+def lost_options(command: str) -> list[str]:
+    """Options of a command that neither commands, nor the method that it names, nor its script have."""
+    words = command.split()
+    if words[0] == "python":
+        known = names_in(ROOT / words[1])
+    else:
+        known = names_in(*(PACKAGE / "commands").glob("*.py")) | {"help", "method_file"}
+    if words[1] in ("train", "convert"):  # METHOD is any
+        available = methods.available()
+        known = known.union(*map(names_of, [word for word in words[2:] if word in available] or available))
+    options = [name.replace("-", "_") for name in re.findall(r"--([a-z][\w-]*)", command)]
+    return [name for name in options if name not in known and name.removeprefix("no_") not in known]
+
+
+def test_documents_name_options_that_are_there():
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    wrong = [
+        f"{page.name}: {command}: {name}"
+        for page in pages
+        for command in commands(page.read_text("utf-8"))
+        for name in lost_options(command)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_a_lost_option_is_noticed():
+    script = "```\npython benchmarks/mesh.py --exact A; lumigraph eval\n```"
+    text = f"`lumigraph train nerf a --steps 1 --hidden-width\n8`\n{script}"
+    *others, first = commands(text)
+    assert first == "lumigraph train nerf a --steps 1 --hidden-width 8" and len(others) == 2
+    assert not any(map(lost_options, (first, *others)))
+    assert lost_options("lumigraph train nerf a --log2-hashmap-size 8 --no-warmth") == [
+        "log2_hashmap_size",
+        "no_warmth",
+    ]
+    assert lost_options("lumigraph train METHOD a --log2-hashmap-size 8") == []
+    assert lost_options("python benchmarks/mesh.py --exact A --wievs 2") == ["wievs"]

@@ -66,6 +66,8 @@ SCENES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "colmap binary": (lambda folder: captures.write_colmap(folder, captures.Tiny(4)), ("sparse/0/*",)),
     "colmap text": (lambda folder: captures.write_colmap(folder, captures.Tiny(4), text=True), ("sparse/0/*",)),
     "llff": (lambda folder: captures.write_llff(folder, captures.Tiny(4)), ("*.npy",)),
+    "nerfies": (lambda folder: captures.write_nerfies(folder, captures.Tiny(4)), ("*.json", "camera/*", "*.npy")),
+    "nr-nerf": (lambda folder: captures.write_nr_nerf(folder, captures.Tiny(4)), ("*.json",)),
     "shapes": (templates.write_shapes, ("*",)),
 }
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from agreement import OPERATIONS, depends, folder
 from budgets import budget
-from conftest import PACKAGE
 from proofs import kept
+from shape_checks import PACKAGE
 
 pytestmark = budget("kernels", 40)
 

@@ -8,11 +8,17 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import beartype
+import jaxtyping
 import pytest
+import shape_checks
+import torch
 from budgets import budget
-from conftest import JIT, PACKAGE, checked_modules, module_name
+from jaxtyping import Float
+from shape_checks import JIT, PACKAGE, checked_modules, module_name
 
 import lumigraph
+from lumigraph.geometry import to_quaternion
 
 ROOT = PACKAGE.parent
 pytestmark = budget("house", 10)
@@ -356,7 +362,7 @@ def test_a_kernel_that_does_not_is_noticed(file, before, after, sentence, tmp_pa
 def test_compiled_functions_stay_outside_the_shape_checks():
     """Numba and Triton read a function's source: checks wrapped around it would stop them."""
     checked = checked_modules()
-    assert {"lumigraph.camera", "lumigraph.camera.rays", "lumigraph.volume", "lumigraph.kernels.composite"} <= checked
+    assert {"lumigraph.camera.rays", "lumigraph.volume", "lumigraph.kernels.composite"} <= checked
     for path in PACKAGE.rglob("*.py"):
         source = path.read_text(encoding="utf-8")
         compiles = any(
@@ -367,6 +373,22 @@ def test_compiled_functions_stay_outside_the_shape_checks():
         assert not (compiles and module_name(path) in checked), (
             f"{path.name} compiles functions but imports no compiler"
         )
+
+
+def test_first_calls_of_each_test_have_their_shapes_checked():
+    @jaxtyping.jaxtyped(typechecker=beartype.beartype)
+    def double(x: Float[torch.Tensor, "row 3"]) -> Float[torch.Tensor, "row 3"]:
+        return 2 * x
+
+    for function in (double, to_quaternion):
+        with pytest.raises(jaxtyping.TypeCheckError):
+            function(torch.zeros(2, 2))
+    for _ in range(shape_checks.CHECKED_CALLS):
+        double(torch.zeros(4, 3))
+    assert double(torch.zeros(2, 2)).shape == (2, 2)
+    shape_checks.next_test()
+    with pytest.raises(jaxtyping.TypeCheckError):
+        double(torch.zeros(2, 2))
 
 
 # The table of rooms in the documents follows FLOORS and docstrings.

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import tiny
 from budgets import budget
-from conftest import PACKAGE
+from shape_checks import PACKAGE
 
 from lumigraph.capture.motion import reconstruct
 from lumigraph.commands.cli import main

@@ -15,8 +15,8 @@ from lumigraph.capture import single_image
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.datasets.shapes.pictures import picture_of
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.occupancy_network import VALUE_SCALE, OccupancyNetwork, voxels_of
-from lumigraph.methods.occupancy_network.networks import ConditionalNorm, PointEncoder
+from lumigraph.methods.occupancy_network import VALUE_SCALE, OccupancyNetwork, Warp, voxels_of
+from lumigraph.methods.occupancy_network.networks import ConditionalNorm, PointEncoder, joined
 from lumigraph.metrics import intersection_over_union
 
 pytestmark = budget("methods", 12)
@@ -65,6 +65,46 @@ def test_points_in_any_order_have_one_code():
     order = torch.randperm(20)
     torch.testing.assert_close(encoder(points), encoder(points[:, order]))
     assert not torch.allclose(encoder(points)[0], encoder(points)[1])
+
+
+def test_a_layer_of_points_and_their_cloud_is_that_of_both_joined():
+    layer, x, whole = torch.nn.Linear(7, 3), torch.randn(2, 5, 4), torch.randn(2, 3)
+    expected = layer(torch.cat([x, whole[:, None].expand(-1, 5, -1)], -1))
+    torch.testing.assert_close(joined(layer, x, whole), expected)
+
+
+def test_a_warp_keeps_the_inside_and_the_longest_side():
+    """A box under a warp is a box: its corners, and points beside its faces, say which."""
+    box = torch.tensor([[[-0.9, -0.5, -0.2], [0.9, 0.3, 0.2]], [[-0.3, -0.9, -0.9], [0.3, 0.9, 0.1]]])
+    bend, stretch = (0.8 * torch.rand(2, 2, 1, 3, generator=torch.Generator().manual_seed(0)) - 0.4).unbind(0)
+    warp, centred = Warp.drawn(box, bend, stretch.exp()), torch.tensor([[[-0.9, -0.5, -0.2], [0.9, 0.5, 0.2]]])
+    low, high = warp(box).split(1, 1)
+    torch.testing.assert_close((high - low).amax(-1), torch.full((2, 1), 1.8))
+    torch.testing.assert_close(low, -high)
+    points = 2 * torch.rand(2, 4000, 3, generator=torch.Generator().manual_seed(1)) - 1
+    inside = ((points > box[:, :1]) & (points < box[:, 1:])).all(-1)
+    assert torch.equal(((warp(points) > low) & (warp(points) < high)).all(-1), inside)
+    torch.testing.assert_close(Warp.drawn(centred, 0 * bend[:1], 1 + 0 * bend[:1])(points[:1]), points[:1])
+
+
+def test_codes_are_kept_of_members_as_they_are():
+    """Clouds of other members are warped with their points, whose occupancy stays."""
+    shapes = replace(tiny_shapes.several(), splits=BOTH)
+    method = OccupancyNetwork(
+        shapes.frame, replace(OccupancyNetwork.smallest(), shapes_per_step=32, bend=0.5, stretch=0.3)
+    )
+    method.begin(shapes)
+    lesson = method.batch(shapes, torch.Generator().manual_seed(0))
+    assert 0 < int(lesson.plain.sum()) < 32
+    reach = lesson.evidence.abs().amax((1, 2))
+    assert float((reach - 0.9).abs().max()) < 0.1, "each is normalised again"
+    of_ball = lesson.points.member.view(32, -1)[:, 0] == 0
+    spread = lesson.evidence.std(1)
+    uneven = spread.amax(-1) / spread.amin(-1)
+    assert float(uneven[of_ball & lesson.plain].max()) < 1.2 < float(uneven[of_ball & ~lesson.plain].max())
+    method.loss(lesson, 0)
+    kept = set(lesson.points.member.view(32, -1)[lesson.plain, 0].tolist())
+    assert set(method.codes.learnt.nonzero()[:, 0].tolist()) == kept
 
 
 def test_normalisation_is_scaled_and_shifted_by_the_code():

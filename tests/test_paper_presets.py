@@ -97,6 +97,48 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "transient_weight": 0.01,
         "transient_start": 0.0,
     },
+    "nerfies": {  # google/nerfies, configs of defaults, warp_defaults and gpu_vrig_paper; the paper's section 4
+        "field": "network",
+        "network.depth": 8,
+        "network.position_frequencies": 8,
+        "hidden_width": 256,
+        "rays.coarse_samples": 128,
+        "rays.fine_samples": 128,
+        "rays.rays_per_step": 6144,
+        "appearance_code": 8,
+        "learning_rate": 1e-3,
+        "final_learning_rate": 1e-4,
+        "deformation.motion": "se3",
+        "deformation.moment_code": 8,
+        "deformation.deformation_frequencies": 8,
+        "deformation.deformation_depth": 6,
+        "deformation.deformation_width": 128,
+        "deformation.deformation_skip": 4,
+        "deformation.annealing": 80_000 / 250_000,
+        "deformation.elastic_weight": 1e-3,
+        "deformation.elastic_until": 50_000 / 250_000,
+        "deformation.elastic_scale": 0.03,
+        "deformation.background_weight": 1.0,
+        "deformation.background_points": 16_384,
+        "deformation.slice_dimensions": 0,  # Park 2021a; HyperNeRF has 2
+        "deformation.slice_width": 64,
+    },
+    "deformable-splatting": {  # hustvl/4DGaussians, arguments/__init__.py and dnerf/dnerf_default.py
+        "initial_gaussians": 2000,  # random ones, of D-NeRF's scenes
+        "ssim_weight": 0.0,
+        "motion.plane_resolution": 64,
+        "motion.plane_moments": 25,
+        "motion.plane_scales": 2,
+        "motion.plane_features": 32,
+        "motion.motion_width": 64,
+        "motion.still_until": 3000 / 23_000,
+        "motion.plane_smoothness": 1e-4,
+        "motion.time_smoothness": 0.01,
+        "motion.time_sparsity": 1e-4,
+        "motion.planes_lr": 1.6e-3,
+        "motion.motion_lr": 1.6e-4,
+        "motion.final_rate": 0.01,
+    },
     "block-nerf": {  # the paper's appendix, from memory; codes, penalty and width also in hjxwhy/Block-NeRF
         "field": "network",
         "network.depth": 8,
@@ -368,6 +410,12 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "laplacian_weight": 0.0,
         "normal_weight": 0.0,
     },
+    "tsdf-fusion": {  # niessner/VoxelHashing's parameters, as in theNded/MeshHashing, include/hash_param.h
+        "voxel_size": 0.004,
+        "truncation": 5.0,  # 0.02 m
+        "max_weight": 255.0,
+        "max_depth": 4.0,
+    },
     "voxel-fit": {  # no paper's; voxels, opacity and step of sunset1995/DirectVoxGO, configs/default.py
         "voxels": 160**3,
         "initial_opacity": 1e-2,
@@ -414,6 +462,46 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "points.fine_spread": 0.0,
         "points_per_step": 512,
         "learning_rate": 1e-3,
+    },
+    "srn": {  # vsitzmann/scene-representation-networks, srns.py, custom_layers.py, train.py, train_configs/chairs.yml
+        "code": 256,
+        "code_deviation": 0.01,
+        "hyper_layers": 2,  # one hidden layer behind the first one
+        "hidden_width": 256,
+        "depth": 4,
+        "pixel_layers": 5,  # four hidden layers behind the first one
+        "march_steps": 10,
+        "marcher_state": 16,
+        "start": "camera",
+        "start_distance": 0.05,
+        "start_deviation": 5e-4,
+        "members_per_step": 64,
+        "rays_per_member": 4096,  # a whole picture of 64 x 64
+        "targets": 1,
+        "colour_weight": 200.0,
+        "depth_weight": 10.0,  # reg_weight 1e-3, times 10 000 in get_regularization_loss
+        "code_weight": 1.0,
+        "learning_rate": 4e-5,
+    },
+    "dvr": {  # autonomousvision/differentiable_volumetric_rendering, configs/default.yaml, multi_view_reconstruction
+        "field": "network",
+        "hidden_width": 512,  # im2mesh/dvr/models/decoder.py
+        "blocks": 5,
+        "threshold": 0.5,  # im2mesh/dvr/models/depth_function.py, as the next three
+        "march_steps": 128,
+        "first_march_steps": 16,
+        "secant_steps": 8,
+        "hull_cells": 0,
+        "rays_per_step": 2048,
+        "colour_weight": 1.0,
+        "freespace_weight": 1.0,
+        "occupancy_weight": 1.0,
+        "depth_weight": 0.0,
+        "normal_weight": 0.05,
+        "neighbour_distance": 2e-3,  # 1e-3 in a cube half as long, as the next one
+        "difference_step": 2e-3,
+        "learning_rate": 1e-4,
+        "final_learning_rate": 2.5e-5,  # two milestones, a half each
     },
     "occupancy-network": {  # autonomousvision/occupancy_networks, configs/default.yaml
         "code": 512,

@@ -25,6 +25,7 @@ from lumigraph.synthetic.shapes import (
     Cuboid,
     Cylinder,
     Plane,
+    SoftCapsule,
     SolidShape,
     Torus,
     Triangle,
@@ -45,6 +46,7 @@ SHAPES = [
     Arch((0.5, 0.3, 0.4), 0.25, spring=0.2, rounding=0.04),
     Plane(),
     Triangle(0.5, 0.2, 0.35, rounding=0.05),
+    SoftCapsule(0.3, 0.35, curvature=-1.8, stretch=1.15),
 ]
 LEANING = Pose.at(0.1, -0.2, 0.05, turn=25, tilt=35)
 CHALK = Material(Plain((0.7, 0.6, 0.5)))

@@ -13,6 +13,9 @@ import torch
 from budgets import budget
 
 from lumigraph.camera.rays import Rays, Samples
+from lumigraph.capture.views import with_fewer_views
+from lumigraph.components.fields.coordinate_field import FrustumField
+from lumigraph.components.fields.hash_field import HashField
 from lumigraph.components.training.regularizers import (
     near_thickness,
     normalized_distance,
@@ -27,7 +30,7 @@ from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
-from lumigraph.methods.regnerf import RegNeRF, clipped, joined
+from lumigraph.methods.regnerf import RegNeRF, clipped, field_of, joined
 from lumigraph.methods.regnerf.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.run import build
 from lumigraph.volume import composite
@@ -253,13 +256,25 @@ def test_gradients_are_clipped_by_value_and_by_norm():
 def test_a_table_has_numbers_of_its_own():
     """It learns five times as fast as a network, the networks behind it are smaller, and a plain CPU has it unasked."""
     config = RegNeRF.preset(torch.device("cpu"))
-    assert config.field == "hash" and RegNeRF.preset(torch.device("cuda")).field == "network"
+    assert config.field == "auto" and RegNeRF.preset(torch.device("cuda")).field == "network"
     table, network = of_table(config), config
     known = InstantNGP.preset(torch.device("cpu"))
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
     assert (network.learning_rate, network.hidden_width) == (4e-3, 128)
     assert table == known  # all of them
     assert table.proposals.depth_weight != config.depth_weight  # of plane sweeps; ours is of roughness
+
+
+def test_few_photographs_of_an_object_are_learnt_by_the_network():
+    """Below MIN_TABLE_VIEWS of them; by a table in the open, from more, and where their number is not known."""
+    scene, auto = tiny.scene(), changed(RegNeRF.smallest(), field="auto")
+    few = with_fewer_views(scene, 3).frame
+    assert few == replace(scene.frame, train_count=3)
+    assert field_of(few, auto) == "network" == field_of(replace(few, train_count=9), RegNeRF.smallest())
+    for frame in replace(few, reach=4.0), with_fewer_views(scene, 9).frame, replace(few, train_count=0):
+        assert field_of(frame, auto) == "hash"
+    for frame, kind in (few, FrustumField), (replace(few, train_count=9), HashField):
+        assert isinstance(RegNeRF(frame, auto).network, kind)
 
 
 def test_what_plane_sweeps_found_counts_beside_what_is_smooth():

@@ -12,7 +12,7 @@ import time
 
 import pytest
 from budgets import budget
-from conftest import PACKAGE
+from shape_checks import PACKAGE
 
 from lumigraph.commands.cli import main
 from lumigraph.system.signals import REMINDER_SECONDS, Interrupt, Stopped, go_on_unless, listening, until_interrupted

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from budgets import budget
-from conftest import PACKAGE, module_name
+from shape_checks import PACKAGE, module_name
 from test_house import imported
 
 pytestmark = budget("house", 8)

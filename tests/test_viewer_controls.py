@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -83,6 +84,30 @@ def test_a_client_sees_what_it_turns_and_nobody_else_does(tmp_path):
         assert one.path._here().time == 5.0 and other.path._here().time == 2.0  # a keyframe keeps the moment
         for client in clients:
             client.close()
+
+
+def test_moments_play_and_pause(tmp_path):
+    scene = tiny.scene()
+    with Viewer(two_moments(scene.frame), subject(scene, tmp_path), choose_address(port=0)) as viewer:
+        client = Client(viewer.address.url)
+        until(lambda: viewer._everyone())
+        (visitor,) = viewer._everyone()
+        slider, playback = visitor.method_controls._handles["time"], visitor.method_controls._playback
+        client.turn(playback._seconds, 0.5)
+        until(lambda: playback._seconds.value == 0.5)
+        playing = threading.Thread(target=playback.play)
+        playing.start()
+        seen = set()
+
+        def all_moments() -> bool:
+            seen.add(int(3 * (slider.value - 2.0)))  # ninths of the span from 2 to 5
+            return len(seen) >= 7
+
+        until(all_moments)
+        assert min(seen) >= 0 and max(seen) <= 9
+        client.close()
+    playing.join(5)  # a visitor who leaves plays no more
+    assert not playing.is_alive()
 
 
 def test_a_cloud_is_sent_anew_when_told_otherwise(tmp_path):

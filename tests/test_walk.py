@@ -8,7 +8,7 @@ from pathlib import Path
 import tiny
 import torch
 from budgets import budget
-from conftest import PACKAGE
+from shape_checks import PACKAGE
 
 from lumigraph.kernels.composite import cpu
 from lumigraph.methods.instant_ngp import InstantNGP

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from PIL import Image
 import lumigraph.methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
-from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.images import ImageStore, Layer, LayerSource
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.run import Run, build
 
@@ -50,17 +50,22 @@ def poses(count: int = 12) -> torch.Tensor:
     return torch.stack([right, torch.linalg.cross(-out, right), -out, DISTANCE * out], -1)
 
 
-def picture(pose: torch.Tensor) -> np.ndarray:
-    """A ball of radius 0.6 whose colour is where its surface points; RGBA bytes."""
+def ball(pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Depth along the pixels' rays of a ball of radius 0.6, infinite beside it, and where they meet it."""
     y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
     directions = torch.stack([(x - SIZE / 2) / FOCAL, (y - SIZE / 2) / FOCAL, torch.ones_like(x)], -1)
     directions = torch.nn.functional.normalize(directions, dim=-1) @ pose[:, :3].T
     origin = pose[:, 3]
     b = directions @ origin
     under = b * b - (origin @ origin - 0.36)
-    hit = under > 0
-    surface = origin + (-b - under.clamp_min(0).sqrt())[..., None] * directions
-    rgba = torch.cat([0.5 + surface / 1.2, torch.ones(SIZE, SIZE, 1)], -1) * hit[..., None]
+    depth = -b - under.clamp_min(0).sqrt()
+    return torch.where(under > 0, depth, torch.inf), origin + depth[..., None] * directions
+
+
+def picture(pose: torch.Tensor) -> np.ndarray:
+    """The ball, whose colour is where its surface points; RGBA bytes."""
+    depth, surface = ball(pose)
+    rgba = torch.cat([0.5 + surface / 1.2, torch.ones(SIZE, SIZE, 1)], -1) * depth.isfinite()[..., None]
     return (rgba.clamp(0, 1) * 255).byte().numpy()
 
 
@@ -77,7 +82,10 @@ def made(count: int, size: int, focal: float) -> Scene:
     frame = Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True, image_count=count)
     splits = {"train": index[index % 4 != 0], "test": index[index % 4 == 0]}
     images = ImageStore.from_arrays([picture(p) for p in pose])
-    return Scene(cameras, images, frame, splits, [f"ball_{i}" for i in range(count)], "in memory")
+    planes = [LayerSource(partial(lambda p: ball(p)[0].numpy(), p)) for p in pose]
+    depth = Layer(images, planes, np.dtype(np.float32), 1, "distance")
+    names = [f"ball_{i}" for i in range(count)]
+    return Scene(cameras, images, frame, splits, names, "in memory", layers={"depth": depth})
 
 
 def method(frame: Frame | None = None, seed: int = 0, **config):

@@ -283,7 +283,7 @@ def row_of(cell: Cell, output: Path, settings: CellSettings, failure: str | None
 def scored(run: Run, settings: CellSettings) -> Row:
     """Columns of a row that its evaluation gives."""
     result = run.evaluation() or {}
-    row = {name: result[name] for name in (*MEASURED, "by_resolution") if name in result}
+    row = {name: result[name] for name in (*MEASURED, "by_resolution", "by_held_out") if name in result}
     if (views := result.get("views")) and "members" not in result["protocol"]:
         row["shown"] = views[len(views) // 2 // settings.scales]  # at full size
     return row

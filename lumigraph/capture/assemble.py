@@ -73,6 +73,7 @@ def assemble(
     with counting("Looking at photographs", len(shots)) as done:
         chosen = in_parallel(lambda i: choose(shots[i], downscale), range(len(shots)), done)
     told += about_small(capture.source, chosen) if downscale else []
+    told += about_times(capture.source, shots)
     for warning in told:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
     lenses = [fitted_lens(shot, c) for shot, c in zip(shots, chosen, strict=True)]
@@ -97,6 +98,7 @@ def assemble(
         place.frame,
         has_alpha=images.has_alpha,
         image_count=len(images),
+        train_count=len(splits["train"]),
         source_from_scene=tuple((a, b, c, d) for a, b, c, d in np.linalg.inv(matrix).tolist()),
         times=span(cameras.time),
         origin=capture.origin,
@@ -249,6 +251,17 @@ def about_missing(capture: Capture) -> str:
         f"{capture.source} lists {counted(len(names), 'file')} that {verb} not exist; using the other "
         f"{len(capture.shots)} photographs without {', '.join(names[:MAX_NAMES])}{more}"
     )
+
+
+def about_times(source: str, shots: list[Shot]) -> list[str]:
+    """Warning of photographs without a moment beside others that have one."""
+    without = [shot.name for shot in shots if shot.time is None]
+    if not without or len(without) == len(shots):
+        return []
+    return [
+        f"{source} has no time of {counted(len(without), 'photograph')}, such as {without[0]}, so nothing is taken to "
+        f"move; add theirs, or remove them"
+    ]
 
 
 def about_small(source: str, chosen: list[Chosen]) -> list[str]:

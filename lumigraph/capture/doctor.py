@@ -19,6 +19,7 @@ from . import colmap
 from .capture import Capture, Shot
 from .coverage import coverage
 from .oddities import in_steps
+from .photos import Photo
 from .photos.judge import JUDGED_SIDE, Judgement, blurred, exposure_jumps, judge
 from .pictures import eight_bits
 from .points import similarity
@@ -103,12 +104,14 @@ def findings(
     left_out: Mapping[str, str] | None = None,
     upright: Float[np.ndarray, "3 3"] | None = None,
     residuals: Sequence[Residual] = (),
+    judged: Sequence[Photo] = (),
 ) -> list[Finding]:
     """Faults of a capture's photographs, those of one kind together, then directions that lack photographs.
 
     left_out:  name and reason of photographs without a pose; None to read them from the folder's capture.json
     upright:   the rotation that brings up to +z; None for poses that stand upright
     residuals: of a run that learnt from them
+    judged:    photographs whose pixels were judged before; the others' files are read
     Raises LumigraphError for a damaged COLMAP model or capture.json beside the photographs.
     """
     capture = replace(capture, shots=[replace(shot, name=label(shot.name)) for shot in capture.shots])
@@ -118,7 +121,7 @@ def findings(
         for name, why in (said_left_out(folder) if left_out is None else left_out).items()
     ]
     if len(shots) >= MIN_JUDGED:
-        found += of_pixels(shots)
+        found += of_pixels(shots, {photo.name: photo for photo in judged})
         found += of_tracks(shots, tracks_of(capture), folder, {f.photograph for f in found if f.fault == BLURRED})
         found += of_residuals(residuals, shots, {f.photograph for f in found})
     poses = np.stack([shot.pose for shot in shots])
@@ -148,9 +151,12 @@ def leave_out(shot: Shot) -> str:
     return f"retake it, or leave it out: {' && '.join(moves)}"
 
 
-def of_pixels(shots: Sequence[Shot]) -> list[Finding]:
-    """Blurred photographs, and jumps of the exposure, from their files; nothing for pictures without files."""
-    judged = in_parallel(lambda i: judged_file(shots[i]), range(len(shots)))
+def of_pixels(shots: Sequence[Shot], before: Mapping[str, Photo]) -> list[Finding]:
+    """Blurred photographs, and jumps of the exposure, from their files; nothing for pictures without files.
+
+    before: photographs that were judged already, by name
+    """
+    judged = in_parallel(lambda i: before.get(shots[i].name) or judged_file(shots[i]), range(len(shots)))
     known = {shot.name: (shot, x) for shot, x in zip(shots, judged, strict=True) if x is not None}
     if len(known) < MIN_JUDGED:
         return []

@@ -22,6 +22,7 @@ MIN_OPACITY = 8  # of 255: a pixel of higher opacity, or further from the backgr
 BORDER_SHARE = 0.97  # of the pixels at the pictures' edges have one colour, where there is a plain background
 MIN_VIEW_SHARE = 0.5  # share of the views that must have a point inside their picture
 MAX_DISAGREEMENTS = (0.0, 0.1)  # share of the views: first none, then some, because masks are seldom perfect
+MOVING_DISAGREEMENTS = (0.8,)  # the same of what moves, and is in one place in few of the views
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,11 @@ def filled(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]
 
 
 def hull_box(
-    outlines: list[Silhouette], centre: Float[np.ndarray, " 3"], half: float
+    outlines: list[Silhouette], centre: Float[np.ndarray, " 3"], half: float, moves: bool = False
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
     """Two corners of the box around the object, which lies within about `half` of `centre`. None where the silhouettes
-    enclose nothing, or no end to it."""
-    for slack in MAX_DISAGREEMENTS:
+    enclose nothing, or no end to it. moves: whether the views are of several moments"""
+    for slack in MOVING_DISAGREEMENTS if moves else MAX_DISAGREEMENTS:
         low, high = centre - half, centre + half
         for _ in range(MAX_DOUBLINGS + 1):
             found = carve(outlines, low, high, GRID_SIDES[0], slack)

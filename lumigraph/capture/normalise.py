@@ -78,7 +78,8 @@ def find_place(
         return part_place(capture, turned, upright, background)
     gaze = find_gaze(capture, turned, upright)
     found = silhouettes(turned, images, views, gaze.centre)
-    box = None if found is None else hull_box(found[0], gaze.centre, gaze.distance)
+    moves = cameras.time is not None and len(cameras.time.unique()) > 1
+    box = None if found is None else hull_box(found[0], gaze.centre, gaze.distance, moves)
     if found is None or box is None:
         return open_place(capture, upright, gaze, background)
     return object_place(upright, box, turned, capture.background or found[1])

@@ -21,7 +21,8 @@ from ..metrics import WINDOW
 def with_fewer_views(scene: Scene, views: int) -> Scene:
     """The scene with so many photographs in its "train" split, spread evenly over the cameras; see `spread_out`.
 
-    Held-out photographs, frame and sparse points stay what all photographs gave, so that scores can be compared.
+    Held-out photographs, sparse points, and the frame but for its `train_count` stay what all photographs gave, so that
+    scores can be compared.
     Raises LumigraphError for fewer than one, and for more than there are.
     """
     train = scene.splits["train"]
@@ -31,12 +32,18 @@ def with_fewer_views(scene: Scene, views: int) -> Scene:
             f"give a number from 1 to {len(train)}"
         )
     kept = spread_out(scene.cameras[train])[:views].sort().values
-    return replace(scene, splits=scene.splits | {"train": train[kept]})
+    return with_train(scene, train[kept])
 
 
 def with_all_views(scene: Scene) -> Scene:
     """The scene with every photograph in its "train" split, those that test as well."""
-    return replace(scene, splits=scene.splits | {"train": torch.arange(len(scene.cameras))})
+    return with_train(scene, torch.arange(len(scene.cameras)))
+
+
+def with_train(scene: Scene, train: Int[Tensor, " image"]) -> Scene:
+    """The scene with these photographs to learn from."""
+    frame = replace(scene.frame, train_count=len(train))
+    return replace(scene, frame=frame, splits=scene.splits | {"train": train})
 
 
 def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:

@@ -19,7 +19,8 @@ class Eval:
     Writes RUN/eval.json (per view and mean PSNR, SSIM and fine detail, also by resolution where there are several, the
     protocol, timings) and RUN/eval.png, a contact sheet of photograph, rendering, error and depth. File names of other
     splits than test contain the split. LPIPS needs weights: torchvision's AlexNet and the LPIPS authors' v0.1/alex.pth.
-    Shapes have IoU, chamfer distance and normal consistency instead.
+    Shapes have IoU, chamfer distance and normal consistency instead. A capture that moves is compared by what was held
+    out, cameras, moments or both, and where a mask of what moves is known, by that alone as well.
     """
 
     run_folder: RunOption
@@ -64,8 +65,8 @@ class Eval:
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         if "detail" in result:
             rows["detail"] = str(FineDetail(**result["detail"]))
-        for size, part in result.get("by_resolution", {}).items():
-            rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
+        for name, part in (result.get("by_resolution", {}) | result.get("by_held_out", {})).items():
+            rows[name] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         name = run.folder / stem(self.split)
         rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
         learnt = last_psnr(run.metrics())

@@ -38,8 +38,8 @@ class ExportMesh:
     """Export a triangle mesh with vertex colours or a texture, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
-    with signed distance or density use marching cubes on it; others use fusion of rendered depth. Only the middle of a
-    scene is meshed.
+    with signed distance or density use marching cubes on it; methods with a mesh give that; others use fusion of
+    rendered depth. Only the middle of a scene is meshed.
     Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 
@@ -53,10 +53,10 @@ class ExportMesh:
     cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
     """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
     way: Annotated[
-        Literal["auto", "distance", "density", "depth"],
+        Literal["auto", "distance", "density", "own", "depth"],
         arg(name="from", help_behavior_hint="(default: the first of these that the method has)"),
     ] = "auto"
-    """Source of the surface: the signed distance, the density field, or rendered depth."""
+    """Source of the surface: the signed distance, the density field, the method's own mesh, or rendered depth."""
     level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
     """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
     smooth: Annotated[int, between(0, 1000), option("N")] = 10

@@ -19,10 +19,10 @@ class Infer:
     """Reconstruct a scene from a few photographs, or a shape from a scan, with a trained prior.
 
     A prior is a run of a method that learns from a collection: lumigraph train pixelnerf procedural:toys. Inference
-    takes seconds: pixelnerf encodes the photographs once, hyp-nerf optimises a code for them. The new run stores the
-    result, and evaluates, renders, exports and opens in the viewer like any other. With --seed instead of a scene,
-    hyp-nerf samples a new object. Priors of shapes (deepsdf, occupancy-network) take a mesh, a cloud of points or, as
-    they were trained, one picture.
+    takes seconds: pixelnerf encodes the photographs once, hyp-nerf and srn optimise a code for them. The new run stores
+    the result, and evaluates, renders, exports and opens in the viewer like any other. With --seed instead of a scene,
+    hyp-nerf and srn sample a new object. Priors of shapes (deepsdf, occupancy-network) take a mesh, a cloud of points
+    or, as they were trained, one picture.
     """
 
     prior: Annotated[Positional[Path], needed("PRIOR")]

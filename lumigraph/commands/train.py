@@ -256,7 +256,7 @@ class Train:
         found = kind_of(self.scene, kind.learns_from)
         if found is not kind.learns_from:
             confirm(self.scene)  # a missing path has no kind
-        check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from(found))
+        check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from)
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)

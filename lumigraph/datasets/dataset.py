@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
@@ -49,14 +49,21 @@ class Dataset(Protocol):
         """A camera whose picture shows how far training has come; None where there is nothing to look at."""
 
 
-def check_kind(learner: str, wanted: type[Any], found: type[Any], source: str, others: Sequence[str] = ()) -> None:
+def check_kind(
+    learner: str,
+    wanted: type[Any],
+    found: type[Any],
+    source: str,
+    learning_from: Callable[[type[Any]], Sequence[str]] = lambda _: (),
+) -> None:
     """Raise LumigraphError if a method that learns from one kind of dataset is to learn from another.
 
-    learner: the method's name
-    others:  names of methods that learn from what was found
+    learner:       the method's name
+    learning_from: names of the methods that learn from a kind; it imports all of them, so only an error asks it
     """
     if issubclass(found, wanted):
         return
+    others = learning_from(found)
     those = f"or train what does: {', '.join(others)}" if others else f"for no method here learns from {found.kind}"
     raise LumigraphError(
         f"{learner} learns from {wanted.kind}, and {source} holds {found.kind}; name {wanted.kind} instead, {those}"

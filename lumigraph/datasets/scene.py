@@ -85,6 +85,7 @@ class Frame:
     background:  colour behind everything
     has_alpha:   whether the photographs say how opaque each pixel is
     image_count: photographs in the scene, held-out ones included
+    train_count: photographs to learn from; 0 where that is not known
     source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
                  line up with it
     forward:     of a capture without bounds whose cameras all look one way; None for any other
@@ -100,6 +101,7 @@ class Frame:
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     has_alpha: bool = False
     image_count: Annotated[int, between(0, 10**6)] = 0
+    train_count: Annotated[int, between(0, 10**6)] = 0
     source_from_scene: tuple[Row, ...] = Similarity.make(1.0).rows
     forward: Forward | None = None
     times: tuple[Coordinate, Coordinate] | None = None

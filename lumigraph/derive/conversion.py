@@ -257,7 +257,7 @@ def check(source: Opened, student: type[Method]) -> None:
         raise LumigraphError(f"{source.path} {reason}")
     if source.frame.times is not None:
         raise LumigraphError(f"{source.path} is of a scene that moves, and what is converted stands still")
-    check_kind(name, student.learns_from, Scene, str(source.path), methods.learning_from(Scene))
+    check_kind(name, student.learns_from, Scene, str(source.path), methods.learning_from)
     if not any(can(student, capability) for capability in SPATIAL_CAPABILITIES):
         raise LumigraphError(
             f"{name} holds pictures, and no scene in space; `lumigraph convert --list` says what goes into what"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
@@ -33,9 +33,11 @@ from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
 from ..system.work import at_work
 from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half
+from .held_out import held_out_kinds
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
+MOVING_LAYER, MOVING = "moving", 1  # the layer that marks what moves, and its mark
 CLEAN_LAYER = "clean"  # the layer of photographs in their own light without passers-by
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is no time of the view
 CAPTURED_POSES = "as captured"
@@ -51,7 +53,11 @@ Picture = Float[Tensor, "height width 3"]
 @dataclass(frozen=True)
 class ViewScore:
     """One view: PSNR in dB, SSIM, the seconds that rendering it took, LPIPS where its weights are at hand, PSNR
-    against the photograph without passers-by where that is known, and fine detail where the photograph has any."""
+    against the photograph without passers-by where that is known, PSNR and SSIM of what moves alone where its mask is
+    known, and fine detail where the photograph has any.
+
+    held_out: of a capture that moves, camera or moment; see `held_out_kinds`
+    """
 
     name: str
     resolution: str
@@ -60,7 +66,10 @@ class ViewScore:
     seconds: float
     lpips: float | None = None
     clean_psnr: float | None = None
+    moving_psnr: float | None = None
+    moving_ssim: float | None = None
     detail: FineDetail | None = None
+    held_out: str | None = None
 
 
 @dataclass(frozen=True)
@@ -101,6 +110,16 @@ class Evaluation:
         return mean_known(each.clean_psnr for each in self._averaged)
 
     @property
+    def moving_psnr(self) -> float | None:
+        """Mean PSNR of what moves alone; None where no mask of it is known."""
+        return mean_known(each.moving_psnr for each in self._averaged)
+
+    @property
+    def moving_ssim(self) -> float | None:
+        """Mean SSIM of what moves alone, likewise."""
+        return mean_known(each.moving_ssim for each in self._averaged)
+
+    @property
     def detail(self) -> FineDetail | None:
         """Mean detail over the views; None if no photograph has fine detail."""
         found = [each.detail for each in self._averaged]
@@ -114,16 +133,26 @@ class Evaluation:
     @property
     def by_resolution(self) -> dict[str, Evaluation]:
         """The views of each size alone, sizes in the order in which they come."""
-        sizes = dict.fromkeys(view.resolution for view in self.views)
-        return {size: self._of_size(size) for size in sizes}
+        return self._by("resolution")
 
-    def _of_size(self, size: str) -> Evaluation:
-        views = [view for view in self.views if view.resolution == size]
-        members = tuple(part for member in self.members if (part := member._of_size(size)).views)
+    @property
+    def by_held_out(self) -> dict[str, Evaluation]:
+        """The views alone of new cameras, of new moments or of both, of a capture that moves."""
+        return self._by("held_out")
+
+    def _by(self, name: str) -> dict[str, Evaluation]:
+        """The views of each value of one of their fields."""
+        values = dict.fromkeys(getattr(view, name) for view in self.views)
+        return {value: self._where(name, value) for value in values if value is not None}
+
+    def _where(self, name: str, value: str) -> Evaluation:
+        views = [view for view in self.views if getattr(view, name) == value]
+        members = tuple(part for member in self.members if (part := member._where(name, value)).views)
         return replace(self, views=views, members=members)
 
     def means(self) -> dict[str, Any]:
-        known = {} if self.clean_psnr is None else {"clean_psnr": self.clean_psnr}
+        further = {name: getattr(self, name) for name in ("clean_psnr", "moving_psnr", "moving_ssim")}
+        known = {name: value for name, value in further.items() if value is not None}
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
 
     @property
@@ -137,10 +166,14 @@ class Evaluation:
         return f"{parts}{len(self.views)} {self.protocol['split']} views"
 
     def to_json(self) -> dict[str, Any]:
-        parts = {size: part.means() | {"views": len(part.views)} for size, part in self.by_resolution.items()}
+        sizes, kinds = (
+            {name: part.means() | {"views": len(part.views)} for name, part in parts.items()}
+            for parts in (self.by_resolution, self.by_held_out)
+        )
         return {
             **self.means(),
-            **({"by_resolution": parts} if len(parts) > 1 else {}),
+            **({"by_resolution": sizes} if len(sizes) > 1 else {}),
+            **({"by_held_out": kinds} if kinds else {}),
             **({} if self.detail is None else {"detail": asdict(self.detail)}),
             "protocol": self.protocol,
             "seconds_per_view": self.seconds_per_view,
@@ -195,12 +228,13 @@ def evaluate(
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
     spread = set(evenly(compared, SHEET_VIEWS))
-    found = held_out_poses(method, scene)
+    found, kinds = held_out_poses(method, scene), held_out_kinds(scene)
+    known = [name for name in (CLEAN_LAYER, LIGHT_LAYER, MOVING_LAYER) if name in scene.layers]
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
-        shot = scene.photograph(index, [name for name in (CLEAN_LAYER, LIGHT_LAYER) if name in scene.layers])
+        shot = scene.photograph(index, known)
         camera = found.camera(index) if found else method.refined(shot.camera)
         columns = right_half(shot) if by_halves or right_halves else slice(None)
         if shot.mask is not None and not shot.mask[:, columns].any():
@@ -215,6 +249,7 @@ def evaluate(
             rgb, photograph = in_light(seen, shot.extra[LIGHT_LAYER])
             seen = replace(seen, rgb=rgb)
         score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
+        score = replace(score, held_out=kinds[index])
         keep(score.name, seen)
         if index in spread:
             shown[score.name] = photograph, seen
@@ -263,17 +298,35 @@ def compare(
         truth = shot.extra[CLEAN_LAYER][:, columns]
         clean = psnr(rgb, truth) if mask is None else psnr(rgb[mask], truth[mask])
     likeness = ssim_map(rgb, photograph)
+    moving = None
+    if MOVING_LAYER in shot.extra:
+        moving = shot.extra[MOVING_LAYER][:, columns] == MOVING
+        moving = moving if mask is None else moving & mask
+    about_moving = of_pixels(rgb, photograph, likeness, moving)
+    shown = detail(rgb, photograph, mask)
     if mask is None:
+        closeness = psnr(rgb, photograph), float(likeness.mean())
         perceived = lpips(rgb, photograph) if lpips else None
-        closeness = float(likeness.mean())
-        shown = detail(rgb, photograph)
-        return ViewScore(name, size, psnr(rgb, photograph), closeness, seconds, perceived, clean, shown)
+    else:
+        closeness = psnr(rgb[mask], photograph[mask]), of_windows(likeness, mask) or 0.0
+        perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
+    return ViewScore(name, size, *closeness, seconds, perceived, clean, *about_moving, shown)
+
+
+def of_pixels(
+    rgb: Picture, photograph: Picture, likeness: Picture, mask: Bool[Tensor, "height width"] | None
+) -> tuple[float | None, float | None]:
+    """PSNR and SSIM of a mask's pixels; None where there are none. likeness: `ssim_map` of the whole"""
+    if mask is None or not mask.any():
+        return None, None
+    return psnr(rgb[mask], photograph[mask]), of_windows(likeness, mask)
+
+
+def of_windows(likeness: Picture, mask: Bool[Tensor, "height width"]) -> float | None:
+    """Mean SSIM of the windows whose middle is in a mask; None where there are none."""
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
-    perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
-    closeness = float(inner.mean()) if len(inner) else 0.0
-    shown = detail(rgb, photograph, mask)
-    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived, clean, shown)
+    return float(inner.mean()) if len(inner) else None
 
 
 def warm_up(method: Method, camera: Camera) -> float:

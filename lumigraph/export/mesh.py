@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy import ndimage
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -21,7 +22,7 @@ from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidde
 from ..errors import LumigraphError
 from ..geometry import evenly
 from ..method import Method
-from ..method.capabilities import HasDensity, HasDistance, can, needs
+from ..method.capabilities import HasDensity, HasDistance, HasMesh, can, needs
 from ..system.progress import counting, track
 from ..system.work import at_work
 from .surface import (
@@ -52,7 +53,7 @@ INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which 
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
 POINTS_PER_CHUNK = 1 << 18  # points
 
-Way = Literal["distance", "density", "depth"]
+Way = Literal["distance", "density", "own", "depth"]
 
 
 @torch.no_grad()
@@ -100,10 +101,21 @@ def extract_mesh(
     closed = not method.frame.is_open if closed is None else closed
     limits = meshed_box(method.frame, extent) if crop is None else within_reach(method.frame, crop)
     holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
-    grid = make_grid(limits, cell)
+    grid, way = make_grid(limits, cell), way or best_way(method)[0]
+    faces = TEXTURED_FACES if faces is None and texture is not None else faces
+    own = own_mesh(method, holds, keep, smooth, faces) if way == "own" else None
+    if own is not None and texture is None:
+        return own
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
+    sources: list[Views] = [lambda _: rendered(depth_maps)]
+    if photographs is not None:
+        chosen = evenly(range(len(cameras)), views)
+        sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
+    if own is not None and texture is not None:
+        surface = own.vertices, own.faces
+        return textured(surface, sources, HIDDEN_CELLS * grid.cell, texture, surface)
     step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
-    value, way = from_depth(depth_maps, grid.cell, closed), way or best_way(method)[0]
+    value = from_depth(depth_maps, grid.cell, closed)
     if way == "distance" and method.learns_from is not Scene:  # of shapes, known where no camera sees it
         value = from_distance(method, grid.cell)
     elif way != "depth":
@@ -132,20 +144,36 @@ def extract_mesh(
     with counting("Smoothing the surface"):
         vertices = smoothed(vertices, triangles, smooth)
         detailed = vertices, triangles
-        faces = TEXTURED_FACES if faces is None and texture is not None else faces
         if faces is not None:
             vertices, triangles = simplified(vertices, triangles, faces)
             corners, triangles = manifold(triangles)
             vertices = vertices[corners]
     if texture is not None:
-        sources: list[Views] = [lambda _: rendered(depth_maps)]
-        if photographs is not None:
-            chosen = evenly(range(len(cameras)), views)
-            sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
         return textured((vertices, triangles), sources, HIDDEN_CELLS * grid.cell, texture, detailed)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
+
+
+def own_mesh(method: Method, holds: Holds, keep: float, smooth: int, faces: int | None) -> Mesh:
+    """The mesh that a method holds, or makes itself, within a region, with its own colours; see `extract_mesh`."""
+    made = needs(method, HasMesh).mesh()
+    inside = holds(torch.from_numpy(made.vertices).float()).numpy()
+    corners, triangles = manifold(made.faces[inside[made.faces].all(-1)])
+    if not len(triangles):
+        raise LumigraphError("No part of the mesh lies inside the box; give a larger --extent, or another box")
+    vertices = made.vertices[corners]
+    vertices, triangles = larger_pieces(vertices, triangles, keep, np.ones(len(vertices), bool))
+    with counting("Smoothing the surface"):
+        places = cKDTree(made.vertices)
+        colours = made.colours[places.query(vertices)[1]]
+        vertices = smoothed(vertices, triangles, smooth)
+        if faces is not None and len(triangles) > faces:
+            vertices, triangles = simplified(vertices, triangles, faces)
+            corners, triangles = manifold(triangles)
+            vertices = vertices[corners]
+            colours = made.colours[places.query(vertices)[1]]
+    return Mesh(vertices, triangles, colours)
 
 
 def best_way(method: Method) -> tuple[Way, str]:
@@ -154,6 +182,8 @@ def best_way(method: Method) -> tuple[Way, str]:
         return "distance", "the signed distance, whose zero level is the surface that was learnt"
     if can(method, HasDensity):
         return "density", "the density, which is finer than depth from pictures; there is no signed distance"
+    if can(method, HasMesh):
+        return "own", "the mesh that the method makes itself; there is no signed distance and no density at points"
     return "depth", "rendered depth, fused; there is no signed distance and no density at points"
 
 

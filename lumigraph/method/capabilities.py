@@ -95,6 +95,13 @@ class RefinesPoses(Protocol):
         """Colours as a function of a photograph's pose, beside the photograph's. RayMethods have it."""
 
 
+class HasMotion(Protocol):
+    """Knows how the things of a moving scene move."""
+
+    def follow(self, points: Points, start: float, end: float) -> Points:
+        """Positions at one moment of surface points of another, moments in the unit of `Frame.times`."""
+
+
 class HasVisibility(Protocol):
     """Knows which places its photographs saw."""
 
@@ -170,10 +177,11 @@ LACKING = {
     FromField: "cannot begin as what another method holds; `lumigraph convert --list` says which can",
     HasOctree: "is no octree; `lumigraph convert` makes one of it, as plenoctrees",
     HasAtlas: "is no atlas of baked values; `lumigraph convert` makes one of it, as snerg",
-    HasDistance: "holds no distance to surfaces; neus does, and so do methods that learn from shapes",
+    HasDistance: "holds no distance to surfaces; neus and dvr do, and so do methods that learn from shapes",
     HasLevels: "has no levels of detail; nglod has",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     RefinesPoses: "learns no poses of photographs; give --refine-cameras to a method that can",
+    HasMotion: "does not know where points of a surface go; nerfies and deformable-splatting do",
     HasVisibility: "does not know which places its photographs saw; block-nerf does",
     HasExposure: "knows no exposures of its photographs",
     HasAppearance: "learns no appearance of its photographs; block-nerf does",

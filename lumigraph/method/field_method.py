@@ -14,7 +14,7 @@ from ..datasets.scene import Batch, Scene
 from ..volume import composite
 from .field import Colours, Densities, Directions, Field, Points
 from .ray_method import RayMethod
-from .sampler import Pass, Sampler
+from .sampler import Density, Pass, Sampler
 
 
 class FieldMethod(RayMethod, ABC):
@@ -81,6 +81,10 @@ class FieldMethod(RayMethod, ABC):
 
     # Training
 
+    def density_in_training(self, generator: torch.Generator) -> Density:
+        """Density for the sampler's grid and its terms, which must cover every code that rays may have."""
+        return self.density
+
     def rays_in_a_step(self, data: Scene) -> float:
         return self.sampler.expected_rays
 
@@ -102,7 +106,7 @@ class FieldMethod(RayMethod, ABC):
         passes = self.sampler.sample(rays, self.network, self.code(rays), generator)
         last = passes[-1]
         self.figures |= {"rays": len(rays), "samples": last.evaluated, "visible_samples": len(last.samples)}
-        return passes, self.sampler.terms(self.density, last, generator)
+        return passes, self.sampler.terms(self.density_in_training(generator), last, generator)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of each pass's picture (Mildenhall 2020, eq. 6), and the sampler's terms."""

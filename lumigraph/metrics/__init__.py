@@ -21,6 +21,8 @@ KEYS = (
     ("ssim", "SSIM", "", "higher", 4),
     ("lpips", "LPIPS", "", "lower", 4),
     ("clean_psnr", "clean PSNR", "dB", "higher", 2),
+    ("moving_psnr", "moving PSNR", "dB", "higher", 2),
+    ("moving_ssim", "moving SSIM", "", "higher", 4),
 )
 MIN_ERROR = 1e-10  # mean squared error below which images count as equal: 100 dB
 WINDOW, DEVIATION = 11, 1.5  # pixels of SSIM's Gaussian window

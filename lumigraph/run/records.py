@@ -66,6 +66,8 @@ class Means:
     ssim: float | None = None
     lpips: float | None = None
     clean_psnr: float | None = None
+    moving_psnr: float | None = None
+    moving_ssim: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +79,8 @@ class ViewScores(Means):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SizeScores(Means):
-    """The scores of all views of one size. views: number of them"""
+class PartScores(Means):
+    """The scores of all views of one size, or of one kind of held-out views. views: number of them"""
 
     views: Tally
 
@@ -90,7 +92,8 @@ class EvaluationRecord(Means):
     protocol: Protocol
     steps: Tally
     views: list[ViewScores] = field(default_factory=list)
-    by_resolution: dict[str, SizeScores] = field(default_factory=dict)
+    by_resolution: dict[str, PartScores] = field(default_factory=dict)
+    by_held_out: dict[str, PartScores] = field(default_factory=dict)
     scores: list[Score] = field(default_factory=list)
     seconds_per_view: Lasted | None = None
     training_seconds: Lasted | None = None

@@ -5,7 +5,8 @@
     signed_distance(stage.world, points)                  exact geometry
     open_scene("procedural:still-life,size=400")          the same as any other capture
     open_scene("procedural:tourists,jitter_poses=2")      with poses that are 2 degrees and 2 % off
-    render(stage.world_of(camera), camera)                the same, of a scene that moves: `swing`
+    render(stage.world_of(camera), camera)                the same, of a scene that moves: `jelly`, `clockwork`, `swing`
+    scene_flow(stage, camera, later)                      where each pixel's surface point is at another moment
     write_blender(stage, folder)                          the same for other tools
 
     open_scene("procedural:city,crossings=6")             scenes may have options of their own
@@ -163,6 +164,8 @@ def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]
         millimetres = np.dtype(np.uint16)
         measured = PixelPlane(values, "z-depth", 1 / MILLIMETRES, unknown=(UNMEASURED,), dtype=millimetres)
         exact = {"depth": measured, "exact_depth": exact["depth"]}
+    if stage.moving_things:
+        lasting["moving"] = plane("moving", "index", np.int64, names=("still", "moving"))
     return lasting | {
         **exact,
         "normals": plane("normals", "direction", np.float32, 3),
@@ -201,9 +204,27 @@ def known(stage: SyntheticStage, camera: Camera, name: str) -> np.ndarray:
     """Ground-truth layers along the rays through pixel centres, from `render`."""
     width, height = camera.size[0].tolist()
     seen = trace(stage.world_of(camera), camera.rays(camera.pixels()), shaded=False)
-    values = {"depth": seen.depth, "normals": seen.normal, "labels": seen.identity, "albedo": seen.reflectance}[name]
-    values = values if name == "labels" else values.astype(np.float32)
+    values = {
+        "depth": seen.depth,
+        "normals": seen.normal,
+        "labels": seen.identity,
+        "albedo": seen.reflectance,
+        "moving": np.isin(seen.identity, stage.moving_things).astype(np.int64),
+    }[name]
+    values = values if values.dtype == np.int64 else values.astype(np.float32)
     return values.reshape(height, width, *values.shape[1:])
+
+
+def scene_flow(stage: SyntheticStage, camera: Camera, time: float) -> np.ndarray:
+    """Displacement (height, width, 3) of the surface point that each pixel shows, from the camera's moment to another,
+    scene units. NaN where nothing is. Optical flow is its projection."""
+    assert stage.moving is not None, "nothing moves"
+    width, height = camera.size[0].tolist()
+    now, rays = stage.world_of(camera), camera.rays(camera.pixels())
+    seen = trace(now, rays, shaded=False)
+    points = rays.origins.double().numpy() + seen.depth[:, None] * rays.directions.double().numpy()
+    points[seen.identity < 0] = np.nan
+    return (now.carried(points, seen.identity, stage.moving(time)) - points).reshape(height, width, 3)
 
 
 def picture(stage: SyntheticStage, camera: Camera) -> np.ndarray:

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from .vector import INNER_OPTIONS, along, dot, unit
 
-SPHERE, BOX, CYLINDER, CONE, TORUS, ARCH, PLANE, TRIANGLE = range(8)
+SPHERE, BOX, CYLINDER, CONE, TORUS, ARCH, PLANE, TRIANGLE, CAPSULE = range(9)
 INFINITY = math.inf
 MIN_COMPONENT = 1e-12  # of a direction, against division by zero
 ON_SURFACE = 1e-7  # where a march along the ray ends, scene units
 NEAR_SURFACE = 5e-3  # within this distance the march around a shape that is not convex may use the secant
 MAX_STEPS = 400
+MIN_CURVATURE = 1e-6  # per scene unit; an axis of less is straight
 
 
 class SolidShape:
@@ -32,6 +34,14 @@ class SolidShape:
     def reach(self, rotation: np.ndarray) -> np.ndarray:
         """Half-size of the upright box around the shape once it is turned: of a box."""
         return np.abs(rotation) @ np.array(self.describe()[3])
+
+    def at_rest(self, points: np.ndarray) -> np.ndarray:
+        """Points of the body as they lie when it is not deformed; both in the shape's frame."""
+        return points
+
+    def deformed(self, points: np.ndarray) -> np.ndarray:
+        """Points of the body at rest where they are now; the inverse of `at_rest`."""
+        return points
 
 
 class Turned(SolidShape):
@@ -146,6 +156,46 @@ class Triangle(SolidShape):
         return TRIANGLE, (self.base, self.apex, self.height), r, (self.base + r, self.height + r, r)
 
 
+@dataclass(frozen=True)
+class SoftCapsule(SolidShape):
+    """A soft body: a capsule along z that stretches, and whose axis bends into an arc about the origin.
+
+    radius, half_height: at rest; the axis is 2 half_height long
+    curvature: of the axis, per scene unit, towards +x; at most a half circle
+    stretch:   factor on the axis's length; the cross-section shrinks by its root, so that the volume stays
+    """
+
+    radius: float
+    half_height: float
+    curvature: float = 0.0
+    stretch: float = 1.0
+
+    def describe(self):
+        radius, half = self.radius / math.sqrt(self.stretch), self.half_height * self.stretch
+        aside = abs(self.axis(half)[0])
+        numbers = self.radius, self.half_height, self.curvature, self.stretch
+        return CAPSULE, numbers, 0.0, (aside + radius, radius, half + radius)
+
+    def axis(self, along: np.ndarray | float) -> tuple[Any, Any, Any]:
+        """x and z of the axis so far along, and the angle that it has turned by, radians."""
+        angle = self.curvature * along
+        half = 0.5 * angle
+        chord = along * np.sinc(half / math.pi)
+        return chord * np.sin(half), chord * np.cos(half), angle
+
+    def at_rest(self, points: np.ndarray) -> np.ndarray:
+        numbers = self.describe()[1]
+        return np.array([at_rest.py_func(CAPSULE, numbers, tuple(p)) for p in points.tolist()]).reshape(-1, 3)
+
+    def deformed(self, points: np.ndarray) -> np.ndarray:
+        across = math.sqrt(self.stretch)
+        on_axis = points[:, 2].clip(-self.half_height, self.half_height)
+        x, z, angle = self.axis(on_axis * self.stretch)
+        aside, beyond = points[:, 0] / across, (points[:, 2] - on_axis) / across
+        cos, sin = np.cos(angle), np.sin(angle)
+        return np.stack([x + aside * cos + beyond * sin, points[:, 1] / across, z - aside * sin + beyond * cos], -1)
+
+
 def triangle_of(corners: np.ndarray, thickness: float) -> tuple[Triangle, np.ndarray, np.ndarray] | None:
     """The plate between three points (corner, 3), with its rotation and position; None for points on a line."""
     sides = np.roll(corners, -1, 0) - corners
@@ -172,7 +222,30 @@ def beside_segment(x, y, ax, ay, bx, by):
 @njit(**INNER_OPTIONS)
 def hollow(kind):
     """True if a ray that leaves the shape can meet it again: it is not convex."""
-    return kind == TORUS or kind == ARCH
+    return kind == TORUS or kind == ARCH or kind == CAPSULE
+
+
+@njit(**INNER_OPTIONS)
+def at_rest(kind, size, p):
+    """A point of a body where it lies when it is not deformed; textures are fixed there. Beyond the ends of a soft
+    capsule's axis, along their tangents. It calls nothing compiled, so that Python may call it."""
+    if kind != CAPSULE:
+        return p
+    x, y, z = p
+    bend, half, across = size[2], size[1] * size[3], math.sqrt(size[3])
+    along = z
+    if abs(bend) >= MIN_CURVATURE:
+        radius, side = 1.0 / bend, math.copysign(1.0, bend)
+        along = math.atan2(side * z, side * (radius - x)) / bend
+        if abs(along) <= half:
+            x = radius - side * math.sqrt((radius - x) ** 2 + z * z)
+        else:
+            end = math.copysign(half, along)
+            cos, sin = math.cos(bend * end), math.sin(bend * end)
+            u, w = x - (1.0 - cos) * radius, z - sin * radius
+            x, along = u * cos - w * sin, end + u * sin + w * cos
+    on_axis = min(max(along, -half), half)
+    return (x * across, y * across, on_axis / size[3] + (along - on_axis) * across)
 
 
 @njit(**INNER_OPTIONS)
@@ -233,6 +306,10 @@ def distance(kind, size, p):
         third, left = beside_segment(x, y, size[1], size[2], -size[0], -size[2])
         flat = 0.0 if min(below, min(right, left)) >= 0.0 else min(first, min(second, third))
         return math.sqrt(flat + z * z) - size[5]
+    if kind == CAPSULE:
+        x, y, z = at_rest(kind, size, p)
+        z = max(abs(z) - size[1], 0.0)
+        return (math.sqrt(x * x + y * y + z * z) - size[0]) / math.sqrt(size[3])
     return z  # a plane
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 from ..camera import Camera
 from ..errors import LumigraphError
 from ..files.ranges import Seed, between, typed
+from ..geometry import evenly
 from .depth_camera import DepthCamera
 from .sensor import Sensor
 from .world import Rotation, Vector, World
 
+MOMENTS = 16  # at which one sees what moves
 MAX_DIGITS = 20  # of a number
 Flag = Annotated[int, between(0, 1)]  # an option that its name alone turns on
 Options = TypeVar("Options")
@@ -57,6 +60,17 @@ class SyntheticStage:
     depth_camera: DepthCamera | None = None
     unit: float = 1.0
     error: float | None = None
+
+    @cached_property
+    def moving_things(self) -> tuple[int, ...]:
+        """Numbers, in the world's `names`, of the things that move."""
+        if self.moving is None:
+            return ()
+        times = [t for cameras in self.cameras.values() if cameras.time is not None for t in cameras.time.tolist()]
+        moments = [self.moving(t) for t in evenly(sorted(times), MOMENTS)]
+        pairs = [pair for world in moments for pair in zip(world.objects, moments[0].objects, strict=True)]
+        changed = {now.name for now, first in pairs if now != first}
+        return tuple(i for i, name in enumerate(self.world.names) if name in changed)
 
     def world_of(self, camera: Camera) -> World:
         """The world at the moment when a camera (a batch of one) takes its photograph."""

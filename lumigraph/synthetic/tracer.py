@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from .shapes import INFINITY, distance, gradient, hollow, intersect, inverse, slab
+from .shapes import INFINITY, at_rest, distance, gradient, hollow, intersect, inverse, slab
 from .textures import PRIMES, clouds, pattern, scramble
 from .vector import (
     COMPILE_OPTIONS,
@@ -220,7 +220,8 @@ def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
         n = rotate(thing.rotation, shape_normal)
         travelled += t
         slant = max(-dot(n, d), 0.05)
-        blend, shade = pattern(material.texture, material.numbers, local, shape_normal, radius * travelled / slant)
+        fixed, width = at_rest(thing.kind, thing.size, local), radius * travelled / slant
+        blend, shade = pattern(material.texture, material.numbers, fixed, shape_normal, width)
         albedo = scale(mix(vec(material.a), vec(material.b), blend), shade)
         if bounce == 0:
             facing, identity, own = n, thing.identity, albedo

@@ -66,6 +66,14 @@ class Pose:
     def about(axis: Vector, degrees: float) -> Pose:
         return Pose(rotation=nested(rotation_about(axis, degrees)))
 
+    def applied(self, points: np.ndarray) -> np.ndarray:
+        """Points (point, 3) of the object's own frame in the world."""
+        return points @ np.array(self.rotation).T + np.array(self.position)
+
+    def inverted(self, points: np.ndarray) -> np.ndarray:
+        """Points (point, 3) of the world in the object's own frame."""
+        return (points - np.array(self.position)) @ np.array(self.rotation)
+
     def __matmul__(self, inner: Pose) -> Pose:
         """The pose that moves by `inner` first, then by this one."""
         rotation, position = np.array(self.rotation), np.array(self.position)
@@ -94,7 +102,8 @@ class Material:
 
 @dataclass(frozen=True)
 class Object:
-    """A shape somewhere. Objects of one name are parts of one thing: they share its mask and move together."""
+    """A shape somewhere. Objects of one name are parts of one thing: they share its mask and move together, as a
+    rigid body unless there is one alone."""
 
     shape: SolidShape
     material: Material
@@ -206,6 +215,20 @@ class World:
             raise KeyError(f"nothing here is called {name!r}; there are {', '.join(self.names)}")
         objects = (replace(o, pose=motion @ o.pose) if o.name == name else o for o in self.objects)
         return replace(self, objects=tuple(objects))
+
+    def carried(self, points: np.ndarray, things: np.ndarray, later: World) -> np.ndarray:
+        """Positions (point, 3) in a later world of points of this one's surfaces. The exact correspondence.
+
+        things: number in `names` of what each point belongs to; -1 stays where it is
+        later:  the same things, moved or deformed
+        """
+        found = np.array(points, np.float64)
+        for number, name in enumerate(self.names):
+            own = things == number
+            before, after = (next(o for o in world.objects if o.name == name) for world in (self, later))
+            at_rest = before.shape.at_rest(before.pose.inverted(found[own]))
+            found[own] = after.pose.applied(after.shape.deformed(at_rest))
+        return found
 
     def transformed(self, motion: Pose) -> World:
         """The world after everything in it, lights included, made a rigid motion; the sky stays."""

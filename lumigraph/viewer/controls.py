@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..datasets.scene import Vector
 from ..method.controls import Control, Value
+from .cameras import STEP_SECONDS
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
 from .serving import PAGE
@@ -121,6 +123,8 @@ def to_bytes(colour: Vector) -> tuple[int, int, int]:
 
 
 STEPS = 200  # of a slider
+TIME = "time"  # name of the control that plays
+PASS_SECONDS = 4.0  # through all moments, at first
 
 
 class MethodControls:
@@ -130,12 +134,20 @@ class MethodControls:
         controls: Sequence[Control] = shared.method.controls
         self._controls, self._begun = controls, {x.name: shared.method.control(x.name) for x in controls}
         self._handles: dict[str, Any] = {}
+        self._playback: Playback | None = None
         if not controls:
             return
         with shared.tabs["View"], client.gui.add_folder("Controls"):
             for control in controls:
                 handle = self._handles[control.name] = add(client.gui, control, self._begun[control.name])
                 handle.on_update(lambda _: changed())
+                if control.name == TIME and control.range is not None:
+                    self._playback = Playback(client.gui, handle, control.range)
+
+    def stop(self) -> None:
+        """Stop what plays."""
+        if self._playback is not None:
+            self._playback.stop()
 
     @property
     def values(self) -> tuple[tuple[str, Value], ...]:
@@ -145,13 +157,13 @@ class MethodControls:
     @property
     def time(self) -> float | None:
         """The shown moment of a moving scene."""
-        time = self._now().get("time")
-        return None if time is None else float(time)
+        moment = self._now().get(TIME)
+        return None if moment is None else float(moment)
 
     def show_time(self, moment: float) -> None:
         """Turn the control `time` to a moment, where there is one."""
-        if "time" in self._handles:
-            self._handles["time"].value = moment
+        if TIME in self._handles:
+            self._handles[TIME].value = moment
 
     def _now(self) -> dict[str, Value]:
         found: dict[str, Value] = {}
@@ -160,6 +172,29 @@ class MethodControls:
             # sliders round, also beyond the ends of their range
             found[control.name] = shown if control.range is None else float(np.clip(shown, *control.range))
         return found
+
+
+class Playback:
+    """Play and pause of a slider of moments: through all of them, again and again."""
+
+    def __init__(self, gui: Any, slider: Any, span: tuple[float, float]):
+        self._slider, self._span, self._number = slider, span, 0
+        buttons = gui.add_button_group("Moments", ("Play", "Pause"))
+        buttons.on_click(lambda _: self.play() if buttons.value == "Play" else self.stop())
+        self._seconds = gui.add_slider("Seconds", 0.5, 30.0, 0.5, PASS_SECONDS, hint="Of a pass through all moments")
+
+    def stop(self) -> None:
+        self._number += 1
+
+    def play(self) -> None:
+        """Move the slider until `stop`, or until it is played again; whoever drags it goes on from there."""
+        self._number += 1
+        number, (first, last), before = self._number, self._span, time.perf_counter()
+        while number == self._number:
+            time.sleep(STEP_SECONDS)
+            now = time.perf_counter()
+            share = (self._slider.value - first) / (last - first) + (now - before) / self._seconds.value
+            self._slider.value, before = first + share % 1.0 * (last - first), now
 
 
 def add(gui: Any, control: Control, value: Value) -> Any:

@@ -89,6 +89,7 @@ class Visitor:
 
     def stop(self) -> None:
         self.flight.stop()
+        self.method_controls.stop()
         self.painter.stop()
 
     def notify(self, title: str, text: str = "") -> None:

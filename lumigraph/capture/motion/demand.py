@@ -47,8 +47,7 @@ class Demand:
     @property
     def reduced(self) -> float:
         """Pixels of a photograph for feature detection."""
-        width, height = self.size
-        return width * height * min(1.0, self.max_size / max(self.size)) ** 2
+        return reduced_pixels(self.size, self.max_size)
 
     @property
     def detection(self) -> float:
@@ -96,6 +95,11 @@ class Demand:
             f"{os.cpu_count() or 1} idle cores, and at most {gigabytes(self.memory)} of memory, of "
             f"{gigabytes(free_memory())} that are free"
         )
+
+
+def reduced_pixels(size: tuple[int, int], max_size: int) -> float:
+    """Pixels of a photograph whose longer side is reduced to `max_size`, if it is longer."""
+    return math.prod(size) * min(1.0, max_size / max(size)) ** 2
 
 
 def fitted(asked: Demand, free: float) -> tuple[Demand, list[str]]:

@@ -29,7 +29,7 @@ from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from ..transforms import read as read_transforms
-from .demand import demand_of, fitted
+from .demand import demand_of, fitted, reduced_pixels
 from .diagnosis import (
     ALL_TURNED_SHARE,
     MIN_FEATURES,
@@ -67,6 +67,7 @@ MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
 FEATURE_BUDGETS = ((80, MAX_FEATURES), (200, 4096))  # most photographs, and features of each; matching is quadratic
 MIN_FEATURE_BUDGET = 2048
+PIXELS_PER_FEATURE = 150  # of a photograph that may have its features without the octave of twice its size
 MAX_SECOND_SIDE = 3200  # pixels of the longer side, for photographs that found no place
 SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
 MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
@@ -243,12 +244,13 @@ class Reconstruction:
         claim_results(self.folder)
         copy_photographs(self.photos, self.images, self.track)
         self.masks = copy_masks(self.photos, self.mask_folder, self.track)
-        self.find_features(self.keys["features"])
-        self.compare(self.keys["matching"])
-        self.place(self.keys["mapping"])
-        self.unfold(self.keys["mapping"])
-        self.complete(self.keys["mapping"])
-        self.refine(self.keys["mapping"])
+        with closing(self.stages):
+            self.find_features(self.keys["features"])
+            self.compare(self.keys["matching"])
+            self.place(self.keys["mapping"])
+            self.unfold(self.keys["mapping"])
+            self.complete(self.keys["mapping"])
+            self.refine(self.keys["mapping"])
         with counting("Writing the scene"):
             return self.write(self.keys["result"])
 
@@ -269,12 +271,15 @@ class Reconstruction:
         threshold."""
         asked = replace(demand_of(self.photos, self.matching, max_size, features), count=len(names))
         chosen, _ = fitted(asked, free_memory())
+        area = PIXELS_PER_FEATURE * features
+        coarse = [p.name for p in self.photos if p.name in names and reduced_pixels(p.size, chosen.max_size) >= area]
         self.colmap(
             description,
             len(self.names),
             database,
             stage="features",
             names=names,
+            coarse=coarse,
             images=str(self.images),
             masks=self.masks and str(self.masks),
             max_size=chosen.max_size,
@@ -364,8 +369,14 @@ class Reconstruction:
                 self.map(self.second, again, "incremental", best)
 
     def match_again(self, left: set[str], database: Path) -> None:
-        """Make the database of the second pass: other features of the photographs without a place, and matches."""
+        """Make the database of the second pass: other features of the photographs without a place, and matches.
+
+        Photographs that had as many features as there may be, at their full size, keep theirs."""
         copy_database(database, self.second)
+        found = read_matches(database).features
+        full = {p.name for p in self.photos if max(p.size) <= self.max_size and found[p.name] >= MAX_FEATURES}
+        if not (left := left - full):
+            return
         delete_features(self.second, left)
         side = max(MAX_SECOND_SIDE, self.max_size)
         self.detect("Finding more details", self.second, sorted(left), side, MAX_FEATURES, SECOND_CONTRAST)
@@ -462,7 +473,7 @@ class Reconstruction:
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)
-        found = findings(read_transforms(self.folder), diagnosis.left_out)
+        found = findings(read_transforms(self.folder), diagnosis.left_out, judged=self.photos)
         result = self.summary(key, model, place, diagnosis) | {"findings": [asdict(finding) for finding in found]}
         write_json(self.folder / RESULT_FILE, result, "capture")
         return read_json(self.folder / RESULT_FILE)

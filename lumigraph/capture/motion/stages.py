@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from ...files.ranges import Lasted
 from ...system.signals import start
 
 WORKER = Path(__file__).with_name("worker.py")
+DONE = "done\n"  # the worker's line at the end of a job
 
 
 def key_of(*parts: Any) -> str:
@@ -42,6 +43,7 @@ class Stages:
     def __init__(self, folder: Path):
         self.path = folder / "stages.json"
         self.log = folder / "colmap.log"
+        self.worker: subprocess.Popen[str] | None = None
         self.marks: dict[str, StageMark] = read_json(self.path, dict[str, StageMark]) if self.path.is_file() else {}
 
     def is_done(self, stage: str, key: str) -> bool:
@@ -75,27 +77,43 @@ class Stages:
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
         """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does. Leaving
         the iterator early ends the work. Raises LumigraphError if COLMAP gives up."""
-        command = [sys.executable, "-P", str(WORKER), json.dumps(job)]
-        with open(self.log, "ab") as log:
-            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
-            process = start(command, signal.SIGKILL, **pipes, start_new_session=True, text=True)
-        assert process.stdin and process.stdout
+        worker = self.worker = self.worker or start_worker(self.log)
+        assert worker.stdin and worker.stdout
         told = 0
         try:
-            for line in process.stdout:
+            worker.stdin.write(json.dumps(job) + "\n")
+            worker.stdin.flush()
+            for line in worker.stdout:
+                if line == DONE:
+                    break
                 for told in range(told + 1, min(int(line), total) + 1):  # noqa: B020
                     yield told
-            if process.wait():
+            else:
                 raise LumigraphError(
                     f"COLMAP gave up while {job['stage']} was under way ({last_words(self.log)}); {self.log} has all "
                     f"that it said"
                 )
-            yield from range(told + 1, total + 1)
-        finally:
-            process.kill()
-            process.wait()
-            process.stdin.close()
-            process.stdout.close()
+        except BaseException:
+            self.close()
+            raise
+        yield from range(told + 1, total + 1)
+
+    def close(self) -> None:
+        """End the worker, whatever it is doing. Another job starts one again."""
+        if self.worker:
+            self.worker.kill()
+            self.worker.wait()
+            for pipe in (self.worker.stdin, self.worker.stdout):
+                assert pipe
+                with suppress(BrokenPipeError):  # a job that it never read
+                    pipe.close()
+            self.worker = None
+
+
+def start_worker(log: Path) -> subprocess.Popen[str]:
+    with open(log, "ab") as messages:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": messages}
+        return start([sys.executable, "-P", str(WORKER)], signal.SIGKILL, **pipes, start_new_session=True, text=True)
 
 
 def last_words(log: Path) -> str:

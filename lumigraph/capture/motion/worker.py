@@ -1,14 +1,15 @@
-"""One stage of COLMAP in a process of its own: Ctrl-C ends it at once, and its memory and messages stay outside.
+"""Stages of COLMAP in a process of their own: Ctrl-C ends it at once, and its memory and messages stay outside.
 
-Run as a script with a job as JSON in its only argument. It imports nothing of the package, so it starts in half a
-second. Progress goes to standard output, a number to a line; COLMAP's messages go to standard error. The process ends
-when its standard input does.
+Run as a script with jobs on its standard input, a line of JSON each. It imports nothing of the package, so it starts in
+half a second. Progress goes to standard output, a number to a line, and at the end of a job "done"; COLMAP's messages
+go to standard error. The process ends when its standard input does.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -24,6 +25,8 @@ import numpy as np
 import pycolmap
 
 COUNTER = Path(__file__).with_name("counter.py")
+SAMPLED_VIEWS = 2  # photographs that decide whether features are looked for without the octave of twice their size
+BLOCK_VIEWS = 16  # photographs whose features are written to the database together
 BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the database
 MIN_MODEL_VIEWS = 3  # photographs of a model
 MAX_THREADS = 16  # more threads need more memory than they save time
@@ -39,18 +42,64 @@ JOIN_TOLERANCE = 0.05  # distance of two points that count as one, of the median
 
 def find_features(job: dict[str, Any]) -> None:
     """Scale-invariant features (Lowe 2004), as root-SIFT, where masks allow them; photographs that have theirs are
-    passed over."""
+    passed over.
+
+    COLMAP keeps the largest features up to the number asked for. The octave of twice a photograph's size takes three
+    quarters of the work, and where the other octaves have so many features, it adds none. So `coarse` photographs,
+    which are large enough for that, are tried without it, unless a sample of them has too few.
+    """
+    known = described(job["database"])
+    coarse = [name for name in job["coarse"] if name not in known]
+    sample = evenly(coarse, SAMPLED_VIEWS)
+    if 2 * add_coarse(job, sample) >= max(len(sample), 1):
+        rest = [name for name in coarse if name not in sample]
+        for i in range(0, len(rest), BLOCK_VIEWS):
+            add_coarse(job, rest[i : i + BLOCK_VIEWS])
+    extract(job["database"], job, job["names"], first_octave=-1)
+
+
+def evenly(names: list[str], count: int) -> list[str]:
+    return names[:: -(-len(names) // count)] if names else []
+
+
+def add_coarse(job: dict[str, Any], names: list[str]) -> int:
+    """Add the features of the photographs that have enough without the octave of twice their size; their number."""
+    if not names:
+        return 0
+    with tempfile.TemporaryDirectory() as place:
+        aside = os.path.join(place, "coarse.db")
+        extract(aside, job, names, first_octave=0)
+        added = 0
+        with closing(pycolmap.Database.open(aside)) as found, closing(pycolmap.Database.open(job["database"])) as into:
+            for image in found.read_all_images():
+                features = found.read_keypoints(image.image_id)
+                if len(np.unique(features[:, :2], axis=0)) > job["features"]:  # those of two orientations count once
+                    number = into.read_image_with_name(image.name).image_id
+                    into.write_keypoints(number, features)
+                    into.write_descriptors(number, found.read_descriptors(image.image_id))
+                    added += 1
+    return added
+
+
+def described(database: str) -> set[str]:
+    """Names of the photographs that have features in a database."""
+    with closing(pycolmap.Database.open(database)) as opened:
+        return {image.name for image in opened.read_all_images() if opened.exists_keypoints(image.image_id)}
+
+
+def extract(database: str, job: dict[str, Any], names: list[str], first_octave: int) -> None:
+    """Detect features of photographs that have none in a database. first_octave: -1 is twice a photograph's size"""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = job["max_size"], job["threads"]
-    options.sift.max_num_features = job["features"]
+    options.sift.max_num_features, options.sift.first_octave = job["features"], first_octave
     options.sift.peak_threshold *= job["contrast"]
     reading = pycolmap.ImageReaderOptions()
     if job["masks"]:
         reading.mask_path = job["masks"]
     pycolmap.extract_features(
-        job["database"],
+        database,
         job["images"],
-        image_names=job["names"],
+        image_names=names,
         reader_options=reading,
         extraction_options=options,
         device=pycolmap.Device.cpu,
@@ -80,6 +129,7 @@ def place_one_by_one(job: dict[str, Any]) -> None:
     options, placed = incremental_options(job), 2
     if job["model"]:
         options.mapper.abs_pose_min_num_inliers = MIN_ADDED_INLIERS
+        options.multiple_models = False
 
     def another() -> None:
         nonlocal placed
@@ -261,21 +311,29 @@ STAGES: dict[str, tuple[Callable[[dict[str, Any]], None], str | None]] = {
 }
 
 
-def tell(count: int) -> None:
-    print(count, file=REPORT, flush=True)
+def tell(line: int | str) -> None:
+    print(line, file=REPORT, flush=True)
 
 
-def end_with_input() -> None:
-    sys.stdin.read()
+def listen(jobs: queue.SimpleQueue[str]) -> None:
+    """Hand on jobs. The end of the input ends the process, also in the middle of a job."""
+    for line in sys.stdin:
+        jobs.put(line)
     os._exit(1)
 
 
 def main() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # COLMAP's logging library has taken it
-    job = json.loads(sys.argv[1])
+    jobs: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=listen, args=(jobs,), daemon=True).start()
+    while True:
+        do(json.loads(jobs.get()))
+        tell("done")
+
+
+def do(job: dict[str, Any]) -> None:
     job.setdefault("threads", min(os.cpu_count() or 1, MAX_THREADS))
     job["seed"] = 0
-    threading.Thread(target=end_with_input, daemon=True).start()
     run, table = STAGES[job["stage"]]
     if table is None:
         run(job)

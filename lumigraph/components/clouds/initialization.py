@@ -107,7 +107,7 @@ def random_cloud(frame: Frame, count: int, degree: int, generator: torch.Generat
 
 
 def random_points(scene: Scene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    if not scene.images.has_alpha or scene.frame.is_open:
+    if not scene.images.has_alpha or scene.frame.is_open or scene.frame.times is not None:
         return points_in_box(scene.frame, count, generator)
     cells = visual_hull(scene, HULL_CELLS).nonzero()
     chosen = cells[torch.randint(len(cells), (count,), generator=generator)]

@@ -201,13 +201,14 @@ class AppearanceCodes(PhotographCodes):
             batch, size = evidence.sample_rays(self.pixels, method.random(0)).to(start.device), 1
         if not len(batch):
             return start
-        background, rest = method.background, method.shown_code[:, len(start) :]
+        codes = method.code(batch.rays)
+        background, rest = method.background, codes[:, len(start) :]
         target = batch.before(background)
-        last = method.sampler.sample(batch.rays, method.network)[-1]
+        last = method.sampler.sample(batch.rays, method.network, codes)[-1]
         last = last.keep(weights_of(last.samples, last.density) > FIT_WEIGHT)
 
         def error(appearance: Tensor) -> Tensor:
-            code = torch.cat([appearance[None], rest], -1)
+            code = torch.cat([appearance.expand(len(rest), -1), rest], -1)
             look, behind = last.look(method.network, code), method.behind(batch.rays, code, background)
             residual = composite(look.samples, look.density, look.rgb, behind).rgb - target
             return residual.view(-1, size, 3).mean(1).square().sum(-1).mean()

@@ -106,6 +106,22 @@ class MLP(nn.Module):
         return kernels.perceptron(x, *self.weights)
 
 
+FIRST_DEVIATION = 1e-2  # of layers that begin as zero in published code, and so pass no gradient on at first
+
+
+class ResNetLayers(nn.Module):
+    """x' = S x + W_1 relu(W_0 relu(x)); S is the identity where the widths agree (Mescheder 2019, figure 2)."""
+
+    def __init__(self, inputs: int, outputs: int):
+        super().__init__()
+        self.first, self.second = nn.Linear(inputs, outputs), nn.Linear(outputs, outputs)
+        self.shortcut = nn.Identity() if inputs == outputs else nn.Linear(inputs, outputs, bias=False)
+        nn.init.normal_(self.second.weight, std=FIRST_DEVIATION)
+
+    def forward(self, x: Float[Tensor, "*batch input"]) -> Float[Tensor, "*batch output"]:
+        return self.shortcut(x) + self.second(self.first(x.relu()).relu())
+
+
 LIMIT = 15.0
 
 

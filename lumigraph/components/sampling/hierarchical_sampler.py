@@ -12,8 +12,9 @@ from torch import Tensor
 from ...camera.rays import Rays, Samples
 from ...files.ranges import BatchSize, RaySamples
 from ...method import Pass, Sampler
+from ...method.sampler import RayCodes, codes_at
 from ...volume import weights_of
-from ..fields.coordinate_field import CoordinateField, Places
+from ..fields.coordinate_field import Places
 from .occupancy import MaskNumbers, OccupancyMask
 from .sampling import inverse_transform, midpoints, stratified
 from .spaces import Space
@@ -66,14 +67,14 @@ class HierarchicalSampler(Sampler):
         self.empty = OccupancyMask(mask.occupancy_resolution, mask.occupancy_threshold)
 
     def sample(
-        self, rays: Rays, field: Any, code: Tensor | None = None, generator: torch.Generator | None = None
+        self, rays: Rays, field: Any, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
         learns = generator is not None and self.learns_coarse
         shares = self.coarse_shares(rays, generator)
         with torch.set_grad_enabled(torch.is_grad_enabled() and learns):
-            coarse = self._pass("coarse", field.coarse or field, rays, shares, None, generator, colours=learns)
+            coarse = self._pass("coarse", field.coarse or field, rays, code, shares, None, generator, colours=learns)
             weights = weights_of(coarse.samples, coarse.density).view(len(rays), -1).detach()
-        fine = self._pass("fine", field, rays, *self.fine_shares(shares, weights, generator), generator)
+        fine = self._pass("fine", field, rays, code, *self.fine_shares(shares, weights, generator), generator)
         if generator is not None:
             self.evaluated = fine.evaluated
         return [coarse, fine]
@@ -106,8 +107,9 @@ class HierarchicalSampler(Sampler):
     def _pass(
         self,
         name: str,
-        field: CoordinateField,
+        field: Any,
         rays: Rays,
+        code: RayCodes | None,
         shares: Tensor,
         lit: Bool[Tensor, " all_samples"] | None = None,
         generator: torch.Generator | None = None,
@@ -115,6 +117,10 @@ class HierarchicalSampler(Sampler):
     ) -> Pass:
         """A field at places along rays. colours: evaluate them at once, of a field without a code"""
         samples, places, radius = self.places(shares, rays)
+        if field.deforms:
+            points, directions = samples.along(rays)
+            density, features = field.geometry(points, None if code is None else codes_at(samples.ray_index, code))
+            return Pass(name, samples, density, features, directions, None, None, len(samples), field=field)
         ray, features, rgb = samples.ray_index, places, None
         there = self.empty.may_hold(places[0], radius)
         where = there if lit is None else lit if there is None else lit & there

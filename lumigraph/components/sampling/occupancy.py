@@ -28,8 +28,11 @@ VIEWS = 24  # photographs asked at most: more cut little further
 def visual_hull(scene: Scene, resolution: int, coarsest: int = 32) -> Bool[Tensor, "x y z"]:
     """Cells of a grid over [-1, 1]^3 that no training photograph with alpha sees through, from coarse to fine.
 
-    Conservative: a cell stays unless some photograph is transparent wherever the ball around the cell projects.
+    Conservative: a cell stays unless some photograph is transparent wherever the ball around the cell projects. All
+    stay of a capture that moves, where a photograph sees through cells that are full at another moment.
     """
+    if scene.frame.times is not None:
+        return torch.ones(resolution, resolution, resolution, dtype=torch.bool)
     train = scene.splits["train"]
     chosen = evenly(train.tolist(), VIEWS)
     photographs = [scene.photograph(index) for index in chosen]

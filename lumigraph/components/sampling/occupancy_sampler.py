@@ -200,7 +200,8 @@ class OccupancySampler(Sampler):
             whole = self.stale or early or schedule.probes >= 1
             share, budget = (1.0, None) if whole else (schedule.probes, self._max_cells)
             chance = method.random(~step)
-            self.grid.update(method.density, n.occupancy_threshold, chance, n.occupancy_decay, share, budget)
+            density = method.density_in_training(chance)
+            self.grid.update(density, n.occupancy_threshold, chance, n.occupancy_decay, share, budget)
             self.stale = False
 
     @property

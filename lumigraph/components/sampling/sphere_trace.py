@@ -64,7 +64,7 @@ def sphere_trace(
     with torch.no_grad():
         t, hit, inside, closest = _first_crossings(distance, rays, box, march or March(), near)
     if torch.is_grad_enabled() and len(rows := (hit & ~inside).nonzero()[:, 0]):
-        t = t.index_put((rows,), _with_gradient(distance, rays[rows], t[rows]))
+        t = t.index_put((rows,), with_gradient(distance, rays[rows], t[rows]))
     return Crossings(t, hit, closest)
 
 
@@ -101,11 +101,11 @@ def _first_crossings(
         going = going[stays]
     if brackets:
         rows, a, b, at_a, at_b = (torch.cat(x) for x in zip(*brackets, strict=True))
-        t[rows] = _regula_falsi(distance, rays[rows], a, b, at_a, at_b, march.refinements)
+        t[rows] = regula_falsi(distance, rays[rows], a, b, at_a, at_b, march.refinements)
     return t, hit, inside, closest
 
 
-def _regula_falsi(
+def regula_falsi(
     distance: Distance, rays: Rays, a: Tensor, b: Tensor, at_a: Tensor, at_b: Tensor, count: int
 ) -> Float[Tensor, " ray"]:
     """Crossing between a, where the value is positive, and b, where it is negative, by the Illinois algorithm."""
@@ -126,7 +126,7 @@ def _regula_falsi(
     return secant()
 
 
-def _with_gradient(distance: Distance, rays: Rays, t: Float[Tensor, " ray"]) -> Float[Tensor, " ray"]:
+def with_gradient(distance: Distance, rays: Rays, t: Float[Tensor, " ray"]) -> Float[Tensor, " ray"]:
     """The same distances with the gradient of the level set: t - (f - f0) / (grad f . d)."""
     points = rays.at(t)
     points = points if points.requires_grad else points.requires_grad_()

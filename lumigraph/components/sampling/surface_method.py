@@ -24,12 +24,14 @@ AMBIENT, DIFFUSE = 0.25, 0.65  # of the grey surface
 class SurfaceMethod(RayMethod):
     """Learns from Shapes. Write `distance`, negative inside; pictures have colour, depth, opacity and normals.
 
-    march: steps along rays towards the surface
+    march:    steps along rays towards the surface
+    shadings: choices of the control of that name, the default first
     """
 
-    learns_from = Shapes
+    learns_from: ClassVar[type] = Shapes
     efforts: ClassVar[Efforts] = {"draft": Effort(20, 500), "good": Effort(200, 4000), "best": Effort(1000, 30_000)}
     march: ClassVar[March] = March()
+    shadings: ClassVar[tuple[str, ...]] = SHADINGS
 
     @abstractmethod
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
@@ -75,4 +77,4 @@ class SurfaceMethod(RayMethod):
     @property
     def controls(self) -> tuple[Control, ...]:
         about = "Colours of the surface: grey in light from the camera, or its normals."
-        return (*super().controls, Control("shading", SHADINGS[0], choices=SHADINGS, about=about))
+        return (*super().controls, Control("shading", self.shadings[0], choices=self.shadings, about=about))

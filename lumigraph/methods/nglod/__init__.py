@@ -147,30 +147,29 @@ class NGLOD(SurfaceMethod):
 
     def met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
         """Sphere tracing inside of the cells that rays cross (section 3.3); a ray skips what lies between them."""
-        number, share = self.level
-        tree = self.octree.levels[number].cells.made[2]
-        nothing = torch.zeros(tree.count, device=self.device)
-        origins = (0.5 * rays.origins + 0.5).contiguous()
-        found = kernels.octree_cells(origins, rays.directions.contiguous(), tree, nothing, 0.5 * self.frame.near)
-        if self.device.type == "cpu" and not share:
-            return self._traced_by_loops(rays, found)
+        if self.device.type == "cpu" and not self.level[1]:
+            return self._traced_by_loops(rays)
         with torch.no_grad():
-            return self.with_normals(rays, self._traced(rays, found))
+            return self.with_normals(rays, self._traced(rays))
 
-    def _traced_by_loops(self, rays: Rays, found: Crossed) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
-        c, number = self.config, self.level[0]
-        t, normals = torch.empty(len(rays)), torch.zeros(len(rays), 3)
-        first, second = (x.detach().t().contiguous() for x in self.octree.levels[number].decoder.weights)
-        spans = 2 * found.t_start, 2 * found.t_end, found.ray_starts
-        given = [x.contiguous().numpy() for x in (rays.origins, rays.directions, *spans)]
-        weights = first.numpy(), second[:, 0].contiguous().numpy()
-        tables, limits = self.octree.tables(number), (np.float32(c.hit_distance), c.max_steps)
-        trace(*given, number, 1 << c.base_level, *tables, *weights, *limits, t.numpy(), normals.numpy())
-        return t, normals
+    def _traced_by_loops(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
+        number = self.level[0]
+        level, t, normals = self.octree.levels[number], torch.empty(len(rays)), torch.empty(len(rays), 3)
+        _, nodes, tree = level.cells.made
+        with torch.no_grad():
+            tables = nodes.index.flatten(), self.octree.hidden(number), level.decoder.weights[1][0]
+        given = [x.contiguous().numpy() for x in (0.5 * rays.origins + 0.5, rays.directions, tree.cells, tree.rows)]
+        near, hit = np.float32(0.5 * self.frame.near), np.float32(0.5 * self.config.hit_distance)
+        found = [x.numpy() for x in (t, normals)]
+        trace(*given, tree.depth, near, *(x.detach().numpy() for x in tables), hit, self.config.max_steps, *found)
+        return 2 * t, normals
 
-    def _traced(self, rays: Rays, found: Crossed) -> Float[Tensor, " ray"]:
-        """Distances to the surface along rays that cross these cells."""
-        c, spans = self.config, Spans(found)
+    def _traced(self, rays: Rays) -> Float[Tensor, " ray"]:
+        """Distances to the surface along rays, by tensors."""
+        c, tree = self.config, self.octree.levels[self.level[0]].cells.made[2]
+        origins, nothing = (0.5 * rays.origins + 0.5).contiguous(), torch.zeros(tree.count, device=self.device)
+        found = kernels.octree_cells(origins, rays.directions.contiguous(), tree, nothing, 0.5 * self.frame.near)
+        spans = Spans(found)
         t = torch.full((len(rays),), torch.inf, device=self.device)
         row = (found.ray_starts.diff() > 0).nonzero()[:, 0]
         place = 2 * found.t_start[found.ray_starts[row]]

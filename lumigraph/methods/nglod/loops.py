@@ -1,5 +1,6 @@
-"""Loops over single rays (Numba): sphere tracing through the cells of one level of an octree of codes.
+"""Loops over single rays (Numba): octree traversal and sphere tracing through the cells of one level, in one pass.
 
+What goes into the decoder's ReLU is trilinear in a cell (`CodeOctree.hidden`), so a step interpolates eight rows of it.
 `NGLOD._traced` does the same with tensors, for GPUs, blends of levels, and as the definition that tests compare with.
 """
 
@@ -10,131 +11,111 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from ...kernels.octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cross, in_cells, outside, place_at, shared, through_cube
+
 CORNERS = 8
-PART = 256  # rays that share a thread's buffers
+HALF = np.float32(0.5)
+
+
+@njit(inline="always")
+def within(x, low):
+    """The share of a cell's side that lies below a coordinate."""
+    return min(max(x - np.float32(low), ZERO), ONE)
+
+
+@njit(inline="always")
+def blend(rows, at, h, x, y, z):
+    """Trilinear interpolation of column h of eight corners' rows: its value, and its slopes by cell."""
+    a, b = rows[at[0], h], rows[at[1], h]
+    c, d = rows[at[2], h], rows[at[3], h]
+    low_0, low_1 = a + z * (b - a), c + z * (d - c)
+    low_z = b - a + y * (d - c - b + a)
+    a, b = rows[at[4], h], rows[at[5], h]
+    c, d = rows[at[6], h], rows[at[7], h]
+    high_0, high_1 = a + z * (b - a), c + z * (d - c)
+    high_z = b - a + y * (d - c - b + a)
+    low, high = low_0 + y * (low_1 - low_0), high_0 + y * (high_1 - high_0)
+    low_y, high_y = low_1 - low_0, high_1 - high_0
+    return low + x * (high - low), high - low, low_y + x * (high_y - low_y), low_z + x * (high_z - low_z)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def weigh(x, y, z, n, index, at, weight):
-    """Rows of the corners around a point in one level, and their trilinear weights."""
-    fx, fy, fz = (0.5 * x + 0.5) * n, (0.5 * y + 0.5) * n, (0.5 * z + 0.5) * n
-    i, j, k = min(max(int(fx), 0), n - 1), min(max(int(fy), 0), n - 1), min(max(int(fz), 0), n - 1)
-    fx, fy, fz = fx - i, fy - j, fz - k
-    for c in range(CORNERS):
-        a, b, d = c >> 2, c >> 1 & 1, c & 1
-        at[c] = index[((i + a) * (n + 1) + j + b) * (n + 1) + k + d]
-        weight[c] = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if d else 1 - fz)
-    return fx, fy, fz
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def value_at(x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, inputs, hidden):
-    """Distance at a point in a cell of the last level: summed features, then the decoder's hidden layer and output."""
-    width = features.shape[1]
-    inputs[:width] = 0.0
-    for level in range(last + 1):
-        n = base << level
-        weigh(x, y, z, n, indices[starts[level] : starts[level + 1]], at, weight)
-        for c in range(CORNERS):
-            if at[c] >= 0:
-                row, w = offsets[level] + at[c], weight[c]
-                for f in range(width):
-                    inputs[f] += w * features[row, f]
-    inputs[width], inputs[width + 1], inputs[width + 2] = x, y, z
-    hidden[:] = 0.0
-    for i in range(width + 3):
-        w = inputs[i]
-        for h in range(len(hidden)):
-            hidden[h] += w * first[i, h]
-    total = np.float32(0.0)
-    for h in range(len(hidden)):
-        total += second[h] * max(hidden[h], np.float32(0.0))
+def value_at(hidden, second, at, x, y, z):
+    """Distance at a place in a cell: f = w_2 . relu(h), with h interpolated (eq. 4)."""
+    total = ZERO
+    for h in range(len(second)):
+        total += second[h] * max(blend(hidden, at, h, x, y, z)[0], ZERO)
     return total
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def slope_at(x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, hidden, to_input, out):
-    """Gradient at the point that `value_at` was last called for."""
-    width = features.shape[1]
-    for i in range(width + 3):
-        total = np.float32(0.0)
-        for h in range(len(hidden)):
-            total += first[i, h] * (second[h] if hidden[h] > 0 else np.float32(0.0))
-        to_input[i] = total
-    for axis in range(3):
-        out[axis] = to_input[width + axis]
-    for level in range(last + 1):
-        n = base << level
-        fx, fy, fz = weigh(x, y, z, n, indices[starts[level] : starts[level + 1]], at, weight)
-        scale = np.float32(0.5 * n)
-        for c in range(CORNERS):
-            if at[c] < 0:
-                continue
-            row, along = offsets[level] + at[c], np.float32(0.0)
-            for f in range(width):
-                along += to_input[f] * features[row, f]
-            a, b, d = c >> 2, c >> 1 & 1, c & 1
-            wx, wy, wz = (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if d else 1 - fz)
-            out[0] += scale * along * (1 if a else -1) * wy * wz
-            out[1] += scale * along * (1 if b else -1) * wx * wz
-            out[2] += scale * along * (1 if d else -1) * wx * wy
+def normal_at(hidden, second, at, x, y, z):
+    """Unit gradient at a place in a cell."""
+    along, across, upwards = ZERO, ZERO, ZERO
+    for h in range(len(second)):
+        value, a, b, c = blend(hidden, at, h, x, y, z)
+        weight = second[h] if value > ZERO else ZERO
+        along += weight * a
+        across += weight * b
+        upwards += weight * c
+    scale = ONE / max(np.float32(math.sqrt(along * along + across * across + upwards * upwards)), np.float32(1e-9))
+    return scale * along, scale * across, scale * upwards
 
 
-@njit(parallel=True, cache=True, fastmath={"contract", "reassoc"}, error_model="numpy")
-def trace(
-    origins, directions, t_start, t_end, ray_starts, last, base, indices, starts, offsets, features, first, second,
-    hit_distance, max_steps, t, normals,
-):  # fmt: skip
-    """Distance along each ray to the surface, infinity without one, and the unit normal there.
+@njit(inline="always")
+def corner_rows(index, side, x, y, z, at):
+    """Fill in the rows of a cell's corners. index: of the dense grid of corners, end to end"""
+    n = side + 1
+    for c in range(CORNERS):
+        at[c] = index[((x + (c >> 2)) * n + y + (c >> 1 & 1)) * n + z + (c & 1)]
 
-    t_start, t_end, ray_starts: intervals of rays in cells of the last level, scene units
-    base:             cells per axis of the first level
-    indices, starts:  row of each corner of each level's dense grid, end to end; -1 for none
-    features, offsets: of the corners of all levels, end to end
-    first, second:    the decoder's weights, (inputs, hidden) and (hidden,)
+
+@njit(parallel=True, fastmath={"contract", "reassoc"}, **FAST)
+def trace(o, d, cells, named, depth, near, index, hidden, second, hit_distance, max_steps, t, normals):
+    """Distance along each ray to the surface, infinity without one, and the unit normal there, zero without one.
+
+    o, d, near, t, hit_distance: in sides of the cube
+    cells, named, depth: the level's `Tree`
+    index, hidden: row of each corner in the dense grid, -1 for none; what goes into the ReLU there
+    second: the decoder's last weights; its distances are in half sides
     """
-    for part in prange((len(origins) + PART - 1) // PART):
-        at, weight = np.empty(CORNERS, np.int64), np.empty(CORNERS, np.float32)
-        inputs, hidden = np.empty(len(first), np.float32), np.empty(len(second), np.float32)
-        to_input, slope = np.empty(len(first), np.float32), np.empty(3, np.float32)
-        for ray in range(part * PART, min(part * PART + PART, len(origins))):
-            t[ray] = np.inf
-            span, end = ray_starts[ray], ray_starts[ray + 1]
-            if span == end:
+    n, side = len(o), np.int64(1) << depth
+    across = np.float32(side)
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        path, at = np.zeros(depth + 1, np.int64), np.zeros(CORNERS, np.int64)
+        for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+            t[r], steps, level = np.inf, 0, np.int64(0)
+            normals[r, 0], normals[r, 1], normals[r, 2] = ZERO, ZERO, ZERO
+            ray = in_cells(o, d, r, across)
+            enter, far = through_cube(ray, across, near)
+            if enter >= far:
                 continue
-            place = t_start[span]
-            before, ahead = place, np.float32(0.0)
-            for _ in range(max_steps):
-                x = origins[ray, 0] + place * directions[ray, 0]
-                y = origins[ray, 1] + place * directions[ray, 1]
-                z = origins[ray, 2] + place * directions[ray, 2]
-                value = value_at(
-                    x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, inputs, hidden
-                )
-                if value < hit_distance:
-                    if value < 0 and ahead > 0:
-                        place = before + ahead / max(ahead - value, np.float32(1e-9)) * (place - before)
-                        x = origins[ray, 0] + place * directions[ray, 0]
-                        y = origins[ray, 1] + place * directions[ray, 1]
-                        z = origins[ray, 2] + place * directions[ray, 2]
-                        value_at(
-                            x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, inputs,
-                            hidden,
-                        )  # fmt: skip
-                    t[ray] = place
-                    slope_at(
-                        x, y, z, last, base, indices, starts, offsets, features, first, second, at, weight, hidden,
-                        to_input, slope,
-                    )  # fmt: skip
-                    size = math.sqrt(slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2])
-                    for axis in range(3):
-                        normals[ray, axis] = slope[axis] / max(size, 1e-9)
+            ox, oy, oz, dx, dy, dz, _, _, _ = ray
+            x, y, z = place_at(ray, enter, side)
+            place = before = enter
+            ahead, met = ZERO, False  # 0: no value in front
+            while True:
+                row, level, leave, u, v, w = cross(cells, named, path, level, depth, x, y, z, ray, enter)
+                if row >= 0 and place <= leave:
+                    if place < enter:
+                        place, ahead = enter, ZERO
+                    corner_rows(index, side, x, y, z, at)
+                    while place <= leave and steps < max_steps and not met:
+                        a, b, c = within(ox + place * dx, x), within(oy + place * dy, y), within(oz + place * dz, z)
+                        value = HALF * value_at(hidden, second, at, a, b, c)
+                        steps += 1
+                        if value < hit_distance:
+                            met = True
+                            if value < ZERO and ahead > ZERO:
+                                place = before + ahead / (ahead - value) * (place - before)
+                        else:
+                            before, ahead = place, value
+                            place += value
+                if met:
+                    t[r] = place
+                    a, b, c = within(ox + place * dx, x), within(oy + place * dy, y), within(oz + place * dz, z)
+                    normals[r, 0], normals[r, 1], normals[r, 2] = normal_at(hidden, second, at, a, b, c)
+                if met or steps == max_steps or outside(u, v, w, side):
                     break
-                before, ahead = place, value
-                place = place + max(value, hit_distance)
-                while span < end and t_end[span] < place:
-                    span += 1
-                if span == end:
-                    break
-                if t_start[span] > place:
-                    place, ahead = t_start[span], np.float32(0.0)
+                level = shared(level - 1, depth, (x ^ u) | (y ^ v) | (z ^ w))
+                x, y, z, enter = u, v, w, leave

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -178,14 +177,17 @@ class CodeOctree(nn.Module):
         bits = cells.rows[cells.row(points), 1].long() >> (4 * x + 2 * y + z)
         return 1.0 - 2.0 * (bits & 1)
 
-    def tables(self, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Rows of corners with the start of each level, then the start of each level's features with these, of the
-        levels up to one, end to end; see `loops.trace`."""
-        levels = [*self.levels][: last + 1]
-        indices = [level.cells.made[1].index.flatten().numpy() for level in levels]
-        features = [level.features.detach().numpy() for level in levels]
-        starts, offsets = (np.cumsum([0, *map(len, parts)]) for parts in (indices, features))
-        return np.concatenate(indices), starts, offsets, np.concatenate(features)
+    def hidden(self, last: int) -> Float[Tensor, "corner hidden"]:
+        """Input of the ReLU of a level's decoder at the corners of its cells.
+
+        A cell lies in one cell of each coarser level, so the sum of their codes is trilinear in it, and so is a linear
+        layer of the sum and the point: eight corners give it anywhere in the cell, for any number of levels.
+        """
+        level, n = self.levels[last], self.levels[last].cells.resolution
+        number = level.cells.corners
+        places = torch.stack([number // (n + 1) ** 2, number // (n + 1) % (n + 1), number % (n + 1)], -1) * (2 / n) - 1
+        summed = sum(coarser.feature(places) for coarser in self.levels[: last + 1])
+        return torch.cat([summed, places], -1) @ level.decoder.weights[0].T
 
     def bytes_at(self, last: int) -> int:
         """Bytes of what a level needs: cells and features up to it, and its decoder."""

@@ -6,19 +6,21 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
 from ...camera import ring
 from ...color.blending import before
+from ...components.fields.appearance import fitted
 from ...components.sampling.coded_surface import CodedSurface, Evidence
 from ...components.sampling.sphere_trace import March
 from ...components.training.schedules import falling
 from ...components.training.shape_points import PointNumbers, PointPools
 from ...datasets.scene import Frame, Photograph
-from ...datasets.shapes import PointBatch, Shape, Shapes
+from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Seed, Width, between
@@ -35,6 +37,8 @@ class Config:
     points: PointNumbers = PointNumbers(100_000, near_share=0.0)
     cloud_points: Annotated[int, between(8, 65_536)] = 300  # points of a cloud as input, section 4.3
     cloud_noise: NonNegative = 0.01  # deviation of noise of these points in training, scene units; higher: more robust
+    bend: Annotated[float, between(0, 0.6)] = 0.0  # largest bend of axes in training, of points alone; more vary shapes
+    stretch: Annotated[float, between(0, 2)] = 0.0  # largest |log| of factors of axes in training, likewise
     picture_size: Annotated[int, between(16, 512)] = 224  # pixels a side of a picture as input
     views: Annotated[int, between(1, 256)] = 24  # pictures of each shape to learn from, around it, section 4.2
     code: Width = 512  # numbers of a code, appendix A; more hold more shapes
@@ -48,9 +52,13 @@ class Config:
     points_per_shape: Annotated[int, between(1, 1 << 20)] = 2048  # points of each shape in a step, section 3.2
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first, appendix A
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
+    code_steps: Annotated[int, between(0, 10_000)] = 0  # steps that fit an encoded cloud's code to it; many overfit
+    fit_learning_rate: LearningRate = 0.02  # Adam's learning rate of that fit, deviations of the learnt codes
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
+PLAIN_SHARE = 0.25  # share of members that stay as they are where the others are warped: their codes are kept
+MAX_LOGIT_ERROR = 4.0  # beyond it a point of a cloud does not pull the surface: the decoder has no such part
 VALUE_SCALE = 0.02  # scene units for a logit of 1: about how steep occupancy is at a learnt surface
 STEP = 0.02  # scene units from one look at a ray to the next
 EVALUATED_POINTS = 1 << 14  # points that go through the decoder together, to stay in caches
@@ -58,15 +66,47 @@ EVALUATED_POINTS = 1 << 14  # points that go through the decoder together, to st
 
 @dataclass(frozen=True)
 class OccupancyLesson:
-    """Points of some members, as many of each, and what each member's code is encoded from."""
+    """Points of some members, as many of each, and what each member's code is encoded from.
+
+    plain: members as they are, without a warp
+    """
 
     unit: ClassVar[str] = "points"
 
     points: PointBatch
-    evidence: Float[Tensor, member * evidence]
+    evidence: Float[Tensor, " member *evidence"]
+    plain: Bool[Tensor, " member"]
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+@dataclass(frozen=True)
+class Warp:
+    """x' = scale (x + bend (1 - x^2) / 2) + shift along each axis of each member: other proportions of the same parts.
+
+    It is monotone for |x| < 1 / |bend|, so the inside of a shape stays inside.
+    """
+
+    bend: Float[Tensor, "member 1 3"]
+    scale: Float[Tensor, "member 1 3"]
+    shift: Float[Tensor, "member 1 3"]
+
+    @staticmethod
+    def drawn(
+        box: Float[Tensor, "member 2 3"], bend: Float[Tensor, "member 1 3"], stretch: Float[Tensor, "member 1 3"]
+    ) -> Warp:
+        """The warp of these bends and factors after which the longest side of each box is normalised again."""
+        low, high = (stretch * bent(box, bend)).split(1, 1)
+        size = 2 * HALF_SIDE / (high - low).amax(-1, keepdim=True)
+        return Warp(bend, size * stretch, -size * (low + high) / 2)
+
+    def __call__(self, points: Float[Tensor, "member point 3"]) -> Float[Tensor, "member point 3"]:
+        return self.scale * bent(points, self.bend) + self.shift
+
+
+def bent(points: Float[Tensor, "member point 3"], bend: Float[Tensor, "member 1 3"]) -> Float[Tensor, "member point 3"]:
+    return points + bend * (1 - points.square()) / 2
 
 
 class OccupancyNetwork(CodedSurface):
@@ -90,10 +130,11 @@ class OccupancyNetwork(CodedSurface):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """Smaller networks, points close to the surface too, and waves."""
+        """Smaller networks, points close to the surface too, waves, and warped members."""
         c = Config(points=PointNumbers(80_000, near_share=0.6), picture_size=64, code=128, encoder_width=64)
-        c = replace(c, hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=4)
-        return replace(c, points_per_shape=1024, learning_rate=3e-3, final_learning_rate=3e-4)
+        c = replace(c, hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=16)
+        c = replace(c, points_per_shape=256, learning_rate=2e-3, final_learning_rate=1e-4)
+        return replace(c, bend=0.4, stretch=0.3, code_steps=30)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -116,18 +157,34 @@ class OccupancyNetwork(CodedSurface):
         return len(data.splits["train"]) / self.config.shapes_per_step
 
     def batch(self, data: Shapes, generator: torch.Generator) -> OccupancyLesson:  # type: ignore[override]
-        c = self.config
-        points = self.pools.lesson(data, c.shapes_per_step, c.points_per_shape, generator)
-        members = points.member[:: c.points_per_shape].tolist()
+        c, many = self.config, len(data.splits["train"]) > 1
+        count = c.points_per_shape if many else c.points_per_shape * c.shapes_per_step  # a single one is encoded once
+        points = self.pools.lesson(data, c.shapes_per_step if many else 1, count, generator)
+        members = points.member[::count].tolist()
         evidence = torch.stack([self._evidence_of(data.members[i], i, generator) for i in members])
-        return OccupancyLesson(points.to(self.device), evidence.to(self.device))
+        plain = torch.rand(len(members), generator=generator) < PLAIN_SHARE
+        if c.input != "points" or not many or not (c.bend or c.stretch):
+            plain = torch.ones_like(plain)
+        if c.input == "points":
+            warp = self._warp([data.members[i] for i in members], plain, generator)
+            moved = warp(points.points.view(len(members), -1, 3)).flatten(0, 1)
+            points, evidence = replace(points, points=moved, distance=None), warp(evidence)
+            evidence = evidence + c.cloud_noise * torch.randn(evidence.shape, generator=generator)
+        return OccupancyLesson(points.to(self.device), evidence.to(self.device), plain.to(self.device))
+
+    def _warp(self, shapes: list[Shape], plain: Bool[Tensor, " member"], generator: torch.Generator) -> Warp:
+        """A random warp of each member, none for those that stay plain."""
+        box = torch.stack(
+            [torch.from_numpy(np.stack([x.mesh.vertices.min(0), x.mesh.vertices.max(0)])) for x in shapes]
+        )
+        warped = ~plain[:, None, None] * (2 * torch.rand(2, len(shapes), 1, 3, generator=generator) - 1)
+        return Warp.drawn(box.float(), self.config.bend * warped[0], (self.config.stretch * warped[1]).exp())
 
     def _evidence_of(self, shape: Shape, member: int, generator: torch.Generator) -> Float[Tensor, "*evidence"]:
         """What a training member is encoded from in a step."""
         c = self.config
         if c.input == "points":
-            cloud = shape.surface(c.cloud_points, generator).points
-            return cloud + c.cloud_noise * torch.randn(cloud.shape, generator=generator)
+            return shape.surface(c.cloud_points, generator).points
         if member not in self._evidence:
             self._evidence[member] = voxels_of(shape) if c.input == "voxels" else self._pictures(shape, member)
         known = self._evidence[member]
@@ -146,7 +203,7 @@ class OccupancyNetwork(CodedSurface):
         shape = len(codes), -1
         logits = self.decoder(points.points.view(*shape, 3), codes)
         with torch.no_grad():
-            self.codes.rows[points.member.view(shape)[:, 0]] = codes
+            self.codes.rows[points.member.view(shape)[batch.plain, 0]] = codes[batch.plain]
             self.figures = {"wrong": float(((logits > 0) != (points.occupancy.view(shape) > 0.5)).float().mean())}
         return {"occupancy": F.binary_cross_entropy_with_logits(logits, points.occupancy.view(shape))}
 
@@ -167,8 +224,12 @@ class OccupancyNetwork(CodedSurface):
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Logit of the threshold less that of points, as long as if occupancy rose by 1 / VALUE_SCALE: it has the sign
         and the zero level of a distance, and not its length."""
-        level = math.log(self.config.threshold / (1 - self.config.threshold))
-        return VALUE_SCALE * (level - self.logits(points))
+        return VALUE_SCALE * (self._level - self.logits(points))
+
+    @property
+    def _level(self) -> float:
+        """Logit of the threshold."""
+        return math.log(self.config.threshold / (1 - self.config.threshold))
 
     # A new shape
 
@@ -202,8 +263,25 @@ class OccupancyNetwork(CodedSurface):
             )
         if c.input == "voxels":
             return self.encoder(voxels_of(evidence)[None].to(self.device))[0]
-        cloud = evidence.surface(c.cloud_points, self.random(2)).points
-        return self.encoder(cloud[None].to(self.device))[0]
+        cloud = evidence.surface(c.cloud_points, self.random(2)).points.to(self.device)
+        return self._through(cloud, self.encoder(cloud[None])[0])
+
+    def _through(self, cloud: Float[Tensor, "point 3"], code: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
+        """The code close to an encoded one whose surface passes through a cloud: the threshold's logit at its points.
+
+        The cloud does not say where the shape is empty, so the fit ends after few steps.
+        """
+        learnt = self.codes.rows[self.codes.learnt]
+        if len(learnt) < 2 or not self.config.code_steps:
+            return code
+        deviation = learnt.std(0)
+
+        def error(off: Float[Tensor, " code"]) -> Tensor:
+            logits = self.decoder(cloud[None], (code + deviation * off)[None])
+            return (logits - self._level).abs().clamp_max(MAX_LOGIT_ERROR).mean()
+
+        c = self.config
+        return code + deviation * fitted(torch.zeros_like(code), error, c.code_steps, c.fit_learning_rate)
 
 
 def voxels_of(shape: Shape) -> Float[Tensor, "x y z"]:

@@ -8,22 +8,26 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from ...components.fields.encodings import FrequencyEncoding
+from ...components.fields.layers import FIRST_DEVIATION, ResNetLayers
 
-SMALL = 1e-2  # deviation of layers that begin as zero in the published code, and so pass no gradient on at first
 VOXELS = 32  # voxels a side that the encoder of voxels takes
 
 
-class ResNetLayers(nn.Module):
-    """x' = S x + W_1 relu(W_0 relu(x)); S is the identity where the widths agree (appendix A, figure 2)."""
+def of_cloud(
+    block: ResNetLayers, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+) -> Float[Tensor, "member point output"]:
+    """Residual layers of points' features and those of their whole cloud, which are multiplied once for each cloud."""
+    inner = joined(block.first, x.relu(), whole.relu())
+    return joined(block.shortcut, x, whole) + block.second(inner.relu())
 
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        self.first, self.second = nn.Linear(inputs, outputs), nn.Linear(outputs, outputs)
-        self.shortcut = nn.Identity() if inputs == outputs else nn.Linear(inputs, outputs, bias=False)
-        nn.init.normal_(self.second.weight, std=SMALL)
 
-    def forward(self, x: Float[Tensor, "*batch input"]) -> Float[Tensor, "*batch output"]:
-        return self.shortcut(x) + self.second(self.first(x.relu()).relu())
+def joined(
+    layer: nn.Linear, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+) -> Float[Tensor, "member point output"]:
+    """A layer of [x, whole], where `whole` is the same for all points of a member."""
+    width = x.shape[-1]
+    once = F.linear(whole, layer.weight[:, width:], layer.bias)
+    return F.linear(x, layer.weight[:, :width]) + once[:, None]
 
 
 class PointEncoder(nn.Module):
@@ -37,11 +41,11 @@ class PointEncoder(nn.Module):
 
     def forward(self, points: Float[Tensor, "member point 3"]) -> Float[Tensor, "member code"]:
         x = self.first(points)
-        for number, layer in enumerate(self.layers):
-            if number:
-                x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
-            x = layer(x)
-        return self.last(x.amax(1).relu())
+        whole = x[:, 0, :0]  # the first layer sees single points
+        for layer in self.layers:
+            x = of_cloud(layer, x, whole)
+            whole = x.amax(1)
+        return self.last(whole.relu())
 
 
 class VoxelEncoder(nn.Module):
@@ -92,7 +96,7 @@ class ConditionalNorm(nn.Module):
         super().__init__()
         self.gamma, self.beta = nn.Linear(code, width), nn.Linear(code, width)
         for layer, bias in ((self.gamma, 1.0), (self.beta, 0.0)):
-            nn.init.normal_(layer.weight, std=SMALL)
+            nn.init.normal_(layer.weight, std=FIRST_DEVIATION)
             nn.init.constant_(layer.bias, bias)
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("variance", torch.ones(width))
@@ -111,7 +115,7 @@ class ConditionalBlock(nn.Module):
         super().__init__()
         self.norms = nn.ModuleList(ConditionalNorm(code, width) for _ in range(2))
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
-        nn.init.normal_(self.second.weight, std=SMALL)
+        nn.init.normal_(self.second.weight, std=FIRST_DEVIATION)
 
     def forward(
         self, x: Float[Tensor, "member point width"], code: Float[Tensor, "member code"]

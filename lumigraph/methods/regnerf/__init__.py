@@ -52,7 +52,7 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     table: HashNumbers = HashNumbers()
     steps: StepNumbers = StepNumbers()
-    field: Literal["network", "hash"] = "network"  # field: mip-NeRF's network, as in the paper, or a faster hash table
+    field: Literal["network", "hash", "auto"] = "network"  # mip-NeRF's network; a faster hash table; auto: see field_of
     unseen_patches: Annotated[int, between(0, 4096)] = 64  # patches of 8 x 8 unobserved rays in a step; 0: none
     depth_weight: NonNegative = 0.1  # weight of depth's roughness in these patches, eq. 6; higher smooths depth
     depth_weight_start: NonNegative = 400.0  # weight of that roughness at first, which falls to depth_weight
@@ -104,6 +104,7 @@ class Config:
 
 DECAY_START = 0.3  # share of the budget before the table's learning rate falls
 FLOWING = 0.05  # of a budget of seconds: the share that learning what is likely may take
+MIN_TABLE_VIEWS = 6  # photographs of an object from which a table is ahead of the network (docs/methods/regnerf.md)
 STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what looks like a photograph, is so in each
 
 
@@ -125,17 +126,17 @@ class Glimpses(Batch):
 class RegNeRF(FieldMethod):
     """Mip-NeRF's network or a hash table, with regularisation of patches at unobserved views."""
 
-    Config, further_bytes = Config, staticmethod(sampling_bytes)
+    Config = Config
     network: HashField | FrustumField
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        space = space_of(frame)
+        space, self.by_table = space_of(frame), field_of(frame, c) == "hash"
         self.poses = poses_for(frame, c.poses)
         self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine else None
         joining = joining_of(self.poses, self.bands)
-        if c.field == "hash":
+        if self.by_table:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(c.seed)
                 self.network = HashField(c.table, c.table_width, space, frame.reach, joining=joining)
@@ -153,13 +154,13 @@ class RegNeRF(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A hash table, for after a laptop's minutes a network is still a blur; with --field network a smaller one.
-        Fewer patches, and a larger share of the budget for what the paper does in its first hundreds of steps."""
+        """A hash table, for after a laptop's minutes a network is still a blur; a smaller network for objects of few
+        photographs. Fewer patches, and a larger share of the budget for what the paper does in its first steps."""
         network = NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16)
         c = Config(**CPU_NETWORK, network=network, unseen_patches=8, annealing=0.25, depth_settling=0.25)
         c = replace(c, depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5)
         c = replace(c, density_noise=0.0, gradient_clip=0.0)
-        c = replace(c, field="hash", table=CPU_HASH["table"], steps=CPU_HASH["steps"], table_width=32)
+        c = replace(c, field="auto", table=CPU_HASH["table"], steps=CPU_HASH["steps"], table_width=32)
         c = replace(c, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15)
         return replace(c, table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
 
@@ -168,6 +169,10 @@ class RegNeRF(FieldMethod):
         """Tiny networks and two patches: every part, within some twenty quick steps."""
         network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6)
         return Config(**TINY_NETWORK, network=network, unseen_patches=2, flow_steps=8)
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        return sampling_bytes(frame, replace(config, field=field_of(frame, config)), learning)
 
     # Learning
 
@@ -188,7 +193,7 @@ class RegNeRF(FieldMethod):
         rays = self.moved(batch.rays)
         rays = rays if unseen is None else joined(rays, unseen)
         passes, terms = self.learn_along(rays, generator)
-        opaque = self.sampler.is_open if c.field == "hash" else c.random_backdrop and self.frame.is_open
+        opaque = self.sampler.is_open if self.by_table else c.random_backdrop and self.frame.is_open
         background = backdrop(batch, self.background, generator, opaque=opaque)
         behind = background.expand(len(batch), 3)
         if unseen is not None:
@@ -201,7 +206,7 @@ class RegNeRF(FieldMethod):
             whole = composite(look.samples, look.density, look.rgb, behind, places=places)
             seen, rest = (part(whole, x) for x in (slice(len(batch)), slice(len(batch), None)))
             residual, self.figures["mse"] = residuals(seen, batch, background)
-            if c.field == "hash":
+            if self.by_table:
                 terms["huber"] = huber(residual, c.huber_delta)
             else:
                 terms[look.name] = weight * residual.square().sum(-1).mean()
@@ -257,7 +262,7 @@ class RegNeRF(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
-        if c.field == "hash":
+        if self.by_table:
             return held(c.table_learning_rate, c.final_table_learning_rate, step, progress, DECAY_START)
         return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
@@ -267,6 +272,15 @@ class RegNeRF(FieldMethod):
         forward = isinstance(self.network.space, NDC)
         self.sampler.sampled_share = max(grown, c.forward_annealing_start if forward else c.annealing_start)
         super().before_step(step, progress)
+
+
+def field_of(frame: Frame, config: Config) -> str:
+    """The field of a Config in a frame. With auto that is the network for an object of few photographs, which a table
+    explains one by one, and the table elsewhere."""
+    if config.field != "auto":
+        return config.field
+    few = 0 < frame.train_count < MIN_TABLE_VIEWS
+    return "network" if few and not frame.is_open else "hash"
 
 
 def clipped(optimizer: torch.optim.Optimizer, most: float) -> torch.optim.Optimizer:

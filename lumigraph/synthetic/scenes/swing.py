@@ -6,13 +6,11 @@ Held-out views are spread over the same second. Where the ball is at any moment 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
-import torch
 
-from ...camera import Camera
 from ..cameras import dome, pinhole, spiral
+from ..filming import timed
 from ..shapes import Ball, Cuboid, Cylinder
 from ..stage import SyntheticStage
 from ..textures import Checker, Plain, Sectors, Wood
@@ -64,8 +62,3 @@ def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
         "test": timed(pinhole(spiral(held_out, 3.6, random), size, 36.0), np.linspace(0, 1, held_out)),
     }
     return SyntheticStage(world(0.0), cameras, ((-1.0, -0.6, -0.7), (1.0, 0.6, 0.7)), reach=1.0, near=1.5, moving=world)
-
-
-def timed(cameras: Camera, times: np.ndarray) -> Camera:
-    """Cameras that take their photographs at these moments."""
-    return replace(cameras, time=torch.from_numpy(times).float())

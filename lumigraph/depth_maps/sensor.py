@@ -1,0 +1,81 @@
+"""Depth of sensors: how far each pixel is to be trusted, and faults of a capture that its numbers show."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..datasets.scene import Scene
+from ..geometry import evenly
+from .depth_map import DepthMap
+
+MIN_FACING = 0.1  # cosine between ray and normal below which a pixel is not trusted
+CHECKED_VIEWS = 8  # depth maps that are looked at
+MAX_ROOM = 100.0  # metres, units of the capture: sensors measure less
+MIN_ROOM = 0.02
+MAX_RATIO = 3.0  # between measured depth and that of sparse points, either way
+
+
+def trust_of(seen: DepthMap, trusted: float, farthest: float) -> Float[Tensor, "height width"]:
+    """Weight of each pixel: the cosine at which the surface is seen, times (trusted / depth)^4 beyond `trusted`.
+
+    The error of triangulated depth grows with its square (Khoshelham and Elberink 2012), its inverse variance falls
+    with the fourth power. 0 where nothing is measured, at grazing angles and beyond `farthest`.
+    trusted: 0 for everywhere
+    """
+    facing, depth = seen.facing, seen.depth
+    weight = torch.where((facing > MIN_FACING) & (depth < farthest), facing, 0.0)
+    if trusted > 0:
+        weight = weight * (trusted / depth.nan_to_num(math.inf).clamp_min(1e-9)).clamp(max=1).pow(4)
+    return weight.nan_to_num(0.0, 0.0)
+
+
+def sensor_faults(scene: Scene) -> list[str]:
+    """Sentences about depth whose unit is wrong, by the scene's sparse points or by what sensors can measure.
+
+    Raises LumigraphError where a scene has no depth.
+    """
+    layer = scene.layer("depth")
+    known = [i for i in scene.splits["train"].tolist() if layer.planes[i] is not None]
+    told = []
+    if missing := len(scene.splits["train"]) - len(known):
+        told.append(
+            f"{scene.source}: {missing} of {len(scene.splits['train'])} photographs have no depth, and are left out"
+        )
+    ratios, medians = [], []
+    for i in evenly(known, CHECKED_VIEWS):
+        photograph = scene.photograph(i, ("depth",))
+        depth = photograph.extra["depth"]
+        if not (measured := depth[depth.isfinite()]).numel():
+            continue
+        medians.append(float(measured.median()) * scene.frame.to_source.scale)
+        if scene.points is not None and len(scene.points):
+            ratios += _ratios(photograph.camera, depth, scene.points)
+    if not medians:
+        told.append(f"{scene.source}: nothing was measured in {len(known)} depth maps; check the files and their unit")
+        return told
+    ratio = float(torch.tensor(ratios).median()) if ratios else 1.0
+    if not 1 / MAX_RATIO < ratio < MAX_RATIO:
+        factor = 10 ** round(abs(math.log10(ratio)))
+        told.append(
+            f"{scene.source}: depth is {ratio:.3g} times as large as the sparse points are far away; its unit is "
+            f"probably wrong by a factor of {factor:,}, so correct that, or the poses' unit"
+        )
+    typical = float(torch.tensor(medians).median())
+    if not ratios and not MIN_ROOM < typical < MAX_ROOM:
+        told.append(
+            f"{scene.source}: the median depth is {typical:.3g} metres, which no depth camera measures; its unit is "
+            "probably wrong by a factor of 1000, so correct it"
+        )
+    return told
+
+
+def _ratios(camera, depth: Float[Tensor, "height width"], points: Float[Tensor, "point 3"]) -> list[float]:
+    """Measured depth over the distance of sparse points, where both are known."""
+    places, inside = camera.locate(points)
+    away = (points - camera.position).norm(dim=-1)
+    ratio = (depth[places[:, 0], places[:, 1]] / away)[inside]
+    return ratio[ratio.isfinite()].tolist()

@@ -1,0 +1,143 @@
+"""Voxel hashing (Nießner et al. 2013): depth maps fused into blocks of 8³ voxels, which exist near surfaces alone."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float, Int, Int32
+from torch import Tensor, nn
+
+from .. import kernels
+from ..camera.rays import Rays
+from ..kernels.block_hash import SIDE, VOXELS, new_table
+from ..kernels.fuse_depth import CHANNELS, empty_voxels
+from .depth_map import DepthMap
+from .pinholes import pinhole_maps
+
+GROWTH = 1.5  # times the blocks that memory is taken for, when it is used up
+MAX_LOAD = 0.5  # blocks to a slot of the table
+EDGE = 0.08  # of the least depth of four neighbouring pixels, from which on they show two surfaces
+EMPTY_DISTANCE = 0.9  # of the truncation: a block without a voxel nearer to a surface shows none
+BYTES_PER_BLOCK = VOXELS * CHANNELS * 4 + 12
+
+
+class VoxelBlocks(nn.Module):
+    """A truncated signed distance with colours, as large as the surfaces that depth maps showed.
+
+    blocks: coordinates of the blocks: voxel (i, j, k) of block b lies at edge (8 b + (i, j, k))
+    voxels: distance over truncation (positive in front of surfaces), weight, sRGB-encoded colour of each block's voxels
+    table:  the hash table, which follows from the blocks
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("blocks", "voxels")
+    blocks: Int32[Tensor, "block 3"]
+    voxels: Float[Tensor, "block 512 5"]
+    table: Int32[Tensor, " slot"]
+
+    def __init__(self, edge: float, truncation: float, max_weight: float = math.inf, max_blocks: int = 1 << 24):
+        """edge: of a voxel, scene units; truncation: in voxels; max_blocks: beyond it none are added"""
+        super().__init__()
+        self.edge, self.truncation, self.max_weight, self.max_blocks = edge, truncation * edge, max_weight, max_blocks
+        self.register_buffer("blocks", torch.empty(0, 3, dtype=torch.int32))
+        self.register_buffer("voxels", empty_voxels(0))
+        self.register_buffer("table", new_table(self.blocks), persistent=False)
+        self.register_load_state_dict_post_hook(lambda module, _: module.rehash())
+
+    def __len__(self) -> int:
+        return len(self.blocks)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the voxels and of the table."""
+        return len(self) * BYTES_PER_BLOCK + 4 * len(self.table)
+
+    def rehash(self) -> None:
+        self.table = new_table(self.blocks)
+
+    @torch.no_grad()
+    def fuse(self, seen: DepthMap, trust: Float[Tensor, "height width"]) -> bool:
+        """Add one depth map; a pixel counts as much as it is trusted. False if no memory is left for new blocks."""
+        room = True
+        for part in pinhole_maps(seen, trust):
+            given = (x.to(self.voxels.device) for x in (part.depth, part.rgb, part.trust, part.pose, part.lens))
+            depth, rgb, trusted, pose, lens = (x.contiguous() for x in given)
+            depth = torch.where(trusted > 0, depth, torch.nan)
+            side = SIDE * self.edge
+            new = kernels.band_blocks(depth, pose, lens, self.blocks, self.table, side, self.truncation)
+            room = self._add(new) and room
+            given = depth, rgb, trusted, pose, lens, self.edge, self.truncation, EDGE, self.max_weight
+            kernels.fuse_depth(self.voxels, self.blocks, *given, in_place=True)
+        return room
+
+    def _add(self, new: Int32[Tensor, "new 3"]) -> bool:
+        """Append blocks that nothing is known of; False if there is no room for them."""
+        first, count = len(self), len(self) + len(new)
+        if count > self.max_blocks:
+            return False
+        if len(new):
+            self.blocks = _extended(self.blocks, new)
+            self.voxels = _extended(self.voxels, empty_voxels(len(new), new.device))
+            if count > MAX_LOAD * len(self.table):
+                self.rehash()
+            else:
+                self.table = kernels.block_hash(self.blocks, self.table, first)
+        return True
+
+    @torch.no_grad()
+    def prune(self) -> int:
+        """Remove blocks without a voxel near a surface (Nießner 2013, sec. 4.3); returns how many they were."""
+        near = (self.voxels[..., 1] > 0) & (self.voxels[..., 0].abs() < EMPTY_DISTANCE)
+        kept = near.any(-1)
+        removed = len(self) - int(kept.sum())
+        if removed:
+            self.blocks, self.voxels = self.blocks[kept], self.voxels[kept]
+            self.rehash()
+        return removed
+
+    def bounds(self) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+        """Lowest and highest corner of all blocks."""
+        low, high = self.blocks.amin(0), self.blocks.amax(0) + 1
+        return SIDE * self.edge * low, SIDE * self.edge * high
+
+    @torch.no_grad()
+    def cast(
+        self, rays: Rays, step: float = 1.0
+    ) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
+        """Distance, normal and colour of the first surface along each ray; infinity without one.
+
+        step: between places on a ray where the distance is asked for, in voxels
+        """
+        near = torch.zeros_like(rays.radius)
+        far = near.clone()
+        if len(self):
+            enter, leave = rays.through_box(torch.stack(self.bounds()))
+            near, far = enter.clamp_min(0), leave
+        given = self.voxels, self.blocks, self.table, self.edge, step * self.edge
+        return kernels.cast_blocks(rays.origins, rays.directions, near, far, *given)
+
+    @torch.no_grad()
+    def surface(
+        self, min_weight: float = 0.0
+    ) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+        """Vertices in the scene's frame, their colours, and triangles, anticlockwise seen from in front.
+
+        min_weight: of a voxel that counts; above what one depth map gives, surfaces that were seen once are lost
+        """
+        places, rgb, faces = kernels.block_surface(self.voxels, self.blocks, self.table, min_weight)
+        return self.edge * places, rgb, faces
+
+
+def _extended(rows: Tensor, new: Tensor) -> Tensor:
+    """Rows and new ones behind them, in the same memory as long as there is room in it."""
+    count = len(rows) + len(new)
+    shape, size = (count, *rows.shape[1:]), max(math.prod(rows.shape[1:]), 1)
+    room = rows.untyped_storage().nbytes() // rows.element_size() // size
+    if room < count or rows.storage_offset():
+        larger = rows.new_empty(max(count, int(GROWTH * len(rows))), *rows.shape[1:])
+        larger[: len(rows)] = rows
+        rows = larger
+    grown = rows.new_empty(0).set_(rows.untyped_storage(), 0, shape)
+    grown[count - len(new) :] = new
+    return grown

@@ -1,0 +1,38 @@
+"""What is held out of a capture that moves: cameras, moments or both."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..datasets.scene import Scene
+
+SAME_MOMENT = 1e-4  # of the capture's duration: two photographs within it are of one moment
+SAME_POSE = 1e-4  # largest difference of two poses' numbers that are of one camera
+NAMES = {
+    (False, False): "new cameras and moments",
+    (False, True): "new cameras",
+    (True, False): "new moments",
+    (True, True): "known cameras and moments",
+}
+
+
+def held_out_kinds(scene: Scene) -> list[str | None]:
+    """For each photograph, which of its camera and its moment no photograph to learn from shares; None for all where
+    nothing says when photographs were taken."""
+    cameras, times = scene.cameras, scene.frame.times
+    if cameras.time is None or times is None:
+        return [None] * len(scene)
+    train = scene.splits["train"]
+    span = SAME_MOMENT * (times[1] - times[0])
+    same_moment = among(cameras.time[:, None], cameras.time[train, None], span)
+    same_camera = among(cameras.pose.flatten(1), cameras.pose[train].flatten(1), SAME_POSE)
+    return [NAMES[pair] for pair in zip(same_camera.tolist(), same_moment.tolist(), strict=True)]
+
+
+def among(
+    rows: Float[Tensor, "row column"], others: Float[Tensor, "other column"], tolerance: float
+) -> Bool[Tensor, " row"]:
+    """The rows that some other row equals within a tolerance."""
+    return torch.cdist(rows.double(), others.double(), p=torch.inf).min(-1).values <= tolerance

@@ -1,0 +1,10 @@
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
+
+FAULTS = {
+    "another prime": ("cpu", "slot_of", "np.int64(y) * P2", "np.int64(y) * P3"),
+    "two slots on": ("cpu", "_insert", "(slot + 1) & mask", "(slot + 3) & mask"),
+    "another prime, on the gpu": ("gpu", "slot_of", "z.to(tl.int64) * P3", "z.to(tl.int64) * P1"),
+    "the smaller number goes on": ("gpu", "_insert", "tl.maximum(number, before)", "tl.minimum(number, before)"),
+}
+
+ASTRAY = {"no end of the table": ("cpu", "_insert", "(slot + 1) & mask", "slot + 1")}

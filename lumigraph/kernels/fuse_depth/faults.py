@@ -1,0 +1,16 @@
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
+
+FAULTS = {
+    "depth along the axis": ("cpu", "_fuse", "np.sqrt(px * px + py * py + pz * pz)", "qz"),
+    "a weight forgotten": ("cpu", "_fuse", "min(weight + w, max_weight)", "min(weight + ONE, max_weight)"),
+    "no end of the weight": ("cpu", "_fuse", "min(weight + w, max_weight)", "weight + w"),
+    "blocks at the border dropped": ("cpu", "_visible", "v + top * w < -slant_t", "v + top * w < slant_t"),
+    "colours of free space": ("cpu", "_fuse", "if d < ONE", "if d > -ONE"),
+    "mixed with no colour": ("cpu", "_fuse", "colour if fresh else own", "own"),
+    "depth along the axis, on the gpu": ("gpu", "_fuse", "tl.sqrt(px * px + py * py + pz * pz)", "qz"),
+    "edges blended": ("gpu", "_fuse", "smooth = farthest - nearest <= edge * nearest", "smooth = farthest > 0"),
+    "what is hidden is known": ("gpu", "_fuse", "(distance >= -1)", "(distance >= -9)"),
+    "another colour": ("gpu", "_fuse", "here, 3, channel)", "here, 3, 0)"),
+}
+
+ASTRAY = {"a pixel beyond the last": ("cpu", "_fuse", "min(left + 1, width - 1)", "left + 1")}

@@ -1,0 +1,123 @@
+"""Deformable splatting: a cloud of Gaussians that moves through planes of space and time (Wu et al. 2024)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ...camera import Camera
+from ...camera.rays import Rendering
+from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.appearance import AppearanceNumbers
+from ...components.clouds.cloud import RateNumbers
+from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.initialization import Initialization
+from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
+from ...datasets.scene import Frame
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...gaussians import Gaussians
+from ...gaussians.splatting import render
+from ...geometry import to_matrix
+from ...method.controls import Control, moment
+from .planes import MotionNumbers, PlaneMotion
+
+FOLLOWED = 4  # Gaussians that a point of a surface moves with
+MIN_FOLLOWED_OPACITY = 0.1  # of these Gaussians
+
+
+@dataclass(frozen=True)
+class Config:
+    """The numbers of the authors' release, with Kerbl's (2023) of the cloud."""
+
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
+    sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
+    ssim_weight: Share = 0.0  # share of D-SSIM in the loss; higher gives structure more weight
+    initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
+    initial_gaussians: CloudSize = 2000  # random Gaussians, where there are no points
+    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
+    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
+    motion: MotionNumbers = MotionNumbers()
+    rates: RateNumbers = RateNumbers()
+    refine: RefineNumbers = RefineNumbers()
+    adaptive: AdaptiveNumbers = AdaptiveNumbers()
+    photographs: AppearanceNumbers = AppearanceNumbers(appearance="no")
+    tidying: TidyingNumbers = TidyingNumbers()
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+class DeformableSplatting(CloudMethod):
+    """A canonical cloud, moved to the moment of a photograph before it is rasterized."""
+
+    Config = Config
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        count = len(self.cloud)
+        self.poses = None
+        self.density_control = AdaptiveDensity(c.refine, c.adaptive, count)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            self.motion = PlaneMotion(frame, c.motion, count)  # it follows what density control does to the cloud
+        self.tidying = Tidying(c.tidying)
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """A smaller cloud that begins dense, coarser planes, and higher rates for few steps."""
+        motion = MotionNumbers(plane_resolution=32, plane_features=8, plane_moments=32, still_until=0.08)
+        motion = replace(motion, planes_lr=4e-3, motion_lr=1e-3, final_rate=0.1)
+        c = Config(initialization="dense", initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, motion=motion)
+        c = replace(c, refine=RefineNumbers(40_000, cap_ramp=True), tidying=ALL_RULES)
+        return replace(c, rates=RateNumbers(most_haste=4.0), half_resolution_until=0.4)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some hundred Gaussians that move, are refined and told apart within some twenty quick steps."""
+        motion = MotionNumbers(4, 4, 1, 4, 8, still_until=0.1, told_apart=0.6, rigid_samples=32)
+        refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
+        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
+        c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, ssim_weight=0.2, motion=motion)
+        return replace(c, refine=refine, adaptive=adaptive, tidying=ALL_RULES)
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return (*super().controls, moment(self.frame.times)) if self.frame.times else super().controls
+
+    def moment_of(self, camera: Camera | None = None) -> float:
+        """The shown moment: of the settings, else of the camera, else the first."""
+        if "time" not in self.settings and camera is not None and camera.time is not None:
+            return float(camera.time[0])
+        first, _ = self.frame.times or (0.0, 0.0)
+        return float(self.settings.get("time", first))
+
+    def gaussians(self) -> Gaussians:
+        return self.motion.at(super().gaussians(), self.moment_of())
+
+    def rasterized(self, camera: Camera) -> Rendering:
+        cloud = self.motion.at(self.filtered(), self.moment_of(camera))
+        return render(cloud, camera, BLACK, self.near_plane)
+
+    @torch.no_grad()
+    def follow(self, points: Float[Tensor, "point 3"], start: float, end: float) -> Float[Tensor, "point 3"]:
+        """Positions at one moment of surface points of another: they move rigidly with the Gaussians around them."""
+        canonical = self.filtered()
+        solid = canonical.opacities.sigmoid() > MIN_FOLLOWED_OPACITY
+        if not solid.any():
+            return points
+        before, after = (self.motion.at(canonical, time)[solid] for time in (start, end))
+        count = min(FOLLOWED, len(before))
+        away, nearest = cKDTree(before.means.cpu().numpy()).query(points.cpu().numpy(), count)
+        away, chosen = (np.reshape(x, (len(points), count)) for x in (away, nearest))
+        rows = torch.from_numpy(chosen).to(points.device)
+        weight = 1 / (torch.from_numpy(away).to(points) ** 2 + 1e-8)
+        turns = to_matrix(after.quaternions) @ to_matrix(before.quaternions).mT
+        there = (turns[rows] @ (points[:, None] - before.means[rows])[..., None])[..., 0] + after.means[rows]
+        return (weight[..., None] * there).sum(1) / weight.sum(1, keepdim=True)

@@ -1,0 +1,238 @@
+"""Motion of Gaussians by a small network over plane features of space and time (Wu 2024, section 4.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Annotated, Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.functional import normalize
+
+from ...components.clouds.addition import Addition, Step
+from ...components.training.schedules import falling
+from ...datasets.scene import Frame
+from ...files.ranges import LearningRate, NonNegative, PositiveShare, Share, Width, between
+from ...gaussians import Gaussians
+from ...geometry import multiply, to_matrix
+
+PAIRS = tuple(combinations(range(4), 2))  # axes of the six planes; 3 is time
+TIME = 3
+NEIGHBOURS = 6  # of a Gaussian, that move rigidly with it
+PROBED_MOMENTS = 12  # at which one sees whether a Gaussian moves
+MIN_DISTANCE = 1e-6  # between neighbours, scene units
+
+Moments = Float[Tensor, " gaussian"] | float
+
+
+@dataclass(frozen=True)
+class MotionNumbers:
+    """A Config's numbers of the motion; those of the authors' release (Wu 2024)."""
+
+    plane_resolution: Annotated[int, between(4, 1024)] = 64  # cells of the coarsest planes along an axis of space
+    plane_moments: Annotated[int, between(2, 1024)] = 25  # cells of the coarsest planes along time; more move faster
+    plane_scales: Annotated[int, between(1, 6)] = 2  # planes of each pair of axes, each twice as fine in space
+    plane_features: Annotated[int, between(1, 128)] = 32  # features of a cell; more hold more motion, and cost time
+    motion_width: Width = 64  # channels of the network's hidden layer
+    max_offset: PositiveShare = 0.5  # largest offset of a Gaussian, as a share of the box's diagonal
+    still_until: Share = 3000 / 23_000  # share of the budget in which nothing moves, 3000 steps; later: a better start
+    told_apart: Share = 0.4  # share of the budget from which Gaussians that hardly move stand still; 1: never
+    still_offset: PositiveShare = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
+    plane_smoothness: NonNegative = 1e-4  # weight of total variation of planes in space
+    time_smoothness: NonNegative = 0.01  # weight of second differences of planes along time; higher: calmer motion
+    time_sparsity: NonNegative = 1e-4  # weight of the planes' distance from no motion; higher: more stands still
+    rigidity: NonNegative = 0.01  # weight of distances to neighbours that change; higher: stiffer bodies
+    rigid_samples: Annotated[int, between(1, 1 << 20)] = 1024  # Gaussians of a step whose neighbours are compared
+    planes_lr: LearningRate = 1.6e-3  # learning rate of the planes at first, times the extent of the cameras
+    motion_lr: LearningRate = 1.6e-4  # learning rate of the network at first, likewise
+    final_rate: PositiveShare = 0.01  # share of these rates at the end of the budget
+
+
+class SpaceTimePlanes(nn.Module):
+    """Features of points at moments: the product over six planes of what each holds (Fridovich-Keil 2023, eq. 1), scale
+    beside scale. Planes of time hold ones at first, so that nothing depends on it."""
+
+    def __init__(self, numbers: MotionNumbers):
+        super().__init__()
+        n = numbers
+        self.width = n.plane_features * n.plane_scales
+        self.planes = nn.ParameterList()
+        for scale in range(n.plane_scales):
+            cells = [n.plane_resolution << scale] * 3 + [n.plane_moments]
+            for a, b in PAIRS:
+                plane = torch.empty(1, n.plane_features, cells[b], cells[a])
+                self.planes.append(nn.Parameter(plane.fill_(1.0) if b == TIME else plane.uniform_(0.1, 0.5)))
+
+    def forward(self, places: Float[Tensor, "point 4"]) -> Float[Tensor, "point width"]:
+        """places: x, y, z and time in [-1, 1]"""
+        scales = []
+        for first in range(0, len(self.planes), len(PAIRS)):
+            features = torch.ones((), device=places.device)
+            for plane, pair in zip(self.planes[first : first + len(PAIRS)], PAIRS, strict=True):
+                at = places[None, None, :, list(pair)]
+                features = features * F.grid_sample(plane, at, padding_mode="border", align_corners=True)[0, :, 0].T
+            scales.append(features)
+        return torch.cat(scales, 1)
+
+    def terms(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Total variation in space, second differences along time, and distance from ones of planes of time."""
+        pairs = PAIRS * (len(self.planes) // len(PAIRS))
+        space, calm, moving = [], [], []
+        for plane, (_, b) in zip(self.planes, pairs, strict=True):
+            space.append(plane.diff(dim=3).square().mean())
+            if b == TIME:
+                calm.append(plane.diff(n=2, dim=2).square().mean())
+                moving.append((plane - 1).abs().mean())
+            else:
+                space.append(plane.diff(dim=2).square().mean())
+        return torch.stack(space).sum(), torch.stack(calm).sum(), torch.stack(moving).sum()
+
+
+class PlaneMotion(Addition):
+    """Positions, rotations and sizes of Gaussians at a moment, as offsets from the canonical cloud (Wu 2024, eq. 7).
+
+    moves:      which Gaussians move; the others cost nothing
+    neighbours: of each Gaussian among those that move, for rigidity
+    active:     whether anything moves yet
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("moves", "neighbours")
+    box: Tensor
+    moves: Tensor
+    neighbours: Tensor
+    active: Tensor
+
+    def __init__(self, frame: Frame, numbers: MotionNumbers, count: int):
+        super().__init__()
+        low, high = torch.tensor(frame.bounds)
+        self.numbers, self.times = numbers, frame.times
+        self.register_buffer("box", torch.stack([low, high]), persistent=False)
+        self.diagonal = float((high - low).norm())
+        self.planes = SpaceTimePlanes(numbers)
+        self.network = nn.Sequential(nn.Linear(self.planes.width, numbers.motion_width), nn.ReLU())
+        self.heads = nn.Linear(numbers.motion_width, 9)
+        nn.init.zeros_(self.heads.weight)
+        nn.init.zeros_(self.heads.bias)
+        self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
+        self.register_buffer("neighbours", torch.arange(count)[:, None].repeat(1, NEIGHBOURS))
+        self.register_buffer("active", torch.tensor(False))
+        self.progress, self.extent = 0.0, 1.0
+
+    # The cloud at a moment
+
+    def offsets(
+        self, means: Float[Tensor, "gaussian 3"], time: Moments
+    ) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"], Float[Tensor, "gaussian 3"]]:
+        """Offsets of positions, rotations as unit quaternions, and factors of sizes, logarithmic."""
+        first, last = self.times or (0.0, 1.0)
+        share = (torch.as_tensor(time, device=means.device) - first) / (last - first)
+        space = 2 * (means - self.box[0]) / (self.box[1] - self.box[0]) - 1
+        places = torch.cat([space, (2 * share - 1).expand(len(means))[:, None]], 1)
+        raw = self.heads(self.network(self.planes(places)))
+        bound = self.numbers.max_offset * self.diagonal
+        position, turn, size = raw.split(3, 1)
+        turn = normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
+        return bound * torch.tanh(position / bound), turn, size
+
+    def at(self, cloud: Gaussians, time: float) -> Gaussians:
+        """The cloud at a moment; its static Gaussians are those of the canonical one."""
+        if not self.active:
+            return cloud
+        rows = self.moves.nonzero()[:, 0]
+        every = len(rows) == len(cloud)
+        some = cloud if every else cloud[rows]
+        offset, turn, size = self.offsets(some.means, time)
+        moved = some.means + offset, multiply(turn, some.quaternions), some.log_scales + size
+        if not every:
+            still = cloud.means, cloud.quaternions, cloud.log_scales
+            moved = tuple(x.index_copy(0, rows, y) for x, y in zip(still, moved, strict=True))  # type: ignore[assignment]
+        return replace(cloud, means=moved[0], quaternions=moved[1], log_scales=moved[2])
+
+    # Learning
+
+    def begin_cloud(self, method: Any) -> None:
+        self.follow_cloud(method.cloud.means.detach())
+
+    @torch.no_grad()
+    def follow_cloud(self, means: Float[Tensor, "gaussian 3"]) -> None:
+        """Tell static Gaussians from moving ones, and find neighbours of these."""
+        count, device = len(means), means.device
+        self.moves = torch.ones(count, dtype=torch.bool, device=device)
+        if self.active and self.progress >= self.numbers.told_apart:
+            first, last = self.times or (0.0, 1.0)
+            moments = torch.linspace(first, last, PROBED_MOMENTS).tolist()
+            farthest = torch.stack([self.offsets(means, t)[0].norm(dim=-1) for t in moments]).amax(0)
+            self.moves = farthest > self.numbers.still_offset * self.diagonal
+        self.neighbours = torch.arange(count, device=device)[:, None].repeat(1, NEIGHBOURS)
+        rows = self.moves.nonzero()[:, 0]
+        if len(rows) > NEIGHBOURS:
+            points = means[rows].cpu().numpy()
+            _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
+            self.neighbours[rows] = rows[torch.from_numpy(nearest[:, 1:]).to(device)]
+
+    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
+        """A neighbour that is pruned becomes the Gaussian itself, which costs nothing."""
+        kept = torch.arange(len(self.moves), device=self.moves.device)[keep]
+        own = torch.arange(len(kept), device=kept.device)
+        place = torch.full_like(self.moves, -1, dtype=torch.long).index_copy(0, kept, own)
+        left = place[self.neighbours[kept]]
+        self.moves, self.neighbours = self.moves[kept], torch.where(left < 0, own[:, None], left)
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        self.progress, self.extent = progress, float(method.cloud.extent)
+        self.active.fill_(self.times is not None and progress >= self.numbers.still_until)
+
+    def before_raster(self, method: Any, step: Step) -> None:
+        if step.camera.time is not None:
+            step.cloud = self.at(step.cloud, float(step.camera.time))
+
+    def regularize(self, method: Any, step: Step) -> None:
+        """Smooth planes, and neighbours at fixed places in each other's frame (Luiten 2024, eq. 9)."""
+        if not self.active:
+            return
+        n = self.numbers
+        space, calm, moving = self.planes.terms()
+        step.terms["planes"] = n.plane_smoothness * space + n.time_smoothness * calm + n.time_sparsity * moving
+        if n.rigidity and step.camera.time is not None:
+            step.terms["rigidity"] = n.rigidity * self.bending(step.whole, float(step.camera.time), step.chance)
+
+    def bending(self, cloud: Gaussians, time: float, chance: torch.Generator) -> Float[Tensor, ""]:
+        """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
+        distance; of some, at random."""
+        rows = self.moves.nonzero()[:, 0]
+        if not len(rows):
+            return cloud.means.sum() * 0
+        drawn = rows[torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)]
+        both = torch.cat([drawn[:, None], self.neighbours[drawn]], 1)
+        there = cloud.means.detach()[both.flatten()]
+        offset, turn, _ = self.offsets(there, time)
+        before, after = (x.view(*both.shape, 3) for x in (there, there + offset))
+        frame = to_matrix(turn.view(*both.shape, 4)[:, 0])
+        apart = before[:, 1:] - before[:, :1]
+        change = after[:, 1:] - after[:, :1] - apart @ frame.mT
+        near = apart.square().sum(-1).clamp_min(MIN_DISTANCE**2)
+        return (change.square().sum(-1) / near).mean()
+
+    def after_step(self, method: Any, step: int) -> None:
+        if method.current.due or len(self.moves) != len(method.cloud):
+            self.follow_cloud(method.cloud.means.detach())
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        n = self.numbers
+        network = [*self.network.parameters(), *self.heads.parameters()]
+        groups = [
+            {"name": "planes", "params": list(self.planes.parameters()), "lr": n.planes_lr},
+            {"name": "motion", "params": network, "lr": n.motion_lr},
+        ]
+        return [torch.optim.Adam(groups, eps=1e-15)]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        n = self.numbers
+        return {
+            name: self.extent * falling(rate, n.final_rate * rate, progress)
+            for name, rate in (("planes", n.planes_lr), ("motion", n.motion_lr))
+        }

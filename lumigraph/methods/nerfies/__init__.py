@@ -1,0 +1,248 @@
+"""Nerfies: a scene that deforms from moment to moment (Park et al. 2021, arXiv 2011.12948; slices: 2106.13228)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad, softplus
+
+from ...camera.rays import Rays
+from ...components.fields.appearance import AppearanceCodes
+from ...components.fields.coordinate_field import NetworkNumbers
+from ...components.fields.hash_field import CODES_RATE, HashNumbers
+from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.sampling.spaces import space_of
+from ...components.training.photometric import backdrop
+from ...components.training.schedules import held_decay
+from ...datasets.scene import Batch, Frame, Scene
+from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between
+from ...method import FieldMethod, Pass
+from ...method.field import Densities, Points
+from ...method.sampler import Density
+from ...volume import composite, weights_of
+from .canonical import SlicedHash, SlicedNetwork, WarpedField
+from .elastic import elastic_loss, geman_mcclure
+from .warp import MomentCodes, Motion, MotionField, SliceField
+
+Code = Annotated[int, between(0, 1024)]  # numbers of a code; 0 for none
+BACKGROUND_SCALE = 0.001  # c of the background's robust loss, in scene units (the authors' release)
+
+
+@dataclass(frozen=True)
+class DeformationNumbers:
+    """A Config's numbers of the deformation; the paper's (Park 2021)."""
+
+    motion: Motion = "se3"  # motion of a point: a screw motion, section 3.2, or a translation; none: only slices
+    moment_code: Annotated[int, between(1, 1024)] = 8  # numbers of a moment's code, section 4; more fit more freely
+    deformation_frequencies: Octaves = 8  # m, octaves of the encoding at the end of annealing, section 3.5
+    deformation_depth: Layers = 6  # hidden layers, section 4; more cost time
+    deformation_width: Width = 128  # channels of a layer, section 4; wider costs time
+    deformation_skip: Layers = 4  # layer whose activation the input joins again, section 4
+    annealing: Share = 0.32  # share of the budget in which octaves join, 80k of 250k steps, section 3.5; 0: at once
+    elastic_weight: NonNegative = 1e-3  # lambda, weight of the elastic loss at first, section 4; higher: more rigid
+    elastic_until: Share = 0.2  # share of the budget before that weight falls, 50k of 250k steps
+    elastic_scale: PositiveShare = 0.03  # c of the robust loss, section 3.3; higher: large stretches count for more
+    elastic_samples: Annotated[int, between(1, 1 << 20)] = 8192  # samples of a step where it is measured
+    background_weight: NonNegative = 1.0  # weight of background points that must not move, section 3.4
+    background_points: Annotated[int, between(1, 1 << 20)] = 16384  # of them in a step
+    slice_dimensions: Annotated[int, between(0, 16)] = 0  # ambient dimensions of HyperNeRF's slice; 0: none
+    slice_width: Width = 64  # channels of the slice's network (Park 2021b, section 5.1)
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers; `Nerfies.preset` has those of a plain CPU."""
+
+    network: NetworkNumbers = NetworkNumbers(position_frequencies=8)  # the authors' release
+    rays: RayNumbers = RayNumbers(128, 128, rays_per_step=6144)  # section 4
+    table: HashNumbers = HashNumbers()
+    occupancy: OccupancyNumbers = OccupancyNumbers()
+    steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
+    deformation: DeformationNumbers = DeformationNumbers()
+    field: Literal["hash", "network"] = "network"  # canonical scene: the paper's networks, or a faster hash table
+    appearance_code: Code = 8  # numbers of a photograph's appearance, section 3.1; 0: all have the same
+    hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
+    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first, section 4; higher: faster, may diverge
+    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
+    deformation_rate: PositiveShare = 1.0  # share of the learning rate that the deformation and its codes learn at
+    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+class Nerfies(FieldMethod):
+    """A canonical scene, and a field of motions from each moment to it."""
+
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    network: WarpedField
+    background_points: Tensor
+    grows = ("background_points",)
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        d, space = c.deformation, space_of(frame)
+        shape, ambient = (d.deformation_depth, d.deformation_width, d.deformation_skip), d.slice_dimensions
+        first = None
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            if c.field == "hash":
+                canonical: Any = SlicedHash(
+                    c.table, c.hidden_width, space, frame.reach, c.appearance_code, ambient=ambient
+                )
+                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
+            else:
+                build = partial(SlicedNetwork, c.network, c.hidden_width, space, code=c.appearance_code)
+                canonical, first = (build(ambient=ambient, activation=softplus, keep_input=True) for _ in range(2))
+                self.sampler = HierarchicalSampler(space, c.rays)
+                self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
+            self.moment_codes = MomentCodes(frame, d.moment_code)
+            bands = d.deformation_frequencies, d.moment_code
+            motion = None if d.motion == "none" else MotionField(space, d.motion, *bands, shape, d.annealing)
+            narrow = d.deformation_depth, d.slice_width, d.deformation_skip
+            slices = SliceField(space, *bands, narrow, ambient) if ambient else None
+        self.network = WarpedField(canonical, motion, slices, c.appearance_code, first)
+        self.appearance = AppearanceCodes(frame.image_count, c.appearance_code) if c.appearance_code else None
+        self.register_buffer("background_points", torch.zeros(0, 3))
+        self.elastic = 0.0  # weight of the elastic loss now
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """A hash table as canonical scene, and a narrower deformation."""
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
+        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
+        d = replace(d, elastic_samples=512, background_points=1024, elastic_until=0.5)
+        return replace(c, deformation=d, final_learning_rate=1e-3, decay_start=0.3, deformation_rate=0.1)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A tiny table under a tiny deformation with a slice, within some twenty quick steps."""
+        c = Config(**TINY_HASH, field="hash", hidden_width=16, appearance_code=2, learning_rate=2e-2)
+        d = replace(c.deformation, deformation_depth=2, deformation_width=16, deformation_skip=1, moment_code=2)
+        d = replace(d, deformation_frequencies=4, elastic_samples=64, background_points=64)
+        d = replace(d, slice_dimensions=1, slice_width=16)
+        return replace(c, deformation=d, final_learning_rate=1e-3, deformation_rate=0.1)
+
+    # Codes
+
+    def code(self, rays: Rays) -> Float[Tensor, "#ray code"]:
+        """Appearance, and the code of each ray's moment."""
+        moments = self.moment_codes(self.moments(rays))
+        if self.appearance is None:
+            return moments
+        if self.training and rays.image_index is not None:
+            return torch.cat([self.appearance(rays.image_index), moments], 1)
+        return torch.cat([self.appearance.shown(self).expand(len(moments), -1), moments], 1)
+
+    @property
+    def shown_code(self) -> Float[Tensor, "1 code"]:
+        first, _ = self.frame.times or (0.0, 0.0)
+        return self.code_at(float(self.settings.get("time", first)))
+
+    def code_at(self, time: float) -> Float[Tensor, "1 code"]:
+        """The appearance of the settings, and the code of a moment."""
+        moments = self.moment_codes(torch.full((1,), time, device=self.device))
+        shown = [] if self.appearance is None else [self.appearance.shown(self)[None]]
+        return torch.cat([*shown, moments], 1)
+
+    def density(self, points: Points) -> Densities:
+        return self.network.density(points, self.shown_code.expand(len(points), -1))
+
+    def density_in_training(self, generator: torch.Generator) -> Density:
+        """Density of each point at a random moment."""
+        first, last = self.frame.times or (0.0, 0.0)
+
+        def density(points: Points) -> Densities:
+            times = first + (last - first) * torch.rand(len(points), generator=generator).to(self.device)
+            return self.network.density(points, pad(self.moment_codes(times), (self.network.appearance, 0)))
+
+        return density
+
+    # Learning
+
+    def begin(self, data: Scene, seconds: float = float("inf")) -> None:
+        if data.points is not None:
+            self.background_points = data.points.to(self.device)
+        super().begin(data, seconds)
+
+    def before_step(self, step: int, progress: float) -> None:
+        """The elastic weight is constant, then falls by half a cosine over twice that time (the authors' release)."""
+        d = self.config.deformation
+        fallen = min(max(progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
+        self.elastic = d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
+        super().before_step(step, progress)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The squared error of each pass, elastic loss (eq. 10) and background loss (eq. 12)."""
+        generator = self.random(step)
+        passes, terms = self.learn(batch.rays, generator)
+        background, code = backdrop(batch, self.background, generator, self.sampler.is_open), self.code(batch.rays)
+        target = batch.before(background)
+        for each in passes:
+            look = each.look(self.network, code)
+            error = (composite(look.samples, look.density, look.rgb, background).rgb - target).square().mean()
+            self.figures["mse"] = float(error.detach())  # of the last pass in the end
+            terms[each.name] = error
+        motion = self.network.motion
+        if motion is not None and self.elastic:
+            terms["elastic"] = self.elastic * self.stretching(motion, batch.rays, passes[-1], code, generator)
+        if motion is not None and len(self.background_points) and self.config.deformation.background_weight:
+            terms["background"] = self.config.deformation.background_weight * self.restlessness(motion, generator)
+        return terms
+
+    def stretching(
+        self, motion: MotionField, rays: Rays, seen: Pass, code: Float[Tensor, "ray code"], generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """The elastic loss along rays, weighted by the rendering weights: at samples that are drawn by them."""
+        d = self.config.deformation
+        weights = weights_of(seen.samples, seen.density).detach()
+        total = float(weights.sum())
+        if not total:
+            return weights.sum()
+        drawn = torch.multinomial(weights.cpu(), d.elastic_samples, True, generator=generator).to(weights.device)
+        ray = seen.samples.ray_index[drawn]
+        points = rays.origins[ray] + seen.samples.t[drawn, None] * rays.directions[ray]
+        jacobian = motion.jacobian(points, code[ray, self.network.appearance :])
+        return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
+
+    def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
+        """How far points of the background move at random moments, by a robust loss."""
+        count, known = self.config.deformation.background_points, self.background_points
+        points = known[torch.randint(len(known), (count,), generator=generator).to(self.device)]
+        first, last = self.frame.times or (0.0, 0.0)
+        times = first + (last - first) * torch.rand(count, generator=generator).to(self.device)
+        away = motion(points, self.moment_codes(times)) - points
+        return geman_mcclure(away.square().sum(-1), BACKGROUND_SCALE).mean()
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        c, canonical = self.config, self.network.canonical
+        moving = [part for part in (self.network.motion, self.network.ambient) if part is not None]
+        deformation = {"params": [p for part in moving for p in part.parameters()], "scale": c.deformation_rate}
+        codes = {"params": [self.moment_codes.codes], "scale": c.deformation_rate}
+        groups = [group for group in (deformation, codes) if group["params"]]
+        if self.appearance is not None:
+            groups.append({"params": [self.appearance.codes], "scale": CODES_RATE if c.field == "hash" else 1.0})
+        if isinstance(canonical, SlicedHash):
+            own = canonical.optimizers_at(c.learning_rate)
+        else:
+            both = [canonical, self.network.first] if self.network.first is not None else [canonical]
+            own = [torch.optim.Adam([p for each in both for p in each.parameters()], c.learning_rate)]
+        return [*own, torch.optim.Adam(groups, c.learning_rate), *super().optimizers()]
+
+    # Motion
+
+    @torch.no_grad()
+    def follow(self, points: Points, start: float, end: float) -> Points:
+        """Positions at one moment of surface points of another: those with the same canonical position."""
+        motion = self.network.motion
+        if motion is None:
+            return points
+        before, after = (self.moment_codes(points.new_full((len(points),), t)) for t in (start, end))
+        return motion.inverse(motion(points, before), after, points)

@@ -1,0 +1,199 @@
+"""Deformation of a scene: a code for each moment, and fields of screw motions and of slices under it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.functional import embedding
+
+from ...components.fields.coordinate_network import SkipNetwork
+from ...components.fields.encodings import FrequencyEncoding
+from ...components.fields.layers import Dense, in_chunks
+from ...components.sampling.spaces import Space
+from ...datasets.scene import Frame, Scene
+from ...method import Part
+from ...method.controls import Control, moment
+
+SMALL_ANGLE = 1e-2  # radians, below which a motion's coefficients are their series; exact to 1e-9
+FIRST_MOTION = 1e-4  # largest weight of the last layer at first: the scene begins as it is (Park 2021, supplement)
+FIRST_CODE = 0.05  # largest number of a code at first
+
+Motion = Literal["se3", "translation", "none"]
+
+
+class MomentCodes(Part):
+    """A code for each moment of training, which photographs of one moment share; interpolated in between.
+
+    moments: ascending, infinite in rows without a moment
+    """
+
+    moments: Tensor
+
+    def __init__(self, frame: Frame, width: int):
+        super().__init__()
+        self.times = frame.times
+        rows = max(frame.image_count, 2)
+        self.register_buffer("moments", torch.linspace(*(frame.times or (0.0, 1.0)), rows))
+        self.codes = nn.Parameter(FIRST_CODE * torch.rand(rows, width))
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        if data.cameras.time is not None:
+            found = data.cameras.time[data.splits["train"]].unique()
+            self.moments.fill_(math.inf)
+            self.moments[: len(found)] = found
+
+    def forward(self, times: Float[Tensor, " ray"]) -> Float[Tensor, "ray width"]:
+        after = torch.searchsorted(self.moments, times.contiguous()).clamp(1, len(self.moments) - 1)
+        a, b = self.moments[after - 1], self.moments[after]
+        share = ((times - a) / (b - a)).clamp(0, 1)[:, None]
+        return (1 - share) * embedding(after - 1, self.codes) + share * embedding(after, self.codes)
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return (moment(self.times),) if self.times else ()
+
+
+def window(bands: int, alpha: Tensor) -> Float[Tensor, " band"]:
+    """Weights of an encoding's bands, the first alpha of which are there (Park 2021, eq. 8)."""
+    j = torch.arange(bands, device=alpha.device)
+    return (1 - torch.cos(math.pi * (alpha - j).clamp(0, 1))) / 2
+
+
+class DeformationNetwork(SkipNetwork):
+    """Numbers at a point and a code: hidden layers over the encoded point beside the code, and a last one that begins
+    close to zero."""
+
+    def __init__(self, bands: int, code: int, depth: int, width: int, skip_layer: int, outputs: int):
+        encoding = FrequencyEncoding(3, bands)
+        super().__init__(encoding.width + code, depth, width, skip_layer, Dense)
+        self.encoding, self.last = encoding, Dense(width, outputs, exact=True)
+        nn.init.uniform_(self.last.weight, -FIRST_MOTION, FIRST_MOTION)
+
+    def forward(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"], weights: Float[Tensor, " band"]
+    ) -> Float[Tensor, "point output"]:
+        def answer(points: Tensor, code: Tensor) -> tuple[Tensor]:
+            return (self.last(self.trunk(torch.cat([self.encoding(points, weights), code], -1), self.last)),)
+
+        return in_chunks(answer, points, code)[0]
+
+    def differentiable(self, points: Tensor, code: Tensor, weights: Tensor) -> Tensor:
+        """The same in plain PyTorch and float32, whose derivatives in points can be differentiated again."""
+        first = torch.cat([self.encoding(points, weights), code], -1)
+        x = self._plain(self.before, first)
+        x = self._plain(self.after, torch.cat([first, x], -1))
+        return F.linear(x, self.last.weight, self.last.bias)
+
+    @staticmethod
+    def _plain(layers: nn.Sequential, x: Tensor) -> Tensor:
+        for layer in layers:
+            x = F.linear(x, layer.weight, layer.bias).relu()  # type: ignore[arg-type]
+        return x
+
+
+class MotionField(Part):
+    """Canonical positions of points at a moment: a screw motion of each (Park 2021, eqs. 4 to 7), or a translation.
+
+    bands:  m, of the encoding, which join from coarse to fine over a share `annealing` of the budget (section 3.5)
+    alpha:  of them that are there
+    """
+
+    alpha: Tensor
+
+    def __init__(
+        self, space: Space, motion: Motion, bands: int, code: int, shape: tuple[int, int, int], annealing: float
+    ):
+        super().__init__()
+        self.space, self.bands, self.annealing = space, bands, annealing
+        self.network = DeformationNetwork(bands, code, *shape, 6 if motion == "se3" else 3)
+        self.register_buffer("alpha", torch.tensor(0.0))
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        self.alpha.fill_(self.bands * min(progress / self.annealing, 1.0) if self.annealing else self.bands)
+
+    def forward(self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"]) -> Float[Tensor, "point 3"]:
+        return moved(points, self.network(self.space.warp(points), code, window(self.bands, self.alpha)))
+
+    def jacobian(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"]
+    ) -> Float[Tensor, "point 3 3"]:
+        """Derivatives of canonical positions, [i, j] of coordinate i along axis j; differentiable in the network."""
+        weights = window(self.bands, self.alpha)
+
+        def warped(x: Tensor) -> Tensor:
+            return moved(x, self.network.differentiable(self.space.warp(x), code, weights))
+
+        axes = torch.eye(3, device=points.device)
+        return torch.stack([torch.func.jvp(warped, (points,), (a.expand_as(points),))[1] for a in axes], -1)
+
+    def inverse(
+        self, canonical: Float[Tensor, "point 3"], code: Float[Tensor, "point code"], start: Tensor, steps: int = 20
+    ) -> Float[Tensor, "point 3"]:
+        """Points that lie at canonical positions, by fixed-point iteration from a start: each step undoes the motion of
+        the last result, which is exact where neighbours move alike."""
+        x = start
+        for _ in range(steps):
+            x = unmoved(canonical, self.network(self.space.warp(x), code, window(self.bands, self.alpha)))
+        return x
+
+
+class SliceField(Part):
+    """Ambient coordinates of points at a moment: the slice of a space of more dimensions that the scene is then (Park
+    2021b, HyperNeRF, section 4.2), for what changes its topology."""
+
+    def __init__(self, space: Space, bands: int, code: int, shape: tuple[int, int, int], dimensions: int):
+        super().__init__()
+        self.space = space
+        self.network = DeformationNetwork(bands, code, *shape, dimensions)
+        self.register_buffer("weights", torch.ones(bands), persistent=False)
+
+    def forward(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"]
+    ) -> Float[Tensor, "point ambient"]:
+        return self.network(self.space.warp(points), code, self.weights)
+
+
+def moved(points: Float[Tensor, "point 3"], motion: Float[Tensor, "point number"]) -> Float[Tensor, "point 3"]:
+    """Points after motions: translations v, or screw motions (r, v) as the exponential map has them.
+
+    x' = R x + G v      R = 1 + a [r] + b [r]^2      G = 1 + b [r] + c [r]^2
+    a = sin t / t      b = (1 - cos t) / t^2      c = (t - sin t) / t^3      t = |r|
+    """
+    if motion.shape[1] == 3:
+        return points + motion
+    r, v = motion.split(3, 1)
+    a, b, c = coefficients(r)
+    return combined(points, r, a, b) + combined(v, r, b, c)
+
+
+def unmoved(points: Float[Tensor, "point 3"], motion: Float[Tensor, "point number"]) -> Float[Tensor, "point 3"]:
+    """The inverse of `moved` under the same motions."""
+    if motion.shape[1] == 3:
+        return points - motion
+    r, v = motion.split(3, 1)
+    a, b, c = coefficients(r)
+    return combined(points - combined(v, r, b, c), -r, a, b)
+
+
+def combined(
+    x: Float[Tensor, "point 3"], r: Float[Tensor, "point 3"], first: Tensor, second: Tensor
+) -> Float[Tensor, "point 3"]:
+    """(1 + first [r] + second [r]^2) x."""
+    once = torch.linalg.cross(r, x)
+    return x + first * once + second * torch.linalg.cross(r, once)
+
+
+def coefficients(r: Float[Tensor, "point 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """a, b, c of `moved`, with finite gradients at r = 0."""
+    square = r.square().sum(-1, keepdim=True)
+    small = square < SMALL_ANGLE**2
+    t = torch.where(small, torch.ones_like(square), square).sqrt()
+    a = torch.where(small, 1 - square / 6, t.sin() / t)
+    b = torch.where(small, 0.5 - square / 24, (1 - t.cos()) / t**2)
+    c = torch.where(small, 1 / 6 - square / 120, (t - t.sin()) / t**3)
+    return a, b, c

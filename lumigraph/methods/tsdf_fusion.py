@@ -1,0 +1,163 @@
+"""TSDF fusion in hashed blocks of voxels (Nießner et al. 2013; Curless and Levoy 1996): depth maps become a surface."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..camera.rays import Rays, Rendering
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Frame, Photograph, Scene
+from ..depth_maps import DepthMap, VoxelBlocks, render_depth_maps, sensor_faults, trust_of
+from ..depth_maps.voxel_blocks import BYTES_PER_BLOCK
+from ..errors import LumigraphError, LumigraphWarning
+from ..files.ranges import Count, NonNegative, Pixels, Positive, Seed, between
+from ..method import Descend, RayMethod
+from ..system.memory import free_memory
+
+Length = Annotated[float, between(0, 1e6)]  # of the capture's frame
+AUTOMATIC_CELLS = 256  # voxels along the longest side of the box of interest, where no size is given
+MEMORY_SHARE = 0.5  # of the free memory that blocks may fill: growing copies them once
+PRUNE_EVERY = 32  # depth maps between two searches for blocks that show no surface
+
+
+@dataclass(frozen=True)
+class Config:
+    """Numbers of the released program for the Kinect (its parameter file; voxels of 4 mm are those of sec. 6)."""
+
+    voxel_size: Length = 0.004  # edge of a voxel, in units of the capture (metres); 0: a 256th of the box of interest
+    truncation: Annotated[float, between(2, 64)] = 5.0  # voxels before and behind a surface; more bears more noise
+    max_weight: Positive = 255.0  # of a voxel's mean; less follows changes sooner
+    max_depth: Length = 4.0  # in units of the capture, beyond which depth is left out; 0: none
+    trusted_depth: Length = 0.0  # in units of the capture, up to which depth counts in full; 0: everywhere
+    min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
+    teacher_views: Count = 100  # depth maps of a method that is converted, at most
+    teacher_size: Pixels = 640  # longer side of those
+    seed: Seed = 0
+
+
+class TSDFFusion(RayMethod):
+    """A truncated signed distance with colours, averaged over the depth maps of a capture one after another."""
+
+    Config = Config
+    any_lens: ClassVar[bool] = True
+    taught_steps: ClassVar[int | None] = 1
+    fused: Tensor  # depth maps so far
+    count: Tensor  # of depth maps in all; 0 before any are known
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        self.unit = 1 / frame.to_source.scale  # scene units to one of the capture
+        longest = max(high - low for low, high in zip(*frame.bounds, strict=True))
+        edge = c.voxel_size * self.unit or longest / AUTOMATIC_CELLS
+        if not longest / (1 << 16) < edge < longest:
+            raise LumigraphError(
+                f"voxels of {c.voxel_size:g} do not fit a box of interest of {longest / self.unit:.3g} units of the "
+                "capture; give --voxel-size in its unit, or 0 for a 256th of the box"
+            )
+        most = int(MEMORY_SHARE * free_memory() / BYTES_PER_BLOCK)
+        self.volume = VoxelBlocks(edge, c.truncation, c.max_weight, max(most, 1))
+        self.register_buffer("fused", torch.tensor(0))
+        self.register_buffer("count", torch.tensor(-1))
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """Voxels of a centimetre; depth beyond 3 m counts by its inverse variance."""
+        return Config(voxel_size=0.01, truncation=4.0, max_depth=0.0, trusted_depth=3.0)
+
+    @classmethod
+    def taught_preset(cls, device: torch.device) -> Any:
+        """Voxels by the box of interest: the unit of photographs is arbitrary."""
+        return Config(voxel_size=0.0, truncation=4.0, max_depth=0.0)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some thousand voxels."""
+        return Config(voxel_size=0.08, truncation=3.0, max_depth=0.0)
+
+    # Learning
+
+    @property
+    def complete(self) -> bool:
+        """True after the last depth map."""
+        return int(self.fused) == int(self.count)
+
+    def steps_per_pass(self, data: Any) -> float:
+        return len(data.splits["train"])
+
+    def steps_for(self, quality: Any, data: Any) -> int:
+        """Each depth map once."""
+        return len(data.splits["train"])
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        super().begin(data, seconds)
+        for sentence in sensor_faults(data):
+            warnings.warn(sentence, LumigraphWarning, stacklevel=2)
+        self.count.fill_(len(data.splits["train"]))
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
+        """The next photograph with its depth, in the order of their names."""
+        train = data.splits["train"]
+        return data.photograph(int(train[min(int(self.fused), len(train) - 1)]), ("depth",))
+
+    @torch.no_grad()
+    def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
+        """Fuse one depth map."""
+        self._fuse(
+            DepthMap.measured(batch.camera, batch.extra["depth"], batch.before(self.frame.background)), batch.mask
+        )
+        return {}
+
+    def _fuse(self, seen: DepthMap, mask: Tensor | None = None) -> None:
+        c = self.config
+        trust = trust_of(seen, c.trusted_depth * self.unit, (c.max_depth or math.inf) * self.unit)
+        if mask is not None:
+            trust = trust * mask.to(trust)
+        if not self.volume.fuse(seen, trust):
+            warnings.warn(
+                f"Memory holds no more than {len(self.volume)} blocks, so new surfaces are left out; give a larger "
+                "--voxel-size",
+                LumigraphWarning,
+                stacklevel=2,
+            )
+        self.fused += 1
+        if int(self.fused) % PRUNE_EVERY == 0:
+            self.volume.prune()
+        self.figures = {"blocks": len(self.volume), "megabytes": self.volume.bytes / 1e6}
+
+    @torch.no_grad()
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Fuse the depth that a teacher renders."""
+        c = self.config
+        views, size = c.teacher_views, c.teacher_size
+        for seen in render_depth_maps(teacher.render, cameras, self.frame.background, views, size):
+            self._fuse(seen)
+        self.count.copy_(self.fused)
+
+    # Rendering
+
+    @torch.no_grad()
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        """The first surface along each ray, opaque."""
+        depth, normals, rgb = self.volume.cast(rays)
+        hit = depth.isfinite()
+        rgb = torch.where(hit[:, None], rgb, background)
+        return Rendering(rgb, depth, hit.float(), {"normals": normals * hit[:, None]})
+
+    @torch.no_grad()
+    def mesh(self) -> Mesh:
+        """The zero level with its colours. Raises LumigraphError where there is none."""
+        vertices, rgb, faces = (x.cpu() for x in self.volume.surface(self.config.min_weight))
+        if not len(faces):
+            raise LumigraphError("No surface was fused, so there is no mesh; look at the capture's depth and its unit")
+        colours = (rgb.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        return Mesh(vertices.numpy().astype(np.float64), faces.numpy(), colours)
