@@ -136,7 +136,7 @@ def test_a_run_that_was_stopped_ends_with_the_same_trajectory(room):
 
 def test_a_lost_frame_is_told_and_left_out(room, capsys):
     """A frame that the map explains nothing of keeps the last known pose, and has none in the file."""
-    from lumigraph.commands.track import show_tracking
+    from lumigraph.commands.outcome import show_tracking
     from lumigraph.training.loop import Outcome
 
     run = Run(room / "straight")

@@ -76,7 +76,7 @@ def unposed(capture: Capture, options: Unposed) -> Capture:
 
 
 def first_depth(shot: Shot) -> Float[np.ndarray, " pixel"]:
-    """What a shot's depth measured, in the source's unit."""
+    """Measured depth of a shot, in the source's unit."""
     plane = settled(shot.planes["depth"], "depth")
     assert plane.encoding in DEPTH_KINDS and shot.size is not None and plane.dtype is not None
     stored = read_plane(plane, "depth", plane.dtype, shot.size, np.eye(3))

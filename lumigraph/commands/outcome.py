@@ -19,6 +19,7 @@ SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # 
 FULL_SIZE_SHARE = 0.45  # share of training below which a trend spans less than its second half
 MIN_GROWTH = 2.5  # times the budget so far that a suggestion has at least
 MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
+MAX_LOST_NAMES = 5  # of lost frames that are named
 WORST_VIEWS = 2  # held-out views that are named
 OTHER_METHODS = "instant-ngp", "gaussian-splatting"  # of which the other is suggested for comparison
 ABOUT_RESIDUALS = "small renderings, each after a gain and an offset per colour"
@@ -31,7 +32,6 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     from ..evaluation.tracking import tracks
     from ..metrics.rows import last_psnr
     from ..training.verdict import cameras_moved, loss_trend
-    from .track import show_tracking
 
     if tracks(method):
         return show_tracking(run, outcome, method, data)
@@ -67,6 +67,35 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     if enough and gap > MEMORISED_DB:
         rows["advice"] = memorised(gap, run, method, [one.photograph for one in checked.of("test")])
     show(rows | finding_rows(checked.findings, str(run.folder / RESULT_FILE)) | next_commands(run))
+
+
+def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
+    """Write the trajectory of a run and print its errors, lost frames and next commands."""
+    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, write_tracking
+
+    state, sequence = outcome.state, method.sequence(data)
+    followed = min(state.step, len(sequence))
+    speed = followed / max(state.seconds, 1e-9)
+    figures = {"frames_per_second": speed}
+    rows = {"run": str(run.folder), "tracking": f"{followed} frames in {state.seconds:.1f} s, {speed:.2f} frames/s"}
+    if processor_seconds is not None and followed:
+        figures["processor_seconds_per_frame"] = processor_seconds / followed
+        rows["tracking"] += f", {processor_seconds / followed:.2f} processor seconds a frame"
+    found = write_tracking(run, method, data, figures)
+    if not outcome.finished:
+        say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
+    rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
+    if found.lost:
+        names = ", ".join(data.names[i] for i in found.lost[:MAX_LOST_NAMES])
+        more = f" and {len(found.lost) - MAX_LOST_NAMES} more" if len(found.lost) > MAX_LOST_NAMES else ""
+        rows["lost"] = (
+            f"tracking failed at {names}{more}; these frames have no pose in {TRAJECTORY_FILE}, and the map holds "
+            "nothing of them; the map and all other poses are kept"
+        )
+    if (errors := found.errors) is not None:
+        rows |= {score.name: str(score) for score in errors.scores}
+        rows["drift"] = f"{run.folder / DRIFT_FILE}, {100 * errors.largest:.2f} cm at most in {errors.path:.2f} m"
+    show(rows | (next_commands(run) if outcome.finished else {}))
 
 
 def examined(run: Any, method: Method, data: Any) -> Examined:

@@ -14,11 +14,10 @@ from .. import methods
 from ..budget import Budget
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Port, Positive, Steps
-from .common import choose_device, exit_code, method_config, next_free, say, scene_name, show, typed
+from .common import choose_device, exit_code, method_config, next_free, scene_name
 from .options import DeviceOption, ReaderOption, SeedOption, needed, option
 
 TRACKED_SIDE = 320  # pixels along the longer side of a frame, about, where the user says nothing
-MAX_LOST_NAMES = 5  # of lost frames that are told
 
 
 @dataclass(frozen=True)
@@ -63,6 +62,7 @@ class Track:
         from ..capture import confirm, open_scene
         from ..run import Run, build, check_new
         from ..training import fit
+        from .outcome import show_tracking
         from .view import keep_showing, watching
 
         kind, device = methods.find(self.method), choose_device(self.device)
@@ -99,33 +99,3 @@ def tracked_downscale(recording: str, reader: str | None) -> int:
 
     sizes = [max(shot.size) for shot in read_capture(recording, reader).shots[:1] if shot.size]
     return max(1, round(max(sizes, default=TRACKED_SIDE) / TRACKED_SIDE))
-
-
-def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
-    """Write the trajectory of a run and print its errors, lost frames and next commands."""
-    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, write_tracking
-    from .outcome import next_commands
-
-    state, sequence = outcome.state, method.sequence(data)
-    followed = min(state.step, len(sequence))
-    speed = followed / max(state.seconds, 1e-9)
-    figures = {"frames_per_second": speed}
-    rows = {"run": str(run.folder), "tracking": f"{followed} frames in {state.seconds:.1f} s, {speed:.2f} frames/s"}
-    if processor_seconds is not None and followed:
-        figures["processor_seconds_per_frame"] = processor_seconds / followed
-        rows["tracking"] += f", {processor_seconds / followed:.2f} processor seconds a frame"
-    found = write_tracking(run, method, data, figures)
-    if not outcome.finished:
-        say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
-    rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
-    if found.lost:
-        names = ", ".join(data.names[i] for i in found.lost[:MAX_LOST_NAMES])
-        more = f" and {len(found.lost) - MAX_LOST_NAMES} more" if len(found.lost) > MAX_LOST_NAMES else ""
-        rows["lost"] = (
-            f"tracking failed at {names}{more}; these frames have no pose in {TRAJECTORY_FILE}, and the map holds "
-            "nothing of them; the map and all other poses are kept"
-        )
-    if (errors := found.errors) is not None:
-        rows |= {score.name: str(score) for score in errors.scores}
-        rows["drift"] = f"{run.folder / DRIFT_FILE}, {100 * errors.largest:.2f} cm at most in {errors.path:.2f} m"
-    show(rows | (next_commands(run) if outcome.finished else {}))

@@ -18,7 +18,6 @@ from ...camera.rays import Rays
 from ...color.blending import before
 from ...components.fields.hash_field import TINY_TABLE, HashNumbers
 from ...components.sampling.spaces import Box
-from ...components.tracking.alignment import aligned
 from ...components.tracking.frames import DepthFrame, Moment, order_of
 from ...components.tracking.trajectory import KNOWN, Pose, Trajectory, moved, relative
 from ...components.training.pose_refinement import PoseAdam
@@ -28,8 +27,9 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed
 from ...method import FieldMethod, Pass
 from ...method.method import Descend
 from ...volume import composite
+from .alignment import aligned
 from .fields import DistanceTable, MapNetwork
-from .sampler import MapSampler, RayNumbers
+from .sampler import MapSampler, SampleNumbers
 
 Iterations = Annotated[int, between(0, 10_000)]
 FREQUENCY_ROWS = 93  # of B, section 3.1
@@ -91,7 +91,7 @@ class Config:
     """The paper's numbers, by section; those without one are not in the paper."""
 
     table: HashNumbers = HashNumbers(sh_bands=1)
-    rays: RayNumbers = RayNumbers()
+    rays: SampleNumbers = SampleNumbers()
     tracking: TrackingNumbers = TrackingNumbers()
     mapping: MappingNumbers = MappingNumbers()
     terms: LossNumbers = LossNumbers()
@@ -150,7 +150,7 @@ class IMap(FieldMethod):
         tracking = TrackingNumbers(first_estimate="surface", tracking_iterations=0)
         mapping = MappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
         mapping = replace(mapping, keyframe_pose_rate=2e-4)
-        c = Config(table, RayNumbers(16, 10), tracking, mapping, LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3), "hash")
+        c = Config(table, SampleNumbers(16, 10), tracking, mapping, LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3), "hash")
         return replace(c, hidden_width=32, learning_rate=1e-2)
 
     @classmethod
@@ -158,7 +158,7 @@ class IMap(FieldMethod):
         """A tiny hash table and few descents a frame."""
         mapping = MappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
         terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-4)
-        c = Config(replace(TINY_TABLE, sh_bands=1), RayNumbers(12, 8), TrackingNumbers(), mapping, terms, "hash")
+        c = Config(replace(TINY_TABLE, sh_bands=1), SampleNumbers(12, 8), TrackingNumbers(), mapping, terms, "hash")
         return replace(c, hidden_width=16, truncation=0.2, sharpness=4.0, learning_rate=2e-2)
 
     # The sequence
@@ -182,7 +182,7 @@ class IMap(FieldMethod):
                 f"{data.source} has no depth, which tracking needs; train with the poses of its photographs"
             )
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Moment:
+    def batch(self, data: Scene, generator: torch.Generator) -> Moment:  # type: ignore[override]
         """The frame that is next, and the scene."""
         sequence, turn = self.sequence(data), int(self.turn)
         return Moment(data, self._frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
@@ -424,6 +424,7 @@ class IMap(FieldMethod):
         """The distance near what was measured, free space before it (Wang 2023, eqs. 8 and 9), smoothness (eq. 10)."""
         c, ray = self.config.terms, seen.samples.ray_index
         ahead = (depth[ray] - seen.samples.t) / field.truncation  # truncations to the surface; NaN where unknown
+        assert isinstance(seen.features, Tensor)
         distance = field.distance_of(seen.features)
         near, free = ahead.abs() < 1, ahead >= 1
         error = torch.where(near, distance - ahead.nan_to_num(0, 0, 0), 0.0).square().sum() / near.sum().clamp_min(1)

@@ -23,7 +23,7 @@ MIN_INTERVAL = 1e-3  # scene units of a ray that misses the box
 
 
 @dataclass(frozen=True)
-class RayNumbers:
+class SampleNumbers:
     """A Config's numbers of samples along a ray (Sucar 2021, section 3.2)."""
 
     coarse_samples: RaySamples = 32  # N_c, stratified samples of a ray; more find thinner things, slower
@@ -39,7 +39,7 @@ class MapSampler(Sampler):
 
     rays_per_chunk = 4096
 
-    def __init__(self, space: Box, numbers: RayNumbers, band: float | None):
+    def __init__(self, space: Box, numbers: SampleNumbers, band: float | None):
         super().__init__()
         self.space, self.numbers, self.band = space, numbers, band
         self.batch_size, self.expected_rays, self.unguided_samples = 1, 1.0, numbers.coarse_samples
@@ -71,26 +71,21 @@ class MapSampler(Sampler):
     ) -> Samples:
         n, device = self.numbers, rays.origins.device
         near, far = self.space.interval(rays)
-        far = torch.maximum(far, near + MIN_INTERVAL)
-        ends = far
-        guided = self.band is not None and depth is not None
-        if guided:
-            assert depth is not None and self.band is not None
-            known = depth.isfinite()
-            ends = torch.where(known, torch.minimum(depth + self.band, far), far)
-            ends = torch.maximum(ends, near + MIN_INTERVAL)
-        count = n.coarse_samples if guided else self.unguided_samples
-        shares = stratified(len(rays), count, generator, device)
-        coarse = torch.lerp(near[:, None], ends[:, None], shares)
+        ends = torch.maximum(far, near + MIN_INTERVAL)
         again = stratified(len(rays), n.fine_samples, generator, device)
-        if guided:
-            middle = torch.where(known, depth, 0.5 * (near + ends))
-            half = torch.where(known, self.band, 0.5 * (ends - near))
-            fine = middle[:, None] + half[:, None] * (2 * again - 1)
-        else:
+        if self.band is None or depth is None:
+            coarse = self._evenly(near, ends, self.unguided_samples, generator)
             first = Samples.rows(coarse, ends)
-            density = field.density(first.along(rays)[0])
-            weights = weights_of(first, density).view(len(rays), -1)
+            weights = weights_of(first, field.density(first.along(rays)[0])).view(len(rays), -1)
             fine = inverse_transform(midpoints(coarse), weights[:, 1:-1], again)
+        else:
+            known = depth.isfinite()
+            ends = torch.where(known, (depth + self.band).minimum(ends).maximum(near + MIN_INTERVAL), ends)
+            coarse = self._evenly(near, ends, n.coarse_samples, generator)
+            start, last = (torch.where(known, depth + x, y) for x, y in ((-self.band, near), (self.band, ends)))
+            fine = torch.lerp(start[:, None], last[:, None], again)
         t = torch.cat([coarse, fine], -1).maximum(near[:, None]).minimum(ends[:, None]).sort(-1).values
         return Samples.rows(t, ends)
+
+    def _evenly(self, near: Tensor, ends: Tensor, count: int, generator: torch.Generator | None) -> Tensor:
+        return torch.lerp(near[:, None], ends[:, None], stratified(len(near), count, generator, near.device))

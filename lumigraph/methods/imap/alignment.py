@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .trajectory import Pose, moved
+from ...components.tracking.trajectory import Pose, moved
 
 HUBER = 1.5  # deviations from which on a residual counts by its size, not its square
 DAMPING = 1e-4  # of the normal matrix's diagonal
