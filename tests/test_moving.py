@@ -123,6 +123,7 @@ def test_held_out_views_are_of_new_cameras_new_moments_or_both():
 
 def test_evaluation_names_what_was_held_out_and_what_moves():
     scene = open_scene("procedural:jelly,size=24,views=9")
+    assert not scene.frame.is_open
     found = evaluate(tiny.method(scene.frame), scene)
     said = found.to_json()
     kinds = said["by_held_out"]
