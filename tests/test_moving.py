@@ -92,9 +92,9 @@ def test_cameras_stay_outside_and_motion_inside_the_bounds(stage):
 
 
 def test_every_moment_is_seen_by_a_held_out_camera():
-    mono, rig = (scenes.stage("jelly", size=16, views=12, rig=rig).cameras for rig in (0, 4))
-    assert len(mono["train"]) == len(rig["train"]) == 12 and len(mono["train"].time.unique()) == 12
-    assert len(rig["train"].time.unique()) == 3 and len(rig["train"].pose.flatten(1).unique(dim=0)) == 4
+    mono, rig = (scenes.stage("jelly", size=16, views=24, rig=rig).cameras for rig in (0, 4))
+    assert len(mono["train"]) == len(rig["train"]) == 24 and len(mono["train"].time.unique()) == 24
+    assert len(rig["train"].time.unique()) == 6 and len(rig["train"].pose.flatten(1).unique(dim=0)) == 4
     for cameras in (mono, rig):
         assert set(cameras["train"].time.tolist()) < set(cameras["test"].time.tolist())
         assert not (cameras["test"].pose[:, None] == cameras["train"].pose).flatten(2).all(-1).any()
@@ -124,7 +124,8 @@ def test_held_out_views_are_of_new_cameras_new_moments_or_both():
 def test_evaluation_names_what_was_held_out_and_what_moves():
     scene = open_scene("procedural:jelly,size=24,views=9")
     assert not scene.frame.is_open
-    found = evaluate(tiny.method(scene.frame), scene)
+    method = tiny.method(scene.frame)
+    found = evaluate(method, scene)
     said = found.to_json()
     kinds = said["by_held_out"]
     assert set(kinds) == {"new cameras", "new cameras and moments"}
@@ -134,9 +135,8 @@ def test_evaluation_names_what_was_held_out_and_what_moves():
     shot = scene.photograph(index, ["moving"])
     moving = shot.extra["moving"] == 1
     assert 0.02 < moving.float().mean() < 0.5
-    rgb, truth = tiny.method(scene.frame).render(shot.camera).rgb, shot.before(scene.frame.background)
+    rgb, truth = method.render(shot.camera).rgb, shot.before(scene.frame.background)
     assert found.views[0].moving_psnr == pytest.approx(psnr(rgb.clamp(0, 1)[moving], truth[moving]))
-    assert found.views[0].moving_psnr < found.views[0].psnr
 
 
 def test_captures_of_what_moves_have_their_moments(tmp_path):
