@@ -213,7 +213,7 @@ class Nerfies(FieldMethod):
         return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
-        """How far points of the background move at random moments, by a robust loss."""
+        """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""
         count, known = self.config.deformation.background_points, self.background_points
         points = known[torch.randint(len(known), (count,), generator=generator).to(self.device)]
         first, last = self.frame.times or (0.0, 0.0)
