@@ -13,6 +13,8 @@ from captures import Tiny, write_nerfies, write_ngp, write_nr_nerf
 
 from lumigraph import synthetic as procedural
 from lumigraph.capture import open_scene
+from lumigraph.capture.hull import Silhouette, hull_box
+from lumigraph.components.sampling.occupancy import visual_hull
 from lumigraph.errors import LumigraphWarning
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.held_out import held_out_kinds
@@ -119,6 +121,21 @@ def test_held_out_views_are_of_new_cameras_new_moments_or_both():
         found = held_out_kinds(replace(scene, splits={"train": torch.tensor(train)}))
         assert {i: found[i] for i in kinds} == kinds
     assert held_out_kinds(tiny.scene()) == [None] * 12
+
+
+def test_nothing_is_carved_away_that_is_empty_at_some_moments_only():
+    assert visual_hull(moving_scene(), 16).all() and not visual_hull(tiny.scene(), 16).all()
+    centres, radius = np.array([[-0.6, 0, 0], [0.6, 0, 0]]), 0.2  # of a ball that is here, then there
+    cameras = tiny.scene().cameras
+    outlines = []
+    for i in range(len(cameras)):
+        rays = cameras[i].rays(cameras[i].pixels())
+        aside = torch.linalg.cross(torch.from_numpy(centres[i % 2]).float() - rays.origins, rays.directions).norm(
+            dim=-1
+        )
+        outlines.append(Silhouette(cameras[i], (aside < radius).view(tiny.SIZE, tiny.SIZE)))
+    found = hull_box(outlines, np.zeros(3), 1.5, moves=True)
+    assert found is not None and found[0][0] < -0.75 and found[1][0] > 0.75
 
 
 def test_evaluation_names_what_was_held_out_and_what_moves():
