@@ -130,9 +130,8 @@ def test_nothing_is_carved_away_that_is_empty_at_some_moments_only():
     outlines = []
     for i in range(len(cameras)):
         rays = cameras[i].rays(cameras[i].pixels())
-        aside = torch.linalg.cross(torch.from_numpy(centres[i % 2]).float() - rays.origins, rays.directions).norm(
-            dim=-1
-        )
+        toward = torch.from_numpy(centres[i % 2]).float() - rays.origins
+        aside = torch.linalg.cross(toward, rays.directions).norm(dim=-1)
         outlines.append(Silhouette(cameras[i], (aside < radius).view(tiny.SIZE, tiny.SIZE)))
     found = hull_box(outlines, np.zeros(3), 1.5, moves=True)
     assert found is not None and found[0][0] < -0.75 and found[1][0] > 0.75
