@@ -22,6 +22,7 @@ from ...geometry import multiply, to_matrix
 
 PAIRS = tuple(combinations(range(4), 2))  # axes of the six planes; 3 is time
 TIME = 3
+FIRST_MOTION = 1e-4  # largest weight of the last layer at first
 NEIGHBOURS = 6  # of a Gaussian, that move rigidly with it
 PROBED_MOMENTS = 12  # at which one sees whether a Gaussian moves
 MIN_DISTANCE = 1e-6  # between neighbours, scene units
@@ -117,7 +118,7 @@ class PlaneMotion(Addition):
         self.planes = SpaceTimePlanes(numbers)
         self.network = nn.Sequential(nn.Linear(self.planes.width, numbers.motion_width), nn.ReLU())
         self.heads = nn.Linear(numbers.motion_width, 9)
-        nn.init.zeros_(self.heads.weight)
+        nn.init.uniform_(self.heads.weight, -FIRST_MOTION, FIRST_MOTION)
         nn.init.zeros_(self.heads.bias)
         self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
         self.register_buffer("neighbours", torch.arange(count)[:, None].repeat(1, NEIGHBOURS))
