@@ -30,7 +30,7 @@ Bend = Annotated[float, between(-1e4, 1e4)]
 
 
 @dataclass(frozen=True)
-class Dataset:
+class PhotographList:
     """Fields of dataset.json: ids of all photographs, and of those that test."""
 
     ids: list[Name]
@@ -90,7 +90,7 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError for malformed JSON and for photographs without a moment."""
-    listed = read_json(folder / "dataset.json", Dataset)
+    listed = read_json(folder / "dataset.json", PhotographList)
     path = folder / "metadata.json"
     moments = {name: typed(Moment, about, f"{path}: {name}") for name, about in read_json(path).items()}
     place = read_json(folder / "scene.json", SceneRecord) if is_file(folder / "scene.json") else SceneRecord()

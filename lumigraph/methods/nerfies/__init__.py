@@ -115,9 +115,10 @@ class Nerfies(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A hash table as canonical scene, and a narrower deformation."""
+        """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
-        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
+        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
+        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.4)
         d = replace(d, elastic_samples=512, background_points=1024, elastic_until=0.5)
         return replace(c, deformation=d, final_learning_rate=1e-3, decay_start=0.3, deformation_rate=0.1)
 
@@ -213,7 +214,7 @@ class Nerfies(FieldMethod):
         return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
-        """How far points of the background move at random moments, by a robust loss."""
+        """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""
         count, known = self.config.deformation.background_points, self.background_points
         points = known[torch.randint(len(known), (count,), generator=generator).to(self.device)]
         first, last = self.frame.times or (0.0, 0.0)
