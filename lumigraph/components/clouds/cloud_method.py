@@ -17,6 +17,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...datasets.scene import Frame, Photograph, Scene
+from ...depth_maps.multi_view import compile_matching
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
@@ -26,7 +27,7 @@ from ..training.pose_refinement import PoseRefinement
 from .addition import Addition, Step
 from .appearance import SplatAppearance
 from .cloud import Cloud, picture_share, thinned
-from .dense_points import compile_sweep, seen_points
+from .dense_points import seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl
 from .initialization import cloud_of, initial_cloud, random_cloud, surface_cloud
 from .interval_schedule import intervals
@@ -87,7 +88,7 @@ class CloudMethod(Method, ABC):
     def compile_begin(self) -> None:
         super().compile_begin()
         if self.config.initialization == "dense":
-            compile_sweep()
+            compile_matching()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         c, cap = self.config, self.density_control.max_count(self.cloud)

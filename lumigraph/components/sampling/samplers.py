@@ -20,13 +20,14 @@ from torch.nn.functional import normalize
 
 from ...camera.rays import Rays
 from ...datasets.scene import Frame, Scene
+from ...depth_maps.multi_view import compile_matching
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, between
 from ...method import Field, Pass, Sampler
 from ...method.field import Points as Places
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import weights_of
-from ..clouds.dense_points import Points, compile_sweep, seen_points
+from ..clouds.dense_points import Points, seen_points
 from ..fields.hash_field import CPU_TABLE, TINY_TABLE
 from ..training.regularizers import depth_loss, distortion_loss, places_between, scale_gradients
 from ..training.row_optimizers import LazyAdam
@@ -183,7 +184,7 @@ class ProposalSampler(Sampler):
     # Training
 
     def compile_begin(self) -> None:
-        compile_sweep()
+        compile_matching()
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
         """Find points on surfaces by plane sweeps, unless poses are learnt."""
@@ -226,7 +227,7 @@ def some(points: Points, generator: torch.Generator) -> Points:
     if len(points.positions) <= MAX_POINTS:
         return points
     chosen = torch.randperm(len(points.positions), generator=generator)[:MAX_POINTS]
-    rows = {name: getattr(points, name)[chosen] for name in ("positions", "colours", "sizes", "origins")}
+    rows = {name: getattr(points, name)[chosen] for name in ("positions", "colours", "sizes", "origins", "normals")}
     return Points(**rows, share=points.share)
 
 

@@ -18,9 +18,10 @@ from torch.nn.functional import max_pool2d
 
 from ...camera import Camera
 from ...components.clouds.addition import Addition, Step
-from ...components.clouds.dense_points import Points, compile_sweep
+from ...components.clouds.dense_points import Points
 from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
+from ...depth_maps.multi_view import compile_matching
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
@@ -86,7 +87,7 @@ class FewViews(Addition):
         return ("dropout of Gaussians", *depth, *surface) if self.active else ()
 
     def compile_begin(self) -> None:
-        compile_sweep()
+        compile_matching()
 
     def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
         """Decide whether the capture is sparse, and keep what plane sweeps have found."""
