@@ -23,6 +23,7 @@ from .flat_view import FlatView, flat_view
 from .patch_match import FAR_AREAS, HYPOTHESES, NEAR_AREAS, PatchMatch, PlaneMap
 
 MAX_VIEWS, MIN_VIEWS = 48, 8  # photographs at most, and at least however short the time
+MIN_SIDE = 40  # pixels along the longer side at the coarsest level
 NEIGHBOURS = 6  # of each photograph
 MEETING_ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # of rays; deviations around it
 MIN_OVERLAP = 0.02  # share of what a photograph sees, weighted by angle, that a neighbour must see
@@ -53,7 +54,7 @@ class Level:
         return (HYPOTHESES * self.first + (self.photometric + self.geometric) * planes) / self.reduction**2
 
 
-LEVELS = Level(4, 4, 3, first=True), Level(2, 0, 2), Level(1, 0, 2)
+LEVELS = Level(4, 3, 2, first=True), Level(2, 0, 2), Level(1, 0, 2)
 
 
 @torch.no_grad()
@@ -68,7 +69,8 @@ def multi_view_depth(scene: Scene, size: int = 400, seconds: float = math.inf, v
     """
     begin = time.perf_counter()
     chosen = evenly(scene.splits["train"].tolist(), views)
-    pyramids = [[flat_view(photograph, size // level.reduction) for level in LEVELS] for photograph in map(scene.photograph, chosen)]
+    sides = [max(size // level.reduction, MIN_SIDE) for level in LEVELS]
+    pyramids = [[flat_view(photograph, side) for side in sides] for photograph in map(scene.photograph, chosen)]
     known, coarse = scene.points, [pyramid[0] for pyramid in pyramids]
     if known is None or len(known) < MIN_KNOWN_POINTS:
         anywhere = [everywhere(view, scene) for view in coarse]
@@ -110,10 +112,11 @@ def match(
 
     photographs: number of each view's; pyramids: its picture at each of the first levels; spans: of its depths
     """
-    chance, begin = torch.Generator().manual_seed(0), time.perf_counter()
+    chance, begin, taken = torch.Generator().manual_seed(0), time.perf_counter(), 0.0
     if seconds < math.inf:
         some = evenly(list(range(len(pyramids))), affordable([one[0] for one in pyramids], spans, seconds))
-        photographs, pyramids, spans = ([rows[i] for i in some] for rows in (photographs, pyramids, spans))
+        photographs, pyramids = [photographs[i] for i in some], [pyramids[i] for i in some]
+        spans = [spans[i] for i in some]
     neighbours = choose_neighbours([one[0] for one in pyramids], spans)
     maps: list[PlaneMap] = []
     for number, level in enumerate(LEVELS[: len(pyramids[0])]):
@@ -121,6 +124,8 @@ def match(
         if not level.first and spent + level.work / LEVELS[number - 1].work * taken > seconds:
             break
         views = [one[number] for one in pyramids]
+        if maps and views[0].trust.shape == maps[0].view.trust.shape:
+            continue
         maps = [old.enlarged(view) for old, view in zip(maps, views)] or list(map(PlaneMap, views, spans))
         rounds = [(False, level.photometric), (True, level.geometric)]
         for geometric, iterations in rounds:

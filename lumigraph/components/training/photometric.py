@@ -18,7 +18,7 @@ from ...errors import LumigraphWarning
 from ...geometry import evenly
 from ...method import Part
 from ...method.controls import Control, Value
-from ..clouds.flat_view import FlatView, flat_view
+from ...depth_maps.flat_view import FlatView, flat_view
 from ..fields.appearance import AVERAGE
 from ..fields.development import decoded, encoded
 
