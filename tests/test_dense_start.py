@@ -23,7 +23,7 @@ from lumigraph.depth_maps.patch_match import PatchMatch, PlaneMap
 
 pytestmark = budget("methods", 8)
 
-RADIUS, SIZE, FOCAL, COUNT = 0.6, 48, 64.0, 6
+RADIUS, SIZE, FOCAL, COUNT = 0.6, 36, 48.0, 5
 
 LENSES = {
     "pinhole": Pinhole(torch.full((COUNT, 2), FOCAL), torch.full((COUNT, 2), SIZE / 2)),
@@ -88,7 +88,7 @@ def off_surface(points: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("lens", LENSES)
 def test_points_without_any_known_lie_on_the_surface(lens):
     found = dense(lens)
-    assert len(found.positions) > 500
+    assert len(found.positions) > 250
     off = off_surface(found.positions)
     assert off.median() < 0.005
     assert (off < 0.02).float().mean() > 0.95
@@ -152,7 +152,7 @@ def test_a_flat_view_sees_what_the_lens_sees():
     under = b * b - origin @ origin + RADIUS**2
     inside = (under > 0.05) & (view.trust == 1)
     places = origin + (-b - under.clamp_min(0).sqrt())[..., None] * directions
-    assert inside.sum() > 300
+    assert inside.sum() > 200
     assert (view.rgb - texture(places))[inside].abs().mean() < 0.05
 
 
@@ -169,11 +169,12 @@ def test_a_warp_is_a_projection(generator):
 
 def test_a_short_budget_matches_fewer_photographs(monkeypatch):
     clock = iter(range(1000))
-    monkeypatch.setattr(multi_view.time, "perf_counter", lambda: next(clock))  # so that any piece of work takes a second
+    monkeypatch.setattr(
+        multi_view.time, "perf_counter", lambda: next(clock)
+    )  # so that any piece of work takes a second
     monkeypatch.setattr(multi_view, "MIN_VIEWS", 3)
     improved = []
     monkeypatch.setattr(multi_view, "improve", lambda maps, *_: improved.append(len(maps)))
-    monkeypatch.setattr(multi_view, "depth_map", lambda found, *_: found)
     scene = replace(ball(), points=torch.zeros(300, 3))
     for seconds, views, rounds in ((1.0, 3, 2), (math.inf, COUNT, 2)):
         improved.clear()
@@ -215,7 +216,9 @@ def test_true_planes_reproject_without_error():
     matching = PatchMatch(maps[0], maps[1:], torch.Generator(), geometric=True)
     pixels = torch.arange(SIZE * SIZE)
     inverse = maps[0].inverse_depth.flatten()
-    error = matching.reprojection_error(pixels, torch.stack([inverse, 1.1 * inverse], 1), torch.zeros_like(pixels)[:, None])
+    error = matching.reprojection_error(
+        pixels, torch.stack([inverse, 1.1 * inverse], 1), torch.zeros_like(pixels)[:, None]
+    )
     there = (error[:, 0, 0] < 2.9) & (inverse > 0)
     assert there.sum() > 300
     assert error[there, 0].max() < 1e-2

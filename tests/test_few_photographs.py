@@ -153,7 +153,7 @@ def test_known_surfaces_carve_away_what_floats_in_front():
 
 
 def test_a_capture_is_sparse_if_sweeps_agree_little_on_up_to_forty_photographs_of_a_place():
-    scene, points = tiny.scene(), Points(*(torch.ones(5, 3),) * 2, torch.ones(5), torch.zeros(5, 3), 0.1)
+    scene, points = tiny.scene(), Points(*(torch.ones(5, 3),) * 2, torch.ones(5), *(torch.zeros(5, 3),) * 2, 0.1)
     place = replace(scene, frame=replace(scene.frame, reach=4.0, has_alpha=False))
     many = replace(place, splits={"train": torch.arange(41) % 4})
     agreed = replace(points, share=0.3)

@@ -40,6 +40,7 @@ from .compose import Compose
 from .compress import Compress
 from .convert import Convert
 from .demo import Demo
+from .depth import Depth
 from .eval import Eval
 from .explain import Explain
 from .export import Export
@@ -107,6 +108,7 @@ def held(command: Any) -> Any:
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "capture": CaptureCommand,
+    "depth": Depth,
     "train": Train,
     "resume": Resume,
     "infer": Infer,

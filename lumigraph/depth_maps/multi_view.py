@@ -58,7 +58,9 @@ LEVELS = Level(4, 3, 2, first=True), Level(2, 0, 2), Level(1, 0, 2)
 
 
 @torch.no_grad()
-def multi_view_depth(scene: Scene, size: int = 400, seconds: float = math.inf, views: int = MAX_VIEWS) -> list[DepthMap]:
+def multi_view_depth(
+    scene: Scene, size: int = 400, seconds: float = math.inf, views: int = MAX_VIEWS
+) -> list[DepthMap]:
     """Depth maps of training photographs, through ideal pinholes; NaN where neighbours do not agree.
 
     size:    pixels along the longer side of the maps, about
@@ -126,7 +128,7 @@ def match(
         views = [one[number] for one in pyramids]
         if maps and views[0].trust.shape == maps[0].view.trust.shape:
             continue
-        maps = [old.enlarged(view) for old, view in zip(maps, views)] or list(map(PlaneMap, views, spans))
+        maps = [maps[i].enlarged(view) if maps else PlaneMap(view, spans[i]) for i, view in enumerate(views)]
         rounds = [(False, level.photometric), (True, level.geometric)]
         for geometric, iterations in rounds:
             for i in track(range(len(maps)), f"{what}, {views[0].trust.shape[1]} pixels", len(maps)):
@@ -162,7 +164,8 @@ def affordable(views: Sequence[FlatView], spans: Sequence[tuple[float, float]], 
     positions = torch.stack([view.pose[:, 3] for view in views])
     others = best_neighbours(middle, views, positions, spans[middle])
     if others:
-        PatchMatch(*[PlaneMap(views[middle], spans[middle]), [PlaneMap(views[j], spans[j]) for j in others], torch.Generator(), False]).begin()
+        own, its = PlaneMap(views[middle], spans[middle]), [PlaneMap(views[j], spans[j]) for j in others]
+        PatchMatch(own, its, torch.Generator(), geometric=False).begin()
     each = (time.perf_counter() - begin) * LEVELS[0].work * LEVELS[0].reduction ** 2 / HYPOTHESES
     return max(int(seconds / each), MIN_VIEWS)
 

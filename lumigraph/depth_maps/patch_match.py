@@ -1,5 +1,4 @@
-"""PatchMatch stereo: a slanted plane at every pixel of a picture, found with some neighbours (Bleyer 2011; Galliani 2015;
-Schönberger 2016; Xu & Tao 2019).
+"""PatchMatch stereo: a slanted plane at every pixel of a picture (Galliani 2015; Schönberger 2016; Xu & Tao 2019).
 
 A plane is the vector n = normal / distance in the camera's frame, so that a ray r = K^-1 (x, y, 1) meets it at the
 inverse depth 1 / z = n · r. In turn red and black pixels, as on a chessboard, try the planes of pixels of the other
@@ -124,8 +123,9 @@ class PatchMatch:
         size = self.its_sizes[views][:, None]
         there &= (u >= 0) & (v >= 0) & (u < size[..., 1]) & (v < size[..., 0])
         column, row = torch.where(there, u, 0).long(), torch.where(there, v, 0).long()
-        planes, rays = self.its_planes[views[:, None], row, column], self.its_rays[views][:, None]
-        its = sum(planes[..., k] * (rays[..., k, 0] * u + rays[..., k, 1] * v + rays[..., k, 2]) for k in range(3))
+        places = torch.stack([u, v, torch.ones_like(u)], -1)[..., None, :]
+        rays = (self.its_rays[views][:, None] * places).sum(-1)
+        its = (self.its_planes[views[:, None], row, column] * rays).sum(-1)
         back_x, back_y, behind = warped(self.ways_back[views][:, None], u, v, its)
         return torch.where(there & behind, torch.hypot(back_x - x, back_y - y), MAX_REPROJECTION)
 
@@ -144,7 +144,7 @@ class PatchMatch:
         self.keep(torch.arange(count), self.random(self.rays[:, None].expand(-1, HYPOTHESES, -1), inverse))
 
     def choose(self, all_views: bool) -> None:
-        """Compute the costs of the planes that there are; unless all views are to count, choose the best at each pixel."""
+        """Compute the costs of the planes, and unless all views are to count, choose those of least cost at each pixel."""
         pixels = torch.arange(len(self.rays))
         costs = self.costs(pixels, self.own.planes.view(-1, 1, 3), self.all_views.expand(len(pixels), -1))
         self.own.cost = self.joined(costs).view(self.own.cost.shape)
@@ -220,7 +220,9 @@ def facing(
 
 def warped(warp: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels (u, v) of places (x, y) at inverse depths (`kernels.patch_cost`), and whether they lie in front."""
-    u, v, s = (warp[..., k, 0] * x + warp[..., k, 1] * y + warp[..., k, 2] + inverse * warp[..., k, 3] for k in range(3))
+    u, v, s = (
+        warp[..., k, 0] * x + warp[..., k, 1] * y + warp[..., k, 2] + inverse * warp[..., k, 3] for k in range(3)
+    )
     front = s > EPSILON
     s = torch.where(front, s, 1)
     return u / s, v / s, front

@@ -46,7 +46,10 @@ def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
 def points_of(maps: list[DepthMap]) -> Points:
     """Points of all sure pixels of depth maps."""
     found = SurfacePoints.cat([seen.points() for seen in maps])
-    sizes = [seen.depth[seen.solid] / float(seen.camera.lens.focal[0, 0]) for seen in maps]
+    sizes = [
+        seen.depth[seen.solid] / float(seen.camera.lens.focal[0, 0])  # type: ignore[attr-defined]
+        for seen in maps
+    ]
     share = len(found) / max(sum(seen.depth.numel() for seen in maps), 1)
     return Points(found.points, found.colours, torch.cat(sizes), found.origins, found.normals, share)
 
@@ -63,4 +66,4 @@ def thinned(points: Points, spacing: float = 1.0) -> Points:
         return total / count.view(-1, *[1] * (values.ndim - 1))
 
     names = ("positions", "colours", "sizes", "origins", "normals")
-    return Points(*(mean(getattr(points, name)) for name in names), points.share)
+    return Points(**{name: mean(getattr(points, name)) for name in names}, share=points.share)

@@ -31,7 +31,9 @@ def _window(reference, trust, row, column, dx, dy, apart, sharpness, a, w):
 
 
 @njit(**FAST)
-def _cost(warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows, columns, masked, samples):
+def _cost(
+    warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows, columns, masked, samples
+):
     """One less the correlation. The loop stores nothing, so that the compiler makes vectors of it, look-ups included.
     Arrays come whole: counting the references to a row of one takes as long as the loop.
 
@@ -85,7 +87,25 @@ def _cost(warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values
 
 
 @njit(parallel=True, cache=True, **FAST)
-def _costs(reference, trust, values, weights, masked, rows, columns, warps, pixels, views, planes, dx, dy, apart, sharpness, samples, out):
+def _costs(
+    reference,
+    trust,
+    values,
+    weights,
+    masked,
+    rows,
+    columns,
+    warps,
+    pixels,
+    views,
+    planes,
+    dx,
+    dy,
+    apart,
+    sharpness,
+    samples,
+    out,
+):
     width = reference.shape[1]
     for chunk in prange((len(pixels) + CHUNK - 1) // CHUNK):
         a, w, across, down = np.empty((4, len(samples)), np.float32)
@@ -99,7 +119,25 @@ def _costs(reference, trust, values, weights, masked, rows, columns, warps, pixe
                 for i in range(views.shape[1]):
                     n = views[p, i]
                     out[p, m, i] = _cost(
-                        warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows, columns, masked, samples
+                        warps,
+                        n,
+                        planes,
+                        p,
+                        m,
+                        x,
+                        y,
+                        across,
+                        down,
+                        a,
+                        w,
+                        whole,
+                        shift,
+                        values,
+                        weights,
+                        rows,
+                        columns,
+                        masked,
+                        samples,
                     )
 
 

@@ -26,7 +26,9 @@ def run(reference, trust, neighbours, neighbour_trust, warps, pixels, views, pla
         n, b = w * seen, weighted / seen.clamp_min(1e-12)
         total = n.sum(-1, keepdim=True).clamp_min(1e-12)
         off_a, off_b = (x - (n * x).sum(-1, keepdim=True) / total for x in (a[:, None], b))
-        variance_a, variance_b, covariance = ((n * x).sum(-1) / total[..., 0] for x in (off_a**2, off_b**2, off_a * off_b))
+        variance_a, variance_b, covariance = (
+            (n * x).sum(-1) / total[..., 0] for x in (off_a**2, off_b**2, off_a * off_b)
+        )
         share = n.sum(-1) / w.sum(-1).clamp_min(1e-12)
         return 1 - share * covariance / ((variance_a + MIN_VARIANCE) * (variance_b + MIN_VARIANCE)).sqrt()
 
