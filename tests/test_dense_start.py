@@ -21,9 +21,9 @@ from lumigraph.depth_maps import DepthMap, multi_view
 from lumigraph.depth_maps.flat_view import flat_view
 from lumigraph.depth_maps.patch_match import PatchMatch, PlaneMap
 
-pytestmark = budget("methods", 8)
+pytestmark = budget("methods", 10)
 
-RADIUS, SIZE, FOCAL, COUNT = 0.6, 36, 48.0, 5
+RADIUS, SIZE, FOCAL, COUNT = 0.6, 48, 64.0, 4
 
 LENSES = {
     "pinhole": Pinhole(torch.full((COUNT, 2), FOCAL), torch.full((COUNT, 2), SIZE / 2)),
@@ -70,14 +70,13 @@ def ball(lens: str = "pinhole", alpha: bool = True) -> Scene:
 
 
 @cache
+def matched(lens: str = "pinhole", alpha: bool = True) -> list[DepthMap]:
+    """Depth maps of these photographs, in which no point is known."""
+    return multi_view.multi_view_depth(ball(lens, alpha))
+
+
 def dense(lens: str = "pinhole", alpha: bool = True) -> dense_points.Points:
-    """Points of these photographs, in which no point is known."""
-    return dense_cloud(ball(lens, alpha))
-
-
-@cache
-def matched() -> list[DepthMap]:
-    return multi_view.multi_view_depth(ball())
+    return dense_points.thinned(dense_points.points_of(matched(lens, alpha)))
 
 
 def off_surface(points: torch.Tensor) -> torch.Tensor:
@@ -85,10 +84,10 @@ def off_surface(points: torch.Tensor) -> torch.Tensor:
     return (points.norm(dim=-1) - RADIUS).abs() / tiny.DISTANCE
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
 def test_points_without_any_known_lie_on_the_surface(lens):
     found = dense(lens)
-    assert len(found.positions) > 250
+    assert len(found.positions) > 500
     off = off_surface(found.positions)
     assert off.median() < 0.005
     assert (off < 0.02).float().mean() > 0.95
@@ -152,7 +151,7 @@ def test_a_flat_view_sees_what_the_lens_sees():
     under = b * b - origin @ origin + RADIUS**2
     inside = (under > 0.05) & (view.trust == 1)
     places = origin + (-b - under.clamp_min(0).sqrt())[..., None] * directions
-    assert inside.sum() > 200
+    assert inside.sum() > 300
     assert (view.rgb - texture(places))[inside].abs().mean() < 0.05
 
 
@@ -196,11 +195,6 @@ def test_a_plane_map_has_depth_and_normals_of_the_surface():
     ways = torch.cat([normalize(seen.camera.position - seen.positions(), dim=-1) for seen in maps])
     assert cosine.median() > 0.97
     assert cosine.mean() > (ways * normalize(points, dim=-1)).sum(-1).mean() + 0.02
-
-
-def test_matching_again_gives_the_same_depth():
-    first, second = matched(), multi_view.multi_view_depth(ball())
-    assert all(torch.equal(a.depth.nan_to_num(0), b.depth.nan_to_num(0)) for a, b in zip(first, second, strict=True))
 
 
 def test_true_planes_reproject_without_error():

@@ -29,13 +29,13 @@ MEETING_ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # o
 MIN_OVERLAP = 0.02  # share of what a photograph sees, weighted by angle, that a neighbour must see
 MIN_POINTS, MIN_KNOWN_POINTS = 16, 200  # in front of a view, and in a scene, that give a range of depths
 NEARER, FARTHER = 0.7, 2.0  # times the depths of known points: the range that is searched
-DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.0  # of depth and of reprojection, up to which two views agree
+DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.02, 2.0  # of depth and of reprojection, up to which two views agree
 MIN_AGREEING = 2  # neighbours that must agree, or the only one
 MAX_SURE_COST = 0.9  # of a plane that is sure, whatever neighbours find
 
 
 @dataclass(frozen=True)
-class Level:
+class MatchingLevel:
     """Work at one size of the pictures: rounds of iterations, the later ones compare the neighbours' planes too.
 
     reduction: from the finest size
@@ -54,7 +54,7 @@ class Level:
         return (HYPOTHESES * self.first + (self.photometric + self.geometric) * planes) / self.reduction**2
 
 
-LEVELS = Level(4, 3, 2, first=True), Level(2, 0, 2), Level(1, 0, 2)
+LEVELS = MatchingLevel(4, 3, 2, first=True), MatchingLevel(2, 0, 2), MatchingLevel(1, 0, 2)
 
 
 @torch.no_grad()
@@ -143,7 +143,7 @@ def improve(
     maps: Sequence[PlaneMap],
     i: int,
     neighbours: Sequence[int],
-    level: Level,
+    level: MatchingLevel,
     geometric: bool,
     iterations: int,
     chance: torch.Generator,

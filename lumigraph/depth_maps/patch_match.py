@@ -144,7 +144,7 @@ class PatchMatch:
         self.keep(torch.arange(count), self.random(self.rays[:, None].expand(-1, HYPOTHESES, -1), inverse))
 
     def choose(self, all_views: bool) -> None:
-        """Compute the costs of the planes, and unless all views are to count, choose those of least cost at each pixel."""
+        """Compute the costs of the planes; unless all views are to count, choose those of least cost at each pixel."""
         pixels = torch.arange(len(self.rays))
         costs = self.costs(pixels, self.own.planes.view(-1, 1, 3), self.all_views.expand(len(pixels), -1))
         self.own.cost = self.joined(costs).view(self.own.cost.shape)

@@ -49,6 +49,7 @@ class FewViewNumbers:
         "no"  # regularisation for few photographs; auto: if plane sweeps agree little
     )
     depth_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
+    observed_depth_weight: NonNegative = 0.0  # weight of stereo depth in photographs, with few_views; 0: off
     surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
 
 
@@ -109,6 +110,11 @@ class FewViews(Addition):
     def regularize(self, method: Any, step: Step) -> None:
         if not self.active or method.cameras is None:
             return
+        if self.numbers.observed_depth_weight and len(self.surface):
+            place, depth, index = visible_points(self.surface, step.camera)
+            if len(index):
+                weight = self.numbers.observed_depth_weight * (1 - method.progress)
+                step.terms["observed_depth"] = weight * depth_error(step.picture, place, depth)
         camera = camera_between(method.cameras, step.chance).to(method.device)
         camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
         seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
@@ -159,8 +165,13 @@ def surface_error(
     seen: Splatted, place: tuple[Tensor, Tensor], depth: Float[Tensor, " point"], colours: Float[Tensor, "point 3"]
 ) -> Float[Tensor, ""]:
     """Error of a picture at points that it is to show: of colours, of the logarithm of depth, and light that passes."""
+    colour = (seen.rgb[place] - colours).abs().mean()
+    return colour + SURFACE_WEIGHT * depth_error(seen, place, depth)
+
+
+def depth_error(seen: Splatted, place: tuple[Tensor, Tensor], depth: Float[Tensor, " point"]) -> Float[Tensor, ""]:
+    """Error of the logarithm of a picture's depth at points, and light that passes them."""
     opacity = seen.opacity[place]
     ratio = (seen.depth[place] / opacity.clamp_min(1e-3)).clamp_min(1e-4) / depth
     off = (ratio.log().abs().clamp(max=MAX_LOG_ERROR) * opacity.detach()).mean()
-    colour = (seen.rgb[place] - colours).abs().mean()
-    return colour + SURFACE_WEIGHT * (off + OPACITY_WEIGHT * (1 - opacity).mean())
+    return off + OPACITY_WEIGHT * (1 - opacity).mean()
