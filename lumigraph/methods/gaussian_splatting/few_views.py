@@ -48,7 +48,7 @@ class FewViewNumbers:
     few_views: Literal["auto", "yes", "no"] = "no"  # regularisation for few photographs; auto: if stereo finds little
     depth_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
     gaussians_per_view: Annotated[int, between(0, 10**6)] = 3000  # cap per photograph, with few_views; 0: none
-    observed_depth_weight: NonNegative = 0.0  # weight of stereo depth in photographs, with few_views; 0: off
+    observed_depth_weight: NonNegative = 0.1  # weight of stereo depth in photographs, with few_views; 0: off
     surface_weight: NonNegative = 0.2  # weight of stereo surfaces at unobserved views, with few_views; 0: off
 
 
