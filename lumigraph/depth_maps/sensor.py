@@ -80,7 +80,7 @@ def sensor_faults(scene: Scene) -> list[str]:
             f"probably wrong by a factor of {factor:,}, so correct that, or the poses' unit"
         )
     typical = float(torch.tensor(medians).median())
-    if not ratios and not MIN_ROOM < typical < MAX_ROOM:
+    if 1 / MAX_RATIO < ratio < MAX_RATIO and not MIN_ROOM < typical < MAX_ROOM:  # points may be of the same depth
         told.append(
             f"{scene.source}: the median depth is {typical:.3g} metres, which no depth camera measures; its unit is "
             "probably wrong by a factor of 1000, so correct it"
