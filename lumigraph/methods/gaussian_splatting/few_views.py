@@ -47,7 +47,7 @@ class FewViewNumbers:
     few_views: Literal["auto", "yes", "no"] = (
         "no"  # regularisation for few photographs; auto: if plane sweeps agree little
     )
-    depth_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
+    roughness_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
     surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
 
 
@@ -81,7 +81,7 @@ class FewViews(Addition):
     @property
     def few_view_priors(self) -> tuple[str, ...]:
         numbers, known = self.numbers, len(self.surface) > 0
-        depth = ("smooth depth",) if numbers.depth_weight else ()
+        depth = ("smooth depth",) if numbers.roughness_weight else ()
         surface = ("plane-sweep surfaces at unobserved views",) if numbers.surface_weight and known else ()
         return ("dropout of Gaussians", *depth, *surface) if self.active else ()
 
@@ -111,7 +111,7 @@ class FewViews(Addition):
         camera = camera_between(method.cameras, step.chance).to(method.device)
         camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
         seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
-        step.terms["depth"] = self.numbers.depth_weight * depth_roughness(seen)
+        step.terms["depth"] = self.numbers.roughness_weight * depth_roughness(seen)
         if self.numbers.surface_weight and len(self.surface):
             place, depth, index = visible_points(self.surface, camera)
             if len(index):

@@ -99,7 +99,7 @@ class Config:
     @property
     def proposals(self) -> ProposalNumbers:
         """Numbers of the hash table's samples in scenes without bounds."""
-        return ProposalNumbers(depth_weight=self.sweep_weight)
+        return ProposalNumbers(sweep_weight=self.sweep_weight)
 
 
 DECAY_START = 0.3  # share of the budget before the table's learning rate falls

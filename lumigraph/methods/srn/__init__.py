@@ -23,7 +23,7 @@ from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
-from .networks import LayerNetwork, Layer, RayMarcher, perceptron, scene_features
+from .networks import Layer, LayerNetwork, RayMarcher, perceptron, scene_features
 
 
 @dataclass(frozen=True)
