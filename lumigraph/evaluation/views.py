@@ -339,8 +339,10 @@ def of_windows(likeness: Picture, mask: Bool[Tensor, "height width"]) -> float |
 
 
 def depth_error(seen: Rendering, measured: Float[Tensor, "height width"]) -> float | None:
-    """Mean error of a rendering's depth in percent of the measured distance. A pixel that shows nothing, or a surface at
-    more than twice the distance, is off by 100 %. None where nothing was measured."""
+    """Mean error of a rendering's depth in percent of the measured distance; None where nothing was measured.
+
+    A pixel that shows nothing, or a surface at more than twice the distance, is off by 100 %.
+    """
     known = measured.isfinite() & (measured > 0)
     if not known.any():
         return None
