@@ -77,7 +77,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "infer": ("infer prior photographs --output found", ("found/", "found", "found/lock.json")),
     "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
     "track": (
-        "track imap procedural:room,depth,views=2,size=32 --downscale 1 --first-iterations 1 --output found",
+        "track imap procedural:room,depth,views=300,size=32 --frames 2 --downscale 1 --output found",
         ("found/", "found", "found/lock.json"),
     ),
     "train, in blocks": (

@@ -105,8 +105,8 @@ def test_the_network_is_the_papers(monkeypatch):
 def room(tmp_path_factory):
     """A short recording of the room, tracked in one sitting, and in two."""
     folder = tmp_path_factory.mktemp("room")
-    options = "--downscale 1 --mapping-iterations 3 --first-iterations 60 --alignment-points 800 --device cpu"
-    source = "procedural:room,depth,views=8,size=48"
+    options = "--frames 8 --downscale 1 --mapping-iterations 3 --first-iterations 40 --pixels-per-frame 64"
+    source = "procedural:room,depth,views=300,size=48"
     for name in ("straight", "broken"):
         command = f"track imap {source} --output {folder / name} {options}".split()
         assert main([*command, *(["--pause-at", "4"] if name == "broken" else [])]) in (0, 130)

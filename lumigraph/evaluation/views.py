@@ -27,6 +27,7 @@ from ..errors import LumigraphError
 from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range
 from ..geometry import evenly
 from ..method import Method
+from ..method.depth import DEPTH_LAYER
 from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
@@ -71,6 +72,7 @@ class ViewScore:
     moving_ssim: float | None = None
     detail: FineDetail | None = None
     held_out: str | None = None
+    depth_error: float | None = None  # mean over pixels with a measured depth, percent of the distance
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,11 @@ class Evaluation:
         return mean_known(each.moving_ssim for each in self._averaged)
 
     @property
+    def depth_error(self) -> float | None:
+        """Mean error of depth in percent of the distance; None where none was measured."""
+        return mean_known(each.depth_error for each in self._averaged)
+
+    @property
     def detail(self) -> FineDetail | None:
         """Mean detail over the views; None if no photograph has fine detail."""
         found = [each.detail for each in self._averaged]
@@ -152,7 +159,7 @@ class Evaluation:
         return replace(self, views=views, members=members)
 
     def means(self) -> dict[str, Any]:
-        further = {name: getattr(self, name) for name in ("clean_psnr", "moving_psnr", "moving_ssim")}
+        further = {name: getattr(self, name) for name in ("clean_psnr", "moving_psnr", "moving_ssim", "depth_error")}
         known = {name: value for name, value in further.items() if value is not None}
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
 
@@ -230,7 +237,7 @@ def evaluate(
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
     spread = set(evenly(compared, SHEET_VIEWS))
     found, kinds = held_out_poses(method, scene), held_out_kinds(scene)
-    known = [name for name in (CLEAN_LAYER, LIGHT_LAYER, MOVING_LAYER) if name in scene.layers]
+    known = [name for name in (CLEAN_LAYER, LIGHT_LAYER, MOVING_LAYER, DEPTH_LAYER) if name in scene.layers]
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
@@ -250,6 +257,8 @@ def evaluate(
             rgb, photograph = in_light(seen, shot.extra[LIGHT_LAYER])
             seen = replace(seen, rgb=rgb)
         score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
+        if DEPTH_LAYER in shot.extra:
+            score = replace(score, depth_error=depth_error(seen, shot.extra[DEPTH_LAYER]))
         score = replace(score, held_out=kinds[index])
         keep(score.name, seen)
         if index in spread:
@@ -328,6 +337,18 @@ def of_windows(likeness: Likeness, mask: Bool[Tensor, "height width"]) -> float 
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
     return float(inner.mean()) if len(inner) else None
+
+
+def depth_error(seen: Rendering, measured: Float[Tensor, "height width"]) -> float | None:
+    """Mean error of a rendering's depth in percent of the measured distance; None where nothing was measured.
+
+    A pixel that shows nothing, or a surface at more than twice the distance, is off by 100 %.
+    """
+    known = measured.isfinite() & (measured > 0)
+    if not known.any():
+        return None
+    error = (seen.depth[known] - measured[known]).abs() / measured[known]
+    return 100 * float(error.nan_to_num(1.0, 1.0).clamp(max=1).mean())
 
 
 def warm_up(method: Method, camera: Camera) -> float:

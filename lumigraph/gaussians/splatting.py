@@ -53,6 +53,12 @@ class Splatted:
         footprints = self.centres, self.conics, self.opacities
         return kernels.rasterize(*footprints, vectors, numbers, self.tiles, stop)
 
+    def along_rays(self, camera: Camera) -> Float[Tensor, "height width"]:
+        """Mean distance along each pixel's ray of what is opaque, infinity where nothing is."""
+        rays = camera.rays(camera.pixels()).directions
+        along = (rays @ camera.forward[0]).view(self.depth.shape).clamp_min(1e-3).to(self.depth.device)
+        return torch.where(self.opacity > 1e-3, self.depth / self.opacity.clamp_min(1e-3) / along, torch.inf)
+
 
 def splat(
     cloud: Gaussians, view: kernels.View, bands: int = 4, stop: float = 1e-4, blur: float = FOOTPRINT_BLUR
@@ -84,11 +90,7 @@ def render(
     """Render a cloud for one camera over a background colour."""
     seen = splat(cloud, view_of(camera, near).to(cloud.means.device), bands, blur=blur)
     rgb = over(seen.rgb, seen.opacity, torch.tensor(background, device=seen.rgb.device))
-    # Depth along the optical axis, of what is opaque, becomes distance along each pixel's ray.
-    rays = camera.rays(camera.pixels()).directions
-    along = (rays @ camera.forward[0]).view(seen.depth.shape).clamp_min(1e-3).to(seen.depth.device)
-    depth = torch.where(seen.opacity > 1e-3, seen.depth / seen.opacity.clamp_min(1e-3) / along, torch.inf)
-    return Rendering(rgb, depth, seen.opacity)
+    return Rendering(rgb, seen.along_rays(camera), seen.opacity)
 
 
 def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:

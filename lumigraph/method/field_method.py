@@ -12,6 +12,7 @@ from torch import Tensor
 from ..camera.rays import Look, Rays, Rendering
 from ..datasets.scene import Batch, Scene
 from ..volume import composite
+from .depth import depth_layers, depth_terms
 from .field import Colours, Densities, Directions, Field, Points
 from .ray_method import RayMethod
 from .sampler import Density, Pass, Sampler
@@ -89,7 +90,8 @@ class FieldMethod(RayMethod, ABC):
         return self.sampler.expected_rays
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        return data.sample_rays(self.sampler.batch_size, generator).to(self.device)
+        layers = depth_layers(self.config, data)
+        return data.sample_rays(self.sampler.batch_size, generator, layers=layers).to(self.device)
 
     def learn(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
         """Passes along rays of photographs at random places, and the sampler's loss terms by name."""
@@ -112,6 +114,7 @@ class FieldMethod(RayMethod, ABC):
         """The squared error of each pass's picture (Mildenhall 2020, eq. 6), and the sampler's terms."""
         passes, terms = self.learn(batch.rays, self.random(step))
         target, code = batch.before(self.background), self.code(batch.rays)
+        taught = dict[str, Tensor]()
         for each in passes:
             if weight := self.pass_weights.get(each.name, 1.0):
                 look = each.look(self.network, code)
@@ -119,4 +122,5 @@ class FieldMethod(RayMethod, ABC):
                 error = (seen.rgb - target).square().mean()
                 self.figures["mse"] = float(error.detach())  # of the last pass in the end
                 terms[each.name] = weight * error
-        return terms
+                taught = depth_terms(self.config, batch.extra, seen.depth, seen.opacity)  # of the last pass
+        return terms | taught

@@ -16,6 +16,7 @@ from ..datasets.scene import Batch, Photograph, Scene
 from ..system.work import at_work
 from ..volume import composite
 from .capabilities import ColourPairs, HasLooks, needs
+from .depth import depth_layers, depth_terms
 from .method import Method
 
 POSE_RAYS = 512  # of a photograph, from which the error of a pose is measured
@@ -39,7 +40,8 @@ class RayMethod(Method):
         return len(copy.deepcopy(self).batch(data, torch.Generator().manual_seed(0)))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        return data.sample_rays(self.config.rays_per_step, generator).to(self.device)
+        layers = depth_layers(self.config, data)
+        return data.sample_rays(self.config.rays_per_step, generator, layers=layers).to(self.device)
 
     @property
     def pass_weights(self) -> dict[str, float]:
@@ -52,14 +54,15 @@ class RayMethod(Method):
         rays: of the samples' random places in training."""
         background = self.background
         target = batch.before(background)
-        terms = {}
+        terms, taught = dict[str, Tensor](), dict[str, Tensor]()
         for look in needs(self, HasLooks).looks(batch.rays, self.random(step)):
             if weight := self.pass_weights.get(look.name, 1.0):
                 seen = composite(look.samples, look.density, look.rgb, background)
                 error = (seen.rgb - target).square().mean()
                 self.figures["mse"] = float(error.detach())  # of the last pass in the end
                 terms[look.name] = weight * error
-        return terms
+                taught = depth_terms(self.config, batch.extra, seen.depth, seen.opacity)  # of the last pass
+        return terms | taught
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         """Rendering of each ray before a background colour: the last look, composited."""

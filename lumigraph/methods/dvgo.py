@@ -30,6 +30,7 @@ from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, See
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod
+from ..method.depth import DepthNumbers, depth_terms
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
@@ -42,6 +43,7 @@ class Config:
 
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20)  # 8192 rays, section 6.1
     proposals: ProposalNumbers = ProposalNumbers()
+    measured: DepthNumbers = DepthNumbers()
     coarse_voxels: Voxels = 100**3  # voxels of the coarse stage, section 6.1; more cost memory and time
     voxels: Voxels = 160**3  # voxels of the fine stage at its end, section 6.1; more give detail, cost memory
     feature_channels: Annotated[int, between(3, 64)] = 12  # channels of a corner, 6.1; the first 3 are a colour
@@ -206,6 +208,7 @@ class DVGO(FieldMethod):
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         terms |= {"colour": residual.square().mean()}
+        terms |= depth_terms(c, batch.extra, rendering.depth, rendering.opacity)
         if weight := c.point_weight if fine else c.coarse_point_weight:
             terms["points"] = weight * point_error(look, batch.before(self.background))
         if weight := c.entropy_weight if fine else c.coarse_entropy_weight:

@@ -23,6 +23,7 @@ from ..datasets.scene import Batch, Frame
 from ..exchange.packing import most_important
 from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
 from ..method import FieldMethod
+from ..method.depth import DepthNumbers, depth_terms
 from ..volume import composite
 
 
@@ -35,6 +36,7 @@ class Config:
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers()
+    measured: DepthNumbers = DepthNumbers()
     hidden_width: Width = 64  # neurons of a hidden layer, section 5.4; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first, section 4; higher: faster, may diverge
     final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
@@ -84,6 +86,7 @@ class InstantNGP(FieldMethod):
         background = backdrop(batch, self.background, generator, opaque=self.sampler.is_open)
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
+        terms |= depth_terms(self.config, batch.extra, rendering.depth, rendering.opacity)
         return {"huber": huber(residual, self.config.huber_delta), **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:

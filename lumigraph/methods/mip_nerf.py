@@ -20,6 +20,7 @@ from ..components.training.schedules import BandSchedule, exponential_decay, joi
 from ..datasets.scene import Frame
 from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width
 from ..method import FieldMethod
+from ..method.depth import DepthNumbers
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Config:
     rays: RayNumbers = RayNumbers(128, 128)  # section 3.2
     mask: MaskNumbers = MaskNumbers()
     poses: PoseNumbers = PoseNumbers()
+    measured: DepthNumbers = DepthNumbers()
     hidden_width: Width = 256  # channels of a layer, as NeRF's; wider holds more detail, and costs time
     coarse_to_fine: Share = 0.0  # share of the budget in which octaves are added (Yang 2023, eq. 2); 0: at once
     resample_padding: NonNegative = 0.01  # alpha, least weight of a frustum, eq. 17; higher samples more evenly

@@ -21,6 +21,7 @@ from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, between
 from ..method import FieldMethod
+from ..method.depth import DepthNumbers
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Config:
     rays: RayNumbers = RayNumbers()
     mask: MaskNumbers = MaskNumbers()
     poses: PoseNumbers = PoseNumbers()
+    measured: DepthNumbers = DepthNumbers()
     hidden_width: Width = 256  # channels of a layer, appendix A; wider holds more detail, and costs time
     learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 5.3; higher: faster, may diverge
     final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, section 5.3

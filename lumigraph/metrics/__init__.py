@@ -21,6 +21,7 @@ KEYS = (
     ("ssim", "SSIM", "", "higher", 4),
     ("lpips", "LPIPS", "", "lower", 4),
     ("clean_psnr", "clean PSNR", "dB", "higher", 2),
+    ("depth_error", "depth error", "% of the distance", "lower", 2),
     ("moving_psnr", "moving PSNR", "dB", "higher", 2),
     ("moving_ssim", "moving SSIM", "", "higher", 4),
 )

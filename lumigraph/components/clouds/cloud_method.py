@@ -22,6 +22,7 @@ from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
 from ...method.capabilities import ColourPairs
+from ...method.depth import depth_layers, depth_terms
 from ..fields.teacher import teacher_of
 from ..training.pose_refinement import PoseRefinement
 from .addition import Addition, Step
@@ -139,7 +140,7 @@ class CloudMethod(Method, ABC):
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
-        photograph = data.photograph(int(train[order[place]]))
+        photograph = data.photograph(int(train[order[place]]), depth_layers(self.config, data))
         self.figures["reduction"] = times = self.reduction(min(photograph.rgb.shape[:2]))
         return photograph.reduced(times).to(self.device)
 
@@ -175,6 +176,8 @@ class CloudMethod(Method, ABC):
             part.mask(self, now)
         now.terms["l1"] = (1 - c.ssim_weight) * (now.rgb - now.target).abs().mean()
         now.terms["ssim"] = c.ssim_weight * (1 - kernels.ssim(now.rgb, now.target))
+        if batch.extra:
+            now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:
             part.regularize(self, now)
         return now.terms

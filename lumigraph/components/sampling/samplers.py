@@ -58,7 +58,7 @@ class ProposalNumbers:
     proposal_samples: Annotated[int, between(4, 1024)] = 64  # samples of a ray in the proposal grid; more cost time
     samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray in the field; more are sharper, slower
     distortion_weight: NonNegative = 0.01  # distortion loss's weight (Barron 2022, eq. 15); higher: fewer floaters
-    depth_weight: NonNegative = 0.03  # weight of stereo depth at first, falling to 0; 0: off
+    stereo_weight: NonNegative = 0.03  # weight of stereo depth at first, falling to 0; 0: off
     air_weight: NonNegative = 0.05  # weight of clear air between cameras in the first half of training; 0: off
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
@@ -132,7 +132,7 @@ class ProposalSampler(Sampler):
         terms = {"proposal": proposal_loss(last.proposals, weights)}
         if self.numbers.distortion_weight:
             terms["distortion"] = self.numbers.distortion_weight * distortion_loss(last.samples, weights)
-        weight = self.numbers.depth_weight * (1 - self.progress / DEPTH_UNTIL)
+        weight = self.numbers.stereo_weight * (1 - self.progress / DEPTH_UNTIL)
         if weight > 0 and len(self.surface):
             chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
             origins = places_between(self.surface_from[chosen], self.stands, generator)
@@ -188,7 +188,7 @@ class ProposalSampler(Sampler):
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
         """Find points on surfaces by multi-view stereo, unless poses are learnt."""
-        if not self.numbers.depth_weight or method.moves_cameras:
+        if not self.numbers.stereo_weight or method.moves_cameras:
             return
         found = some(seen_points(data, STEREO_SHARE * seconds), method.random(1))
         self.surface, self.surface_from = (x.to(self.surface) for x in (found.positions, found.origins))

@@ -16,6 +16,7 @@ from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
@@ -41,6 +42,7 @@ class Config:
     mcmc: McmcNumbers = McmcNumbers()
     filters: MipNumbers = MipNumbers()
     poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    measured: DepthNumbers = DepthNumbers()
     photographs: AppearanceNumbers = AppearanceNumbers()
     distractors: RobustNumbers = RobustNumbers()
     sparse: FewViewNumbers = FewViewNumbers()

@@ -46,9 +46,9 @@ class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
     few_views: Literal["auto", "yes", "no"] = "no"  # regularisation for few photographs; auto: if stereo finds little
-    depth_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
+    roughness_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
     gaussians_per_view: Annotated[int, between(0, 10**6)] = 3000  # cap per photograph, with few_views; 0: none
-    observed_depth_weight: NonNegative = 0.1  # weight of stereo depth in photographs, with few_views; 0: off
+    stereo_weight: NonNegative = 0.1  # weight of stereo depth in photographs, with few_views; 0: off
     surface_weight: NonNegative = 0.2  # weight of stereo surfaces at unobserved views, with few_views; 0: off
 
 
@@ -82,7 +82,7 @@ class FewViews(Addition):
     @property
     def few_view_priors(self) -> tuple[str, ...]:
         numbers, known = self.numbers, len(self.surface) > 0
-        depth = ("smooth depth",) if numbers.depth_weight else ()
+        depth = ("smooth depth",) if numbers.roughness_weight else ()
         surface = ("stereo surfaces at unobserved views",) if numbers.surface_weight and known else ()
         return ("dropout of Gaussians", *depth, *surface) if self.active else ()
 
@@ -111,15 +111,15 @@ class FewViews(Addition):
     def regularize(self, method: Any, step: Step) -> None:
         if not self.active or method.cameras is None:
             return
-        if self.numbers.observed_depth_weight and len(self.surface):
+        if self.numbers.stereo_weight and len(self.surface):
             place, depth, index = visible_points(self.surface, step.camera)
             if len(index):
-                weight = self.numbers.observed_depth_weight * (1 - method.progress)
+                weight = self.numbers.stereo_weight * (1 - method.progress)
                 step.terms["observed_depth"] = weight * depth_error(step.picture, place, depth)
         camera = camera_between(method.cameras, step.chance).to(method.device)
         camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
         seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
-        step.terms["depth"] = self.numbers.depth_weight * depth_roughness(seen)
+        step.terms["depth"] = self.numbers.roughness_weight * depth_roughness(seen)
         if self.numbers.surface_weight and len(self.surface):
             place, depth, index = visible_points(self.surface, camera)
             if len(index):

@@ -23,6 +23,7 @@ from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between
 from ...method import FieldMethod
+from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
 from .fields import DistanceNumbers, HashDistance, NetworkDistance, NeuSField
 from .sampler import NETWORK_CHUNK, TABLE_CHUNK, SectionSampler
@@ -44,6 +45,7 @@ class Config:
     table: HashNumbers = HashNumbers()
     rays: RayNumbers = RayNumbers(64, 64, rays_per_step=512)
     mask: MaskNumbers = MaskNumbers()
+    measured: DepthNumbers = DepthNumbers()
     field: Literal["network", "hash"] = "network"  # distance field: the paper's network, or a faster hash table
     hidden_width: Width = 256  # channels of a hidden layer; wider holds more detail, and costs time
     upsampling_rounds: Annotated[int, between(1, 16)] = 4  # rounds that share the fine samples; more are finer, slower
@@ -161,6 +163,7 @@ class NeuS(FieldMethod):
         self.figures |= {"mse": float(residual.detach().square().mean()), "s": float(self.network.sharpness.detach())}
         shown = 1.0 if batch.alpha is None else batch.alpha.mean().clamp_min(1e-2)
         terms["colour"] = residual.abs().mean() / shown
+        terms |= depth_terms(c, batch.extra, rendering.depth, rendering.opacity)
         points = self._anywhere(len(batch), generator)
         anywhere, filled = self.network.shape.surface(points), self.sampler.empty.may_hold(points)
         if filled is not None:  # nothing else is learnt where the mask says that nothing is

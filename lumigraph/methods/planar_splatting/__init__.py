@@ -27,6 +27,7 @@ from ...errors import LumigraphError
 from ...files.ranges import BatchSize, CloudSize, Count, NonNegative, PositiveShare, Seed, Share, Steps, between
 from ...gaussians.splatting import splat, view_of
 from ...geometry import unit
+from ...method.depth import DepthNumbers
 from ...system.work import at_work
 from .consistency import PlaneView, grey_of, multi_view_errors, near_views, patch_centres, single_view_error
 from .planes import discs, plane_maps
@@ -74,6 +75,7 @@ class Config:
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
     poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    measured: DepthNumbers = DepthNumbers()
     photographs: AppearanceNumbers = AppearanceNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run

@@ -27,6 +27,7 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Posi
 from ...kernels import total_variation
 from ...kernels.harmonic_grid import BANDS
 from ...method import Field, FieldMethod
+from ...method.depth import DepthNumbers, depth_terms
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
 from .sparse_voxels import Cells, SparseVoxels, VoxelRows
@@ -47,6 +48,7 @@ class Config:
         occupancy_decay=0.9,
     )
     proposals: ProposalNumbers = ProposalNumbers()
+    measured: DepthNumbers = DepthNumbers()
     base_resolution: Resolution = 256  # voxels per axis at first, section 3.3; more cost time early
     max_resolution: Resolution = 512  # voxels per axis in the end, by doublings; more give detail, cost memory
     open_base_resolution: Resolution = 128  # voxels per axis at first where there is no bound, the release's
@@ -250,6 +252,7 @@ class Plenoxels(FieldMethod):
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
         terms |= {"colour": residual.square().mean()}
+        terms |= depth_terms(config, batch.extra, rendering.depth, rendering.opacity)
         if config.sparsity:
             terms["sparsity"] = config.sparsity * cauchy(look.density, len(batch))
         if step % config.tv_interval == 0:

@@ -28,6 +28,7 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod
+from ...method.depth import DepthNumbers, depth_terms
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
 from .factorised import FactorGrid, nodes_in, truncate
@@ -42,6 +43,7 @@ class Config:
 
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20, occupancy_threshold=0.005)
     proposals: ProposalNumbers = ProposalNumbers()
+    measured: DepthNumbers = DepthNumbers()
     factors: Literal["vm", "cp"] = "vm"  # factorisation, section 3: vm, planes and lines, or cp, lines alone, smaller
     density_components: Components = 16  # components of each density factor, section 5: 3 x 16 of 192
     appearance_components: Components = 48  # components of each appearance factor, section 5: 3 x 48 of 192
@@ -239,6 +241,7 @@ class TensoRF(FieldMethod):
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         terms |= {"colour": residual.square().mean()}
+        terms |= depth_terms(c, batch.extra, rendering.depth, rendering.opacity)
         if not self.sampler.is_open:
             if weight := c.final_l1_weight if network.stage else c.l1_weight:
                 terms["l1"] = weight * network.density_grid.sparsity()
