@@ -12,6 +12,7 @@ from ..block_hash.cpu import find, slot_of
 NONE = np.int32(EMPTY)
 ONE, HALF, ZERO = np.float32(1), np.float32(0.5), np.float32(0)
 FIRST_SLOTS = 1 << 12
+FAR = np.int32(2**31 - 1)  # coordinate of no block
 
 
 @njit(cache=True, error_model="numpy")
@@ -44,7 +45,7 @@ def _walk(depth, pose, lens, blocks, table, side, truncation, steps, begin, new,
         dx = (pose[0, 0] * u + pose[0, 1] * v + pose[0, 2]) * length
         dy = (pose[1, 0] * u + pose[1, 1] * v + pose[1, 2]) * length
         dz = (pose[2, 0] * u + pose[2, 1] * v + pose[2, 2]) * length
-        last_x, last_y, last_z = np.int32(NONE), np.int32(NONE), np.int32(NONE)
+        last_x, last_y, last_z = FAR, FAR, FAR
         for k in range(steps + 1):
             s = t - truncation + step * np.float32(k)
             x = np.int32(math.floor((pose[0, 3] + s * dx) / side))

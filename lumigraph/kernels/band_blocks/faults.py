@@ -9,4 +9,11 @@ FAULTS = {
     "held blocks are new, on the gpu": ("gpu", "_walk", "find(x, y, z, blocks, table, mask, here) < 0", "t > 0"),
 }
 
-ASTRAY = {"room for one more": ("cpu", "_walk", "count + steps >= len(new)", "count > len(new)")}
+ASTRAY = {
+    "the pixel after the last": (
+        "cpu",
+        "_walk",
+        "depth[pixel // width, pixel % width]",
+        "depth[pixel // width, pixel + 1]",
+    )
+}

@@ -11,7 +11,7 @@ FACTS = Facts(unit="blocks", outputs=1, differentiable=(), typical=3, compiled=3
 PRIMES = 73856093, 19349669, 83492791
 SIDE = 8  # voxels along each axis of a block
 VOXELS = SIDE**3  # voxels of a block, z fastest
-EMPTY = 2**31 - 1  # of a slot without a block
+EMPTY = -1  # of a slot without a block
 
 
 @door
@@ -23,7 +23,7 @@ def block_hash(
         h(x, y, z) = (73856093 x xor 19349669 y xor 83492791 z) mod n
 
     A slot holds the number of a block, or EMPTY. Block i lies in the first slot from h on, cyclically, that no block
-    with a smaller number holds. So the table does not depend on the order of insertion (Blelloch and Golovin 2007),
+    with a larger number holds. So the table does not depend on the order of insertion (Blelloch and Golovin 2007),
     and threads may insert at once.
 
     blocks: coordinates, each once

@@ -1,4 +1,4 @@
-"""Numba: blocks in the order of their numbers, so that none is ever evicted."""
+"""Numba: one block after another. Each evicts a smaller number, which goes on to the next slot."""
 
 import numpy as np
 import torch
@@ -32,9 +32,12 @@ def find(x, y, z, blocks, table):
 @njit(cache=True, error_model="numpy")
 def _insert(blocks, table, first):
     mask = len(table) - 1
-    for number in range(first, len(blocks)):
-        slot = slot_of(blocks[number, 0], blocks[number, 1], blocks[number, 2], mask)
+    for block in range(first, len(blocks)):
+        number = np.int32(block)
+        slot = slot_of(blocks[block, 0], blocks[block, 1], blocks[block, 2], mask)
         while table[slot] != NONE:
+            if table[slot] < number:
+                table[slot], number = number, table[slot]
             slot = (slot + 1) & mask
         table[slot] = number
 

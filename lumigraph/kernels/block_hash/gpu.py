@@ -50,9 +50,9 @@ def _insert(blocks, table, first, count, mask):
     x, y, z = load_block(blocks, first + i, here)
     slot = slot_of(x, y, z, mask)
     while tl.max(here.to(tl.int32), 0) > 0:
-        before = tl.atomic_min(table + slot, number, mask=here)
+        before = tl.atomic_max(table + slot, number, mask=here)
         here = here & (before != NONE)
-        number = tl.maximum(number, before)  # the larger number goes on, be it evicted or not
+        number = tl.minimum(number, before)  # the smaller number goes on, be it evicted or not
         slot = (slot + 1) & mask
 
 

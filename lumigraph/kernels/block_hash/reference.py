@@ -31,7 +31,7 @@ def run(blocks, table, first):
     slot = slot_of(blocks[first:], len(table))
     while len(number):
         before = table[slot]
-        table.scatter_reduce_(0, slot, number, "amin")
+        table.scatter_reduce_(0, slot, number, "amax")
         now = table[slot]
         lost = number != now
         evicted = ~lost & (before != EMPTY)

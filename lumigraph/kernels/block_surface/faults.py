@@ -11,7 +11,7 @@ FAULTS = {
     "weights forgotten": ("cpu", "_fill", "voxels[held, row, 1] > min_weight", "voxels[held, row, 1] >= ZERO"),
     "a colour of nothing": ("cpu", "_write", "voxels[held, other, 2] < ZERO", "False"),
     "edges miscounted": ("cpu", "_write", "(before & 1) + (before >> 1)", "before"),
-    "unknown corners count": ("gpu", "_case", "whole = whole & known", "whole = whole | known"),
+    "weights forgotten, on the gpu": ("gpu", "_distance", "> min_weight", ">= min_weight"),
     "vertices of this block alone, on the gpu": (
         "gpu",
         "_write",

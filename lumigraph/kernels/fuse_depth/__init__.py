@@ -93,6 +93,7 @@ def _inputs(height, width, side, most, generator):
     voxels = torch.where(
         seen[..., None], known * torch.tensor([2.0, 3.0, 1, 1, 1]) - torch.tensor([1.0, 0, 0, 0, 0]), voxels
     )
+    voxels[:, ::5, 2:] = UNCOLOURED  # seen as free space alone
     rgb, trust = torch.rand(height, width, 3, generator=generator), torch.rand(height, width, generator=generator)
     trust[torch.rand(height, width, generator=generator) < 0.1] = 0
     inputs = voxels, blocks, depth, rgb, trust, pose, lens, side / SIDE, truncation, 0.15, most
