@@ -7,6 +7,7 @@ go to standard error. The process ends when its standard input does.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import queue
@@ -17,7 +18,7 @@ import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -328,6 +329,8 @@ def main() -> None:
     threading.Thread(target=listen, args=(jobs,), daemon=True).start()
     while True:
         do(json.loads(jobs.get()))
+        with suppress(AttributeError):  # another C library than glibc
+            ctypes.CDLL(None).malloc_trim(0)  # the next stage has the memory of this one
         tell("done")
 
 
