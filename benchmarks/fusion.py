@@ -1,6 +1,6 @@
 """tsdf-fusion beside Open3D: frames a second, bytes beside a dense grid, errors against exact geometry.
 
-    pip install open3d                                   # optional; without it ours is measured alone
+    pip install open3d==0.19                             # optional; without it ours is measured alone
     python benchmarks/fusion.py --size 320 --views 60
     python benchmarks/fusion.py --size 640 --views 30 --output FILE
 

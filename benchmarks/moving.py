@@ -2,8 +2,8 @@
 
     python benchmarks/moving.py --scene procedural:jelly --size 100 --views 60 --seconds 90
 
-Trains each method, its seconds counted in those of processors, because a machine may be busy. Compares views of held-out
-cameras at training moments, and between them.
+Trains each method, its seconds counted in those of processors, because a machine may be busy. Compares views of
+held-out cameras at training moments, and between them.
 `time-input` is the hash table of nerfies without its motion: the code of the moment is a further input of density.
 PCK is the share of surface points of what moves whose place at another moment is predicted to within 5 % of the
 longest side of the box around what moves; of a method without motion it is the share of points that stay. Each method's

@@ -27,6 +27,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
+from lumigraph.components.fields import appearance
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Scene
 from lumigraph.depth_maps import depth_map
@@ -201,6 +202,7 @@ def fall(losses: list[float]) -> bool:
 def test_it_learns(taught, monkeypatch):
     """Its loss falls, where it has one, and it shows held-out photographs better than one that has learnt nothing."""
     monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph, of methods that refine poses; 200 otherwise
+    monkeypatch.setattr(appearance, "FIT_STEPS", 10)  # for each photograph, of methods with appearance; 100 otherwise
     losses = [row["loss"] for row in taught.straight.metrics() if "loss" in row]
     if losses and not fall(losses):  # as yet
         run = begin(taught.name, taught.data, taught.straight.folder.with_name("later"), taught.device)

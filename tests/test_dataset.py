@@ -12,6 +12,7 @@ import tiny
 import tiny_collection
 import tiny_shapes
 import torch
+import trimesh
 
 from lumigraph import methods
 from lumigraph.capture import kind_of, meshes, open_dataset
@@ -151,6 +152,36 @@ def test_what_is_no_mesh_is_refused_in_one_sentence(tmp_path, content):
     (tmp_path / "a.obj").write_text(content)
     with pytest.raises(LumigraphError, match="a.obj"):
         open_dataset(tmp_path / "a.obj")
+
+
+def test_bad_meshes_are_refused_in_one_sentence(tmp_path, monkeypatch):
+    """NaN corners, triangles without an area, and more triangles than memory holds."""
+    broken = trimesh.creation.box()
+    broken.vertices[0, 0] = np.nan
+    broken.export(tmp_path / "a.ply")
+    with pytest.raises(LumigraphError, match=r"a\.ply has points that are not finite"):
+        open_dataset(tmp_path / "a.ply")
+    (path := tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nv 3 0 0\nf 1 2 3\nf 2 3 4\n")
+    with pytest.raises(LumigraphError, match=r"a\.obj has triangles, and none of them has an area"):
+        open_dataset(path)
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n" + "f 1 2 3\nf 2 3 4\n" * 50_000)
+    monkeypatch.setattr("lumigraph.system.memory.free_memory", lambda: 20_000_000)
+    with pytest.raises(LumigraphError, match=r"a\.obj has 100,000 triangles, which would need 0\.1 GB"):
+        open_dataset(path)
+
+
+def test_normals_that_are_none_do_not_count(tmp_path):
+    """A cloud whose file has a normal of zero or of NaN has no normals, as one whose file has no such columns."""
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(
+        f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz")
+    )
+    for normal, known in (("0 0 2", True), ("0 0 0", False), ("nan 0 1", False)):
+        rows = f"0 0 0 0 0 1\n1 0 0 {normal}\n0 1 0 1 0 0\n"
+        (tmp_path / "a.ply").write_text(head + "end_header\n" + rows)
+        normals = meshes.read_shape(tmp_path / "a.ply", "a").normals
+        assert (normals is not None) == known
+        if normals is not None:
+            assert np.abs(np.linalg.norm(normals, axis=-1) - 1).max() < 1e-9
 
 
 # Collections

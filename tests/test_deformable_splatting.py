@@ -45,8 +45,8 @@ def test_nothing_moves_at_first_and_nothing_leaves_the_scene():
     fresh.motion.active.fill_(True)
     cloud = fresh.filtered()
     at_end = fresh.motion.at(cloud, 3.0)
-    torch.testing.assert_close(at_end.means, cloud.means)
-    torch.testing.assert_close(at_end.log_scales, cloud.log_scales)
+    torch.testing.assert_close(at_end.means, cloud.means, atol=1e-3, rtol=0)
+    torch.testing.assert_close(at_end.log_scales, cloud.log_scales, atol=1e-3, rtol=0)
     method = moving()
     method.motion.heads.bias.data += 1e4
     offset, turn, _ = method.motion.offsets(cloud.means, 2.0)

@@ -86,6 +86,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "demo": ("demo --seconds 1 --output shown", ("shown/", "shown")),
     "capture": ("capture photographs --output placed", ("placed/",)),
+    "depth": ("depth photographs --output deep", ("deep/",)),
 }
 WRITE_NOTHING = {"info", "methods"}
 WITHIN_RUNS = {"resume", "view"}  # see the tests of checkpoints and of what is saved in the viewer

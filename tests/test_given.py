@@ -18,11 +18,11 @@ from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.components.clouds.flat_view import FlatView
 from lumigraph.components.fields.development import decoded, encoded
 from lumigraph.components.training.photometric import brighter, gain_between, spread_of_exposure
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame
+from lumigraph.depth_maps.flat_view import FlatView
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half

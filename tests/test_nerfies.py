@@ -140,6 +140,10 @@ def test_codes_are_those_of_training_moments_and_interpolated_between():
     found = codes(torch.tensor([-1.0, 0.0, 1.0, 1.5, 3.0, 4.0, 9.0]))
     c = codes.codes
     torch.testing.assert_close(found, torch.stack([c[0], c[0], c[1], (c[1] + c[2]) / 2, (c[2] + c[3]) / 2, c[3], c[3]]))
+    waves = MomentCodes(scene.frame, 4, waves=True)
+    waves.begin(None, scene, math.inf)
+    half = 0.5 * torch.tensor([[0.0, 1, 0, 1], [1, 0, 0, -1], [0, -1, 0, 1]])  # at the first, middle and last moment
+    torch.testing.assert_close(waves.codes[[0, 2, 3]].detach(), half, atol=1e-6, rtol=0)
     assert [control.name for control in codes.controls] == ["time"] and MomentCodes(Frame(), 3).controls == ()
 
 

@@ -90,9 +90,8 @@ def test_a_warp_keeps_the_inside_and_the_longest_side():
 def test_codes_are_kept_of_members_as_they_are():
     """Clouds of other members are warped with their points, whose occupancy stays."""
     shapes = replace(tiny_shapes.several(), splits=BOTH)
-    method = OccupancyNetwork(
-        shapes.frame, replace(OccupancyNetwork.smallest(), shapes_per_step=32, bend=0.5, stretch=0.3)
-    )
+    c = replace(OccupancyNetwork.smallest(), cloud_points=2000, shapes_per_step=32, bend=0.5, stretch=0.3)
+    method = OccupancyNetwork(shapes.frame, c)
     method.begin(shapes)
     lesson = method.batch(shapes, torch.Generator().manual_seed(0))
     assert 0 < int(lesson.plain.sum()) < 32
@@ -105,6 +104,24 @@ def test_codes_are_kept_of_members_as_they_are():
     method.loss(lesson, 0)
     kept = set(lesson.points.member.view(32, -1)[lesson.plain, 0].tolist())
     assert set(method.codes.learnt.nonzero()[:, 0].tolist()) == kept
+
+
+def test_the_surface_is_fitted_to_a_cloud(learnt):
+    """A code that an encoder got a little wrong: its surface passes through the cloud's points again."""
+    if learnt.config.input != "points":
+        pytest.skip("clouds alone are fitted to")
+    learnt.config = replace(learnt.config, code_steps=60)
+    cloud = tiny_shapes.box().surface(300, torch.Generator().manual_seed(0)).points
+    right = learnt.encoder(cloud[None])[0].detach()
+    wrong = right + 0.4 * learnt.codes.rows[learnt.codes.learnt].std(0)
+
+    def off(code):
+        return float(learnt.decoder(cloud[None], code[None]).abs().mean())
+
+    with torch.no_grad():
+        assert off(learnt._through(cloud, wrong)) < 0.9 * off(wrong)
+    learnt.config = replace(learnt.config, code_steps=0)
+    assert torch.equal(learnt._through(cloud, wrong), wrong)
 
 
 def test_normalisation_is_scaled_and_shifted_by_the_code():

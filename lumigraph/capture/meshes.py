@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from plyfile import PlyData
 
@@ -16,7 +17,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import natural
-from ..system.memory import free_memory
+from ..system.memory import ask_for, free_memory
 from ..system.progress import track
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
@@ -24,6 +25,7 @@ Z_UP_SUFFIXES = (".stl", ".off")  # by custom with +z up; the others have +y up
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # to +z
 MAX_COORDINATE, ZERO_EXTENT = 1e12, 1e-12  # units of a file, from its origin; largest extent that counts as zero
 DEFAULT_GREY = 160  # for meshes without colour
+TRIANGLE_BYTES = 500  # of memory for each triangle: its corners, and the tree over all of them
 
 
 def recognises(path: Path) -> bool:
@@ -72,12 +74,17 @@ def read_shape(path: Path, name: str) -> Shape:
         raise LumigraphError(f"{path} holds neither triangles nor points; name another file")
     if not all(map(is_sound, meshes or clouds[:1])):
         raise LumigraphError(f"{path} has corners without three numbers, or triangles of corners that it has not")
+    count = sum(len(part.faces) for part in meshes)
+    what, remedy = f"{path} has {count:,} triangles, which", "reduce their number in a mesh editor"
+    ask_for(TRIANGLE_BYTES * count, torch.device("cpu"), what, remedy)
     made = joined(meshes) if meshes else cloud(clouds[0])
     if not (np.abs(made.vertices) <= MAX_COORDINATE).all() or not np.ptp(made.vertices, 0).max() > ZERO_EXTENT:
         raise LumigraphError(
             f"{path} has points that are not finite or farther than {MAX_COORDINATE:g} units, or all in one place; "
             "name another file"
         )
+    if meshes and not len(made.faces):
+        raise LumigraphError(f"{path} has triangles, and none of them has an area; export it once more")
     return normalised(
         name, made, None if meshes else normals_of(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP
     )
@@ -128,7 +135,7 @@ def cloud(part: Any) -> Mesh:
 
 
 def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
-    """The normals of a cloud of points, of unit length; None where its file has none."""
+    """The normals of a cloud of points, of unit length; None without, or with any that is 0 or NaN."""
     if path.suffix.lower() != ".ply":
         return None
     try:
@@ -138,7 +145,8 @@ def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
     if not {"nx", "ny", "nz"} <= set(table.dtype.names):
         return None
     found = np.stack([table[axis].astype(np.float64) for axis in ("nx", "ny", "nz")], -1)
-    return found / np.maximum(np.linalg.norm(found, axis=-1, keepdims=True), 1e-12)
+    length = np.linalg.norm(found, axis=-1, keepdims=True)
+    return found / length if (length > 0).all() and np.isfinite(length).all() else None
 
 
 def name_of(file: Path, folder: Path) -> str:

@@ -30,7 +30,7 @@ Bend = Annotated[float, between(-1e4, 1e4)]
 
 
 @dataclass(frozen=True)
-class Dataset:
+class PhotographList:
     """Fields of dataset.json: ids of all photographs, and of those that test."""
 
     ids: list[Name]
@@ -39,7 +39,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class Moment:
+class PhotographRecord:
     """Fields of a photograph in metadata.json. HyperNeRF's `time_id` takes precedence over Nerfies' `warp_id`."""
 
     warp_id: Coordinate | None = None
@@ -90,9 +90,9 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError for malformed JSON and for photographs without a moment."""
-    listed = read_json(folder / "dataset.json", Dataset)
+    listed = read_json(folder / "dataset.json", PhotographList)
     path = folder / "metadata.json"
-    moments = {name: typed(Moment, about, f"{path}: {name}") for name, about in read_json(path).items()}
+    moments = {name: typed(PhotographRecord, about, f"{path}: {name}") for name, about in read_json(path).items()}
     place = read_json(folder / "scene.json", SceneRecord) if is_file(folder / "scene.json") else SceneRecord()
     near, far = (None if x is None else x / place.scale for x in (place.near, place.far))
     sizes = sorted((int(f.name[:-1]), f) for f in (folder / "rgb").glob("*x") if f.name[:-1].isdecimal())

@@ -64,7 +64,14 @@ def read(folder: Path) -> Capture:
         shots.append(
             Shot(name, read_pose(poses[pose]), lens, IMAGE_SIZE, {1: folder / name}, time=float(moment), planes=planes)
         )
-    return with_depth_points(Capture(str(folder), shots, missing=missing))
+    given = {"groundtruth.txt": moments, "rgb.txt": np.array([float(row[0]) for row in pictures])}
+    notes = [
+        f"{folder / name}: moments go back {int((np.diff(times) < 0).sum())} times; pictures and poses are paired by "
+        "the nearest moment, and pictures are taken in the order of their names"
+        for name, times in given.items()
+        if (np.diff(times) < 0).any()
+    ]
+    return with_depth_points(Capture(str(folder), shots, missing=missing, notes=notes))
 
 
 def read_rows(path: Path, columns: int) -> list[list[str]]:

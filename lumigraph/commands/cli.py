@@ -40,6 +40,7 @@ from .compose import Compose
 from .compress import Compress
 from .convert import Convert
 from .demo import Demo
+from .depth import Depth
 from .eval import Eval
 from .explain import Explain
 from .export import Export
@@ -108,6 +109,7 @@ def held(command: Any) -> Any:
 COMMANDS: dict[str, type] = {
     "demo": Demo,
     "capture": CaptureCommand,
+    "depth": Depth,
     "train": Train,
     "track": Track,
     "resume": Resume,

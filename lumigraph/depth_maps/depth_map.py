@@ -136,7 +136,7 @@ class DepthMap:
     def measured(
         camera: Camera, depth: Float[Tensor, "height width"], rgb: Float[Tensor, "height width 3"]
     ) -> DepthMap:
-        """Depth map of a sensor, a depth file or a plane sweep. Opacity is 1 where something was measured, else 0.
+        """Depth map of a sensor, a depth file or multi-view stereo. Opacity is 1 where something was measured, else 0.
 
         depth: along rays, scene units, as a photograph's layer has it (`Photograph.extra["depth"]`); infinity where
                nothing is, NaN where nothing was measured

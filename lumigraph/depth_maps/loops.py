@@ -63,3 +63,39 @@ def fuse(pixels, valid, away, depth, facing, least, edges, truncations, total, w
                 total[i] += share * min(ahead / truncation, 1.0)
                 weight[i] += share
                 truncated[i] += share * truncation
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def incidence(depth, directions, out):
+    """Cosine between each pixel's ray and the normal of its surface, from differences to the nearer of two neighbours
+    along each axis; 0 where the depth is not known, or that of both neighbours.
+
+    directions: (height, width, 3), unit length
+    """
+    height, width = depth.shape
+    for y in prange(height):
+        for x in range(width):
+            here, out[y, x] = depth[y, x], 0.0
+            if not (here > 0 and here < math.inf):
+                continue
+            left, right = depth[y, max(x - 1, 0)], depth[y, min(x + 1, width - 1)]
+            above, below = depth[max(y - 1, 0), x], depth[min(y + 1, height - 1), x]
+            # Comparisons with NaN are false, so a neighbour that is not known is not the nearer one.
+            along_x = 1 if x + 1 < width and not (x > 0 and abs(left - here) <= abs(right - here)) else -1
+            along_x = -1 if x > 0 and not abs(right - here) < math.inf else along_x
+            along_y = 1 if y + 1 < height and not (y > 0 and abs(above - here) <= abs(below - here)) else -1
+            along_y = -1 if y > 0 and not abs(below - here) < math.inf else along_y
+            beside, under = depth[y, x + along_x], depth[y + along_y, x]
+            if not (beside > 0 and beside < math.inf and under > 0 and under < math.inf):
+                continue
+            dx, dy, dz = directions[y, x, 0], directions[y, x, 1], directions[y, x, 2]
+            ax = beside * directions[y, x + along_x, 0] - here * dx
+            ay = beside * directions[y, x + along_x, 1] - here * dy
+            az = beside * directions[y, x + along_x, 2] - here * dz
+            bx = under * directions[y + along_y, x, 0] - here * dx
+            by = under * directions[y + along_y, x, 1] - here * dy
+            bz = under * directions[y + along_y, x, 2] - here * dz
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            length = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if length > 0:
+                out[y, x] = abs(nx * dx + ny * dy + nz * dz) / length

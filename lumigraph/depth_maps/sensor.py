@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera import Camera
+from ..camera.lens import Lens
 from ..datasets.scene import Scene
 from ..geometry import evenly
+from . import loops
 from .depth_map import DepthMap
 
 MIN_FACING = 0.1  # cosine between ray and normal below which a pixel is not trusted
@@ -26,11 +31,21 @@ def trust_of(seen: DepthMap, trusted: float, farthest: float) -> Float[Tensor, "
     with the fourth power. 0 where nothing is measured, at grazing angles and beyond `farthest`.
     trusted: 0 for everywhere
     """
-    facing, depth = seen.facing, seen.depth
+    depth, facing = seen.depth.contiguous(), torch.empty_like(seen.depth)
+    width, height = seen.camera.size[0].tolist()
+    towards = directions(json.dumps(seen.camera.lens.to_json()), width, height)
+    loops.incidence(depth.numpy(), towards.numpy(), facing.numpy())
     weight = torch.where((facing > MIN_FACING) & (depth < farthest), facing, 0.0)
     if trusted > 0:
         weight = weight * (trusted / depth.nan_to_num(math.inf).clamp_min(1e-9)).clamp(max=1).pow(4)
     return weight.nan_to_num(0.0, 0.0)
+
+
+@lru_cache(maxsize=4)
+def directions(lens: str, width: int, height: int) -> Float[Tensor, "height width 3"]:
+    """Unit directions of all pixels in the camera's frame. lens: as JSON"""
+    camera = Camera(torch.eye(3, 4)[None], Lens.from_json(json.loads(lens)), torch.tensor([[width, height]]))
+    return camera.lens.unproject(camera.pixels()).view(height, width, 3).contiguous()
 
 
 def sensor_faults(scene: Scene) -> list[str]:
@@ -65,7 +80,7 @@ def sensor_faults(scene: Scene) -> list[str]:
             f"probably wrong by a factor of {factor:,}, so correct that, or the poses' unit"
         )
     typical = float(torch.tensor(medians).median())
-    if not ratios and not MIN_ROOM < typical < MAX_ROOM:
+    if 1 / MAX_RATIO < ratio < MAX_RATIO and not MIN_ROOM < typical < MAX_ROOM:  # points may be of the same depth
         told.append(
             f"{scene.source}: the median depth is {typical:.3g} metres, which no depth camera measures; its unit is "
             "probably wrong by a factor of 1000, so correct it"
@@ -73,7 +88,7 @@ def sensor_faults(scene: Scene) -> list[str]:
     return told
 
 
-def _ratios(camera, depth: Float[Tensor, "height width"], points: Float[Tensor, "point 3"]) -> list[float]:
+def _ratios(camera: Camera, depth: Float[Tensor, "height width"], points: Float[Tensor, "point 3"]) -> list[float]:
     """Measured depth over the distance of sparse points, where both are known."""
     places, inside = camera.locate(points)
     away = (points - camera.position).norm(dim=-1)

@@ -16,7 +16,9 @@ from ..kernels.fuse_depth import CHANNELS, empty_voxels
 from .depth_map import DepthMap
 from .pinholes import pinhole_maps
 
-GROWTH = 1.5  # times the blocks that memory is taken for, when it is used up
+GROWTH = 2.0  # times the blocks that memory is taken for, when it is used up; what is not yet touched costs nothing
+FIRST_BLOCKS = 4096  # that memory is taken for at first
+PIXELS_PER_SIDE, MAX_PIXEL_STEP = 4, 4  # pixels that ask for blocks to a side of a block; beyond which none are skipped
 MAX_LOAD = 0.5  # blocks to a slot of the table
 EDGE = 0.08  # of the least depth of four neighbouring pixels, from which on they show two surfaces
 EMPTY_DISTANCE = 0.9  # of the truncation: a block without a voxel nearer to a surface shows none
@@ -64,12 +66,24 @@ class VoxelBlocks(nn.Module):
             given = (x.to(self.voxels.device) for x in (part.depth, part.rgb, part.trust, part.pose, part.lens))
             depth, rgb, trusted, pose, lens = (x.contiguous() for x in given)
             depth = torch.where(trusted > 0, depth, torch.nan)
-            side = SIDE * self.edge
-            new = kernels.band_blocks(depth, pose, lens, self.blocks, self.table, side, self.truncation)
-            room = self._add(new) and room
-            given = depth, rgb, trusted, pose, lens, self.edge, self.truncation, EDGE, self.max_weight
-            kernels.fuse_depth(self.voxels, self.blocks, *given, in_place=True)
+            room = self._add(self._new_blocks(depth, pose, lens)) and room
+            numbers = self.edge, self.truncation, EDGE, self.max_weight
+            kernels.fuse_depth(self.voxels, self.blocks, depth, rgb, trusted, pose, lens, *numbers, in_place=True)
         return room
+
+    def _new_blocks(
+        self, depth: Float[Tensor, "height width"], pose: Float[Tensor, "3 4"], lens: Float[Tensor, " 4"]
+    ) -> Int32[Tensor, "new 3"]:
+        """Blocks around surfaces that are not there yet: by rays of pixels, PIXELS_PER_SIDE to the side of a block at
+        the median depth."""
+        side, known = SIDE * self.edge, depth[::8, ::8].nan_to_num(0.0, 0.0)
+        measured = known[known > 0]
+        typical = float(measured.median()) if measured.numel() else 0.0
+        step = int(side * float(lens[:2].min()) / max(PIXELS_PER_SIDE * typical, 1e-9))
+        step = min(max(step, 1), MAX_PIXEL_STEP)
+        some, numbers = depth[::step, ::step].contiguous(), lens / step
+        numbers[2:] += 0.5 - 0.5 / step  # centres of pixels stay where they are
+        return kernels.band_blocks(some, pose, numbers, self.blocks, self.table, side, self.truncation)
 
     def _add(self, new: Int32[Tensor, "new 3"]) -> bool:
         """Append blocks that nothing is known of; False if there is no room for them."""
@@ -77,8 +91,8 @@ class VoxelBlocks(nn.Module):
         if count > self.max_blocks:
             return False
         if len(new):
-            self.blocks = _extended(self.blocks, new)
-            self.voxels = _extended(self.voxels, empty_voxels(len(new), new.device))
+            self.blocks = _extended(self.blocks, count, new)
+            self.voxels = _extended(self.voxels, count, empty_voxels(1, new.device))
             if count > MAX_LOAD * len(self.table):
                 self.rehash()
             else:
@@ -129,15 +143,17 @@ class VoxelBlocks(nn.Module):
         return self.edge * places, rgb, faces
 
 
-def _extended(rows: Tensor, new: Tensor) -> Tensor:
-    """Rows and new ones behind them, in the same memory as long as there is room in it."""
-    count = len(rows) + len(new)
-    shape, size = (count, *rows.shape[1:]), max(math.prod(rows.shape[1:]), 1)
-    room = rows.untyped_storage().nbytes() // rows.element_size() // size
-    if room < count or rows.storage_offset():
-        larger = rows.new_empty(max(count, int(GROWTH * len(rows))), *rows.shape[1:])
-        larger[: len(rows)] = rows
+def _extended(rows: Tensor, count: int, new: Tensor) -> Tensor:
+    """Rows and new ones behind them up to a count, in the same memory as long as there is room in it.
+
+    new: what the new ones hold, of any shape that expands to theirs
+    """
+    held, size = len(rows), math.prod(rows.shape[1:]) * rows.element_size()
+    if rows.untyped_storage().nbytes() < count * size or rows.storage_offset():
+        shape = max(count, FIRST_BLOCKS, int(GROWTH * held)), *rows.shape[1:]
+        larger = rows.new_empty(shape)
+        larger[:held] = rows
         rows = larger
-    grown = rows.new_empty(0).set_(rows.untyped_storage(), 0, shape)
-    grown[count - len(new) :] = new
+    grown = rows.new_empty(0).set_(rows.untyped_storage(), 0, (count, *rows.shape[1:]))  # type: ignore[call-overload]
+    grown[held:] = new
     return grown

@@ -1,4 +1,4 @@
-"""What is held out of a capture that moves: cameras, moments or both."""
+"""Kinds of held-out views of a capture that moves: new cameras, new moments, or both."""
 
 from __future__ import annotations
 

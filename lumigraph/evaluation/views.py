@@ -49,6 +49,7 @@ LIGHT_PROTOCOL = (
 )
 
 Picture = Float[Tensor, "height width 3"]
+Likeness = Float[Tensor, "inner_height inner_width 3"]  # SSIM of the windows within a picture
 
 
 @dataclass(frozen=True)
@@ -323,7 +324,7 @@ def compare(
 
 
 def of_pixels(
-    rgb: Picture, photograph: Picture, likeness: Picture, mask: Bool[Tensor, "height width"] | None
+    rgb: Picture, photograph: Picture, likeness: Likeness, mask: Bool[Tensor, "height width"] | None
 ) -> tuple[float | None, float | None]:
     """PSNR and SSIM of a mask's pixels; None where there are none. likeness: `ssim_map` of the whole"""
     if mask is None or not mask.any():
@@ -331,7 +332,7 @@ def of_pixels(
     return psnr(rgb[mask], photograph[mask]), of_windows(likeness, mask)
 
 
-def of_windows(likeness: Picture, mask: Bool[Tensor, "height width"]) -> float | None:
+def of_windows(likeness: Likeness, mask: Bool[Tensor, "height width"]) -> float | None:
     """Mean SSIM of the windows whose middle is in a mask; None where there are none."""
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]

@@ -103,16 +103,16 @@ def extract_mesh(
     holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
     grid, way = make_grid(limits, cell), way or best_way(method)[0]
     faces = TEXTURED_FACES if faces is None and texture is not None else faces
-    own = own_mesh(method, holds, keep, smooth, faces) if way == "own" else None
-    if own is not None and texture is None:
-        return own
+    made = own_mesh(method, holds, keep, smooth, faces) if way == "own" else None
+    if made is not None and texture is None:
+        return made
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
     sources: list[Views] = [lambda _: rendered(depth_maps)]
     if photographs is not None:
         chosen = evenly(range(len(cameras)), views)
         sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
-    if own is not None and texture is not None:
-        surface = own.vertices, own.faces
+    if made is not None and texture is not None:
+        surface = made.vertices, made.faces
         return textured(surface, sources, HIDDEN_CELLS * grid.cell, texture, surface)
     step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
     value = from_depth(depth_maps, grid.cell, closed)

@@ -6,6 +6,17 @@ the model that it came from; COLMAP's lenses know more than LLFF's. `--reader` o
 
 from __future__ import annotations
 
-READERS = ("transforms", "blender", "nerfies", "nr_nerf", "tum", "seven_scenes", "colmap", "llff")
+READERS = (
+    "transforms",
+    "blender",
+    "nerfies",
+    "nr_nerf",
+    "tum",
+    "seven_scenes",
+    "nice_slam",
+    "phones",
+    "colmap",
+    "llff",
+)
 NAMES = tuple(name.replace("_", "-") for name in READERS)  # what a user types
 LISTED = f"{', '.join(NAMES[:-1])} or {NAMES[-1]}"

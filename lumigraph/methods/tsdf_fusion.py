@@ -104,7 +104,7 @@ class TSDFFusion(RayMethod):
             warnings.warn(sentence, LumigraphWarning, stacklevel=2)
         self.count.fill_(len(data.splits["train"]))
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:  # type: ignore[override]
         """The next photograph with its depth, in the order of their names."""
         train = data.splits["train"]
         return data.photograph(int(train[min(int(self.fused), len(train) - 1)]), ("depth",))

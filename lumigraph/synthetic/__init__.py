@@ -112,11 +112,11 @@ def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None 
         for i in range(len(cameras))
     ]
     background = (0.0, 0.0, 0.0) if visible else (1.0, 1.0, 1.0)
-    low, high = (tuple(stage.unit * x for x in corner) for corner in stage.bounds)
+    (a, b, c), (d, e, f) = ([stage.unit * x for x in corner] for corner in stage.bounds)
     return Capture(
         source,
         shots,
-        bounds=(low, high),
+        bounds=((a, b, c), (d, e, f)),
         reach=stage.unit * stage.reach,
         near=stage.unit * stage.near,
         background=background,

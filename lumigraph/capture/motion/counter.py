@@ -25,7 +25,7 @@ def watch(database: str, table: str, since: str) -> None:
             with closing(sqlite3.connect(where, uri=True)) as connection:
                 count = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
             before = count if before is None else before
-            print(count - before, flush=True)
+            os.write(sys.stdout.fileno(), f"{count - before}\n".encode())  # a line is written whole or not at all
         except sqlite3.OperationalError:  # COLMAP is writing just now, or has not begun to
             pass
         time.sleep(POLL_SECONDS)

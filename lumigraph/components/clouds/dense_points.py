@@ -1,196 +1,61 @@
-"""A dense cloud of points from photographs with known cameras: plane sweeps, kept where neighbours agree.
-
-Each photograph is compared with some neighbours at many depths (Collins 1996); the depth of least cost stands where
-neighbours, swept by themselves, find the same place (Merrell 2007).
-"""
+"""A dense cloud of points from photographs with known cameras, by multi-view stereo (`depth_maps.multi_view`)."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ... import kernels
 from ...datasets.scene import Scene
-from ...geometry import evenly
-from ...system.progress import track
-from .flat_view import FlatView, flat_view
+from ...depth_maps import DepthMap, SurfacePoints
+from ...depth_maps.multi_view import multi_view_depth
 
-MAX_VIEWS, MIN_VIEWS = 48, 8  # photographs asked at most, and however short the time
-MAX_SIDE, COARSE_SIDE = 160, 80  # pixels of their longer side, and where no depth is known yet
-NEIGHBOURS, BEST = 4, 2  # of each photograph, and how many of them must see a place
-ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # at which rays should meet; deviations around it
-ANCHORS = 200  # places by which two views are asked whether they see the same
-MIN_HYPOTHESES, MAX_HYPOTHESES, MIN_POINTS = 16, 80, 16
-NEARER, FARTHER = 0.7, 2.0  # times the depths of known points: the range that is searched
-MAX_COST = 0.4  # at most: a correlation of 0.6
-AGREEMENT = 0.02  # of its depth: how far apart two views may find a place
-WINDOW = 5  # pixels
+MAX_SIDE = 200  # pixels along the longer side of a depth map
 
 
 @dataclass(frozen=True)
 class Points:
-    """Places in the scene's frame, their colours in [0, 1], and how large a pixel is there.
+    """Points of surfaces in the scene's frame.
 
+    normals: unit length, towards the camera
+    colours: in [0, 1]
+    sizes:   of a pixel there
     origins: positions of the cameras that found them
-    share:   of the swept pixels at which a point was found
+    share:   of the pixels at which a point was found
     """
 
     positions: Float[Tensor, "point 3"]
     colours: Float[Tensor, "point 3"]
     sizes: Float[Tensor, " point"]
     origins: Float[Tensor, "point 3"]
+    normals: Float[Tensor, "point 3"]
     share: float = 1.0
 
 
-@torch.no_grad()
 def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
-    """Points on what at least two or three of the training photographs see, a pixel or so apart; maybe none.
+    """Points at pixels of training photographs whose depth neighbours confirm; maybe none.
 
-    seconds: that sweeping may take, about; fewer photographs are asked where all would take longer
-    Depths are searched around the scene's sparse points; where there are none, around what smaller pictures tell.
+    seconds: that matching may take, about
     """
-    chosen = evenly(scene.splits["train"].tolist(), MAX_VIEWS)
-    views = [flat_view(scene.photograph(i), MAX_SIDE) for i in chosen]
-    known = scene.points
-    if known is None or len(known) < ANCHORS:
-        small = [flat_view(scene.photograph(i), COARSE_SIDE) for i in chosen]
-        seconds = seconds / 2
-        known = swept(small, [everywhere(view, scene) for view in small], "Looking for depth", seconds).positions
-    ranges = [around(view, known) or everywhere(view, scene) for view in views]
-    return swept(views, ranges, "Sweeping for points", seconds)
+    return points_of(multi_view_depth(scene, MAX_SIDE, seconds))
 
 
-def compile_sweep() -> None:
-    """Make the kernel ready, on one dark pixel, so that it takes no time of who calls `seen_points`."""
-    dark, warp = torch.zeros(1, 1, 1), torch.eye(3, 4)[None]
-    kernels.plane_sweep(dark[0], dark[0], dark, dark, warp, torch.ones(1), WINDOW, 1)
-
-
-def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:
-    """From where the scene begins before a view to where it ends."""
-    away, radius = float(view.pose[:, 3].norm()), math.sqrt(3) * scene.frame.reach
-    return max(scene.frame.near, away - radius), away + radius
-
-
-def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, float] | None:
-    """The range of depths of the known points before a view, with some room; None if they are few."""
-    seen, _, _, depth = view.sees(known)
-    if int(seen.sum()) < MIN_POINTS:
-        return None
-    near, far = depth[seen].quantile(torch.tensor([0.01, 0.99])).tolist()
-    return NEARER * near, FARTHER * far
-
-
-def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str, seconds: float) -> Points:
-    """Points of the views where their neighbours agree; of as many views as can be swept in so many seconds."""
-    if seconds < math.inf:
-        some = evenly(list(range(len(views))), affordable(views, ranges, seconds))
-        views, ranges = [views[i] for i in some], [ranges[i] for i in some]
-    neighbours = choose_neighbours(views, ranges)
-    depths = []
-    for i in track(range(len(views)), what, len(views)):
-        depths.append(sweep(views[i], [views[j] for j in neighbours[i]], ranges[i]))
-    positions, colours, sizes = [torch.zeros(0, 3)], [torch.zeros(0, 3)], [torch.zeros(0)]
-    origins = [torch.zeros(0, 3)]
-    for i, view in enumerate(views):
-        found = depths[i] > 0
-        places = view.pose[:, 3] + view.rays[found] * depths[i][found][:, None]
-        agree = torch.zeros(len(places), dtype=torch.int)
-        for j in neighbours[i]:
-            seen, row, column, depth = views[j].sees(places)
-            agree += seen & ((depths[j][row, column] / depth - 1).abs() < AGREEMENT)
-        kept = agree >= (2 if len(neighbours[i]) > 2 else 1)
-        positions.append(places[kept])
-        colours.append(view.rgb[found][kept])
-        sizes.append(depths[i][found][kept] / view.intrinsics[0, 0])
-        origins.append(view.pose[:, 3].expand(int(kept.sum()), 3))
-    share = sum(len(x) for x in positions) / max(sum(view.trust.numel() for view in views), 1)
-    return Points(torch.cat(positions), torch.cat(colours), torch.cat(sizes), torch.cat(origins), share)
-
-
-def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
-    """Number of views that can be swept in so many seconds, by the time of one."""
-    begin, middle = time.perf_counter(), len(views) // 2
-    positions = torch.stack([view.pose[:, 3] for view in views])
-    sweep(views[middle], [views[j] for j in best_neighbours(middle, views, positions, ranges[middle])], ranges[middle])
-    return max(int(seconds / (time.perf_counter() - begin)), MIN_VIEWS)
-
-
-def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, float]) -> Float[Tensor, "height width"]:
-    """Depth along the axis of each pixel, 0 where none is sure."""
-    if not neighbours:
-        return torch.zeros_like(view.trust)
-    warps = torch.stack([view.warp_to(other) for other in neighbours])
-    near, far = 1 / span[0], 1 / span[1]
-    count = min(max(math.ceil(disparity(view, warps, near, far)) + 1, MIN_HYPOTHESES), MAX_HYPOTHESES)
-    hypotheses = torch.linspace(far, near, count)
-    pictures, trust = (padded([getattr(x, name) for x in neighbours]) for name in ("grey", "trust"))
-    best = min(BEST, len(neighbours))
-    cost = kernels.plane_sweep(view.grey, view.trust, pictures, trust, warps, hypotheses, WINDOW, best)
-    least, plane = cost.min(0)
-    # The lowest place of the parabola through the least cost and the costs beside it.
-    beside = [cost.gather(0, (plane + k).clamp(0, count - 1)[None])[0] for k in (-1, 1)]
-    bend = (beside[0] + beside[1] - 2 * least).clamp_min(1e-6)
-    inverse = far + (plane + 0.5 * (beside[0] - beside[1]) / bend) * ((near - far) / (count - 1))
-    sure = (least < MAX_COST) & (plane > 0) & (plane < count - 1) & (view.trust > 0.99)
-    return torch.where(sure, 1 / inverse, 0)
-
-
-def disparity(view: FlatView, warps: Float[Tensor, "neighbour 3 4"], near: float, far: float) -> float:
-    """Pixels between the nearest and farthest hypothesis of a view's middle in its neighbours, within their width."""
-    height, width = view.trust.shape
-    middle = torch.tensor([width / 2, height / 2, 1.0])
-    places = [warps[:, :, :3] @ middle + h * warps[:, :, 3] for h in torch.linspace(far, near, 64).tolist()]
-    seen = torch.stack([p[:, :2] / p[:, 2:].clamp_min(1e-6) for p in places])
-    steps = seen.diff(dim=0).norm(dim=-1)
-    inside = (seen - middle[:2]).abs().amax(-1) < max(height, width)
-    return float((steps * inside[1:]).sum(0).max())
-
-
-def padded(pictures: Sequence[Float[Tensor, "_ _"]]) -> Float[Tensor, "picture height width"]:
-    """Pictures of any sizes as one tensor, zero beyond each."""
-    size = torch.tensor([p.shape for p in pictures]).amax(0).tolist()
-    out = torch.zeros(len(pictures), *size)
-    for one, picture in zip(out, pictures, strict=True):
-        one[: picture.shape[0], : picture.shape[1]] = picture
-    return out
-
-
-def choose_neighbours(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]]) -> list[list[int]]:
-    """For each view those others that see most of what it sees, from neither too near nor too far aside."""
-    positions = torch.stack([view.pose[:, 3] for view in views])
-    return [best_neighbours(i, views, positions, ranges[i]) for i in range(len(views))]
-
-
-def best_neighbours(
-    i: int, views: Sequence[FlatView], positions: Float[Tensor, "view 3"], span: tuple[float, float]
-) -> list[int]:
-    """Asked at places on a coarse grid of pixels at some depths."""
-    view = views[i]
-    height, width = view.trust.shape
-    grid = view.rays[height // 10 :: height // 5 + 1, width // 10 :: width // 5 + 1].reshape(-1, 3)
-    depths = torch.logspace(math.log10(span[0]), math.log10(span[1]), 6)[1:-1]
-    places = view.pose[:, 3] + (grid * depths[:, None, None]).reshape(-1, 3)
-    here = torch.nn.functional.normalize(places - view.pose[:, 3], dim=-1)
-    scores = torch.zeros(len(views))
-    for j, other in enumerate(views):
-        there = torch.nn.functional.normalize(places - positions[j], dim=-1)
-        angle = (here * there).sum(-1).clamp(-1, 1).acos()
-        off = (angle - ANGLE) / torch.where(angle < ANGLE, NARROWER, WIDER)
-        scores[j] = (other.sees(places)[0] * torch.exp(-0.5 * off * off)).mean()
-    scores[i] = 0
-    order = scores.argsort(descending=True)[:NEIGHBOURS]
-    return [j for j in order.tolist() if scores[j] > 0.02]
+def points_of(maps: list[DepthMap]) -> Points:
+    """Points of all sure pixels of depth maps."""
+    found = SurfacePoints.cat([seen.points() for seen in maps])
+    sizes = [
+        seen.depth[seen.solid] / float(seen.camera.lens.focal[0, 0])  # type: ignore[attr-defined]
+        for seen in maps
+    ]
+    share = len(found) / max(sum(seen.depth.numel() for seen in maps), 1)
+    return Points(found.points, found.colours, torch.cat(sizes), found.origins, found.normals, share)
 
 
 def thinned(points: Points, spacing: float = 1.0) -> Points:
-    """The means of points that lie in one cell; cells are as large as `spacing` pixels there, to within a half."""
+    """Means of points that lie in one cell; cells are as large as `spacing` pixels there, to within a half."""
     level = (points.sizes * spacing).log2().round().int()
     cell = (points.positions / torch.exp2(level)[:, None]).floor().long()
     key = torch.cat([level[:, None].long(), cell], 1)
@@ -200,4 +65,5 @@ def thinned(points: Points, spacing: float = 1.0) -> Points:
         total = values.new_zeros(len(count), *values.shape[1:]).index_add_(0, place, values)
         return total / count.view(-1, *[1] * (values.ndim - 1))
 
-    return Points(mean(points.positions), mean(points.colours), mean(points.sizes), mean(points.origins), points.share)
+    names = ("positions", "colours", "sizes", "origins", "normals")
+    return Points(**{name: mean(getattr(points, name)) for name in names}, share=points.share)

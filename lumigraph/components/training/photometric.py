@@ -14,11 +14,11 @@ from torch.nn.functional import huber_loss, normalize
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...datasets.scene import Batch, Photograph, Scene
+from ...depth_maps.flat_view import FlatView, flat_view
 from ...errors import LumigraphWarning
 from ...geometry import evenly
 from ...method import Part
 from ...method.controls import Control, Value
-from ..clouds.flat_view import FlatView, flat_view
 from ..fields.appearance import AVERAGE
 from ..fields.development import decoded, encoded
 

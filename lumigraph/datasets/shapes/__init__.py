@@ -23,6 +23,7 @@ HALF_SIDE = 0.9  # half of the longest side after normalisation
 BOX_MARGIN = 0.05  # scene units between the shape and the box of interest
 PROBE_POINTS, PROBE_SEED = 256, 0  # points at which a closed surface has an integer winding number
 INTEGER_TOLERANCE, MIN_CLOSED_SHARE = 0.05, 0.97  # distance to an integer, and the share of probe points within it
+PROBE_REACH = 6.0  # radii of a box of triangles away from which they count together: millions take minutes else
 CUBE = Frame(background=(1.0, 1.0, 1.0))  # of many shapes, each of which has a frame of its own
 
 
@@ -99,7 +100,7 @@ class Shape:
             return False
         low, high = np.array(self.frame.bounds)
         points = np.random.default_rng(PROBE_SEED).uniform(low, high, (PROBE_POINTS, 3))
-        found = self._triangles.winding(points, np.inf)
+        found = self._triangles.winding(points, PROBE_REACH)
         return bool((np.abs(found - found.round()) < INTEGER_TOLERANCE).mean() >= MIN_CLOSED_SHARE)
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:

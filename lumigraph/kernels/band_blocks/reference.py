@@ -13,7 +13,8 @@ def rays(height, width, pose, lens):
 
 
 def run(depth, pose, lens, blocks, table, side, truncation, steps):
-    origin, directions = rays(*depth.shape, pose, lens)
+    height, width = depth.shape
+    origin, directions = rays(height, width, pose, lens)
     measured = depth.isfinite() & (depth > 0)
     shift = torch.linspace(-truncation, truncation, steps + 1).to(depth)
     t = depth[measured][:, None] + shift

@@ -3,13 +3,15 @@
 import math
 
 import numpy as np
+import torch
 from numba import njit, prange
 
 from ..block_hash import SIDE, VOXELS
-from . import BEHIND_DEPTH, UNCOLOURED
+from . import BEHIND_DEPTH, CHANNELS, UNCOLOURED
 
 ZERO, HALF, ONE, INFINITE = np.float32(0), np.float32(0.5), np.float32(1), np.float32(np.inf)
 MIN_DEPTH, NONE = np.float32(BEHIND_DEPTH), np.float32(UNCOLOURED)
+ONE_ON = np.uint64(1)
 MARGIN = np.float32(1.001)  # of a block's ball, for rounding
 
 
@@ -39,72 +41,83 @@ def _visible(blocks, height, width, pose, lens, voxel, farthest, chosen):
 
 
 @njit(inline="always", error_model="numpy")
-def _four(values, top, left, below, right, a, b, c, d):
-    return a * values[top, left] + b * values[top, right] + c * values[below, left] + d * values[below, right]
+def _four(values, a, b, c, d, wa, wb, wc, wd):
+    return wa * values[a] + wb * values[b] + wc * values[c] + wd * values[d]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
-def _fuse(voxels, blocks, chosen, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight):
-    height, width = depth.shape
-    over = ONE / truncation
-    last_x, last_y = np.float32(width - 1), np.float32(height - 1)
+@njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+def _fuse(voxels, blocks, chosen, depth, rgb, trust, height, width, pose, lens, voxel, truncation, edge, max_weight):
+    """Arrays of pixels and voxels are flat. Indices are unsigned, so that none is looked at for its sign."""
+    over, wide, high = ONE / truncation, np.float32(width), np.float32(height)
+    last_x, last_y = wide - ONE, high - ONE
+    step_x, step_y, step_z = voxel * pose[2, 0], voxel * pose[2, 1], voxel * pose[2, 2]
+    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     for c in prange(len(chosen)):
         number = chosen[c]
-        for i in range(VOXELS):
-            px = voxel * np.float32(SIDE * blocks[number, 0] + (i >> 6)) - pose[0, 3]
-            py = voxel * np.float32(SIDE * blocks[number, 1] + ((i >> 3) & 7)) - pose[1, 3]
-            pz = voxel * np.float32(SIDE * blocks[number, 2] + (i & 7)) - pose[2, 3]
-            qz = pose[0, 2] * px + pose[1, 2] * py + pose[2, 2] * pz
-            if not qz > MIN_DEPTH:
-                continue
-            qx = pose[0, 0] * px + pose[1, 0] * py + pose[2, 0] * pz
-            qy = pose[0, 1] * px + pose[1, 1] * py + pose[2, 1] * pz
-            x, y = qx / qz * lens[0] + lens[2], qy / qz * lens[1] + lens[3]
-            if not (x >= ZERO and y >= ZERO and x < np.float32(width) and y < np.float32(height)):
-                continue
-            u, v = min(max(x - HALF, ZERO), last_x), min(max(y - HALF, ZERO), last_y)
-            left, top = int(u), int(v)
-            right, below = min(left + 1, width - 1), min(top + 1, height - 1)
-            d0, d1, d2, d3 = depth[top, left], depth[top, right], depth[below, left], depth[below, right]
-            nearest, farthest = min(min(d0, d1), min(d2, d3)), max(max(d0, d1), max(d2, d3))
-            if not (nearest > ZERO and farthest < INFINITE and d0 + d1 + d2 + d3 > ZERO):
-                continue
-            u, v = u - np.float32(left), v - np.float32(top)
-            wa, wb, wc, wd = (ONE - v) * (ONE - u), (ONE - v) * u, v * (ONE - u), v * u
-            smooth = farthest - nearest <= edge * nearest
-            if not smooth:
-                column, row = int(x), int(y)
-                wa, wb, wc, wd = ONE, ZERO, ZERO, ZERO
-                left, right, top, below = column, column, row, row
-            surface = _four(depth, top, left, below, right, wa, wb, wc, wd)
-            d = (surface - np.sqrt(px * px + py * py + pz * pz)) * over
-            if d < -ONE:
-                continue
-            w = _four(trust, top, left, below, right, wa, wb, wc, wd)
-            if not w > ZERO:
-                continue
-            weight = voxels[number, i, 1]
-            share = w / (weight + w)
-            voxels[number, i, 0] += share * (min(d, ONE) - voxels[number, i, 0])
-            voxels[number, i, 1] = min(weight + w, max_weight)
-            if d < ONE:
-                fresh = voxels[number, i, 2] == NONE
-                for channel in range(3):
-                    colour = (
-                        wa * rgb[top, left, channel] + wb * rgb[top, right, channel]
-                        + wc * rgb[below, left, channel] + wd * rgb[below, right, channel]
-                    )  # fmt: skip
-                    own = voxels[number, i, 2 + channel]
-                    voxels[number, i, 2 + channel] = colour if fresh else own + share * (colour - own)
+        pz0 = voxel * np.float32(SIDE * blocks[number, 2]) - pose[2, 3]
+        for row in range(SIDE * SIDE):
+            px = voxel * np.float32(SIDE * blocks[number, 0] + (row >> 3)) - pose[0, 3]
+            py = voxel * np.float32(SIDE * blocks[number, 1] + (row & 7)) - pose[1, 3]
+            qx0 = pose[0, 0] * px + pose[1, 0] * py + pose[2, 0] * pz0
+            qy0 = pose[0, 1] * px + pose[1, 1] * py + pose[2, 1] * pz0
+            qz0 = pose[0, 2] * px + pose[1, 2] * py + pose[2, 2] * pz0
+            across = px * px + py * py
+            for k in range(SIDE):
+                t = np.float32(k)
+                qz = qz0 + t * step_z
+                if not qz > MIN_DEPTH:
+                    continue
+                inverse = ONE / qz
+                x, y = (qx0 + t * step_x) * inverse * fx + cx, (qy0 + t * step_y) * inverse * fy + cy
+                if not (x >= ZERO and y >= ZERO and x < wide and y < high):
+                    continue
+                u, v = min(max(x - HALF, ZERO), last_x), min(max(y - HALF, ZERO), last_y)
+                left, top = np.int32(u), np.int32(v)
+                right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+                a, b = np.uint32(top * width + left), np.uint32(top * width + right)
+                i, j = np.uint32(below * width + left), np.uint32(below * width + right)
+                da, db, dc, dd = depth[a], depth[b], depth[i], depth[j]
+                nearest, farthest = min(min(da, db), min(dc, dd)), max(max(da, db), max(dc, dd))
+                if not (nearest > ZERO and farthest < INFINITE):
+                    continue
+                pz = pz0 + t * voxel
+                away = np.sqrt(across + pz * pz)
+                if (farthest - away) * over < -ONE:
+                    continue
+                u, v = u - np.float32(left), v - np.float32(top)
+                wa, wb, wc, wd = (ONE - v) * (ONE - u), (ONE - v) * u, v * (ONE - u), v * u
+                if farthest - nearest > edge * nearest:
+                    wa, wb, wc, wd = ONE, ZERO, ZERO, ZERO
+                    a = np.uint32(np.int32(y) * width + np.int32(x))
+                    b, i, j = a, a, a
+                d = (_four(depth, a, b, i, j, wa, wb, wc, wd) - away) * over
+                w = _four(trust, a, b, i, j, wa, wb, wc, wd)
+                if d < -ONE or not w > ZERO:
+                    continue
+                place = np.uint64(CHANNELS * (VOXELS * number + SIDE * row + k))
+                weight = voxels[place + ONE_ON]
+                share = w / (weight + w)
+                voxels[place] += share * (min(d, ONE) - voxels[place])
+                voxels[place + ONE_ON] = min(weight + w, max_weight)
+                if d < ONE:
+                    fresh = voxels[place + np.uint64(2)] == NONE
+                    for channel in range(3):
+                        at = np.uint32(channel)
+                        three = np.uint32(3)
+                        colour = _four(
+                            rgb, three * a + at, three * b + at, three * i + at, three * j + at, wa, wb, wc, wd
+                        )
+                        own = voxels[place + np.uint64(2 + channel)]
+                        voxels[place + np.uint64(2 + channel)] = colour if fresh else own + share * (colour - own)
 
 
 def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight):
-    blocks, *given = (x.detach().contiguous().numpy() for x in (blocks, depth, rgb, trust, pose, lens))
-    depth, _, _, pose, lens = given
-    measured = depth[np.isfinite(depth)]
-    chosen = np.empty(len(blocks), np.int64)
+    given = blocks, torch.where(depth > 0, depth, 0), rgb, trust, pose, lens  # what is not a number is not positive
+    blocks, depth, rgb, trust, pose, lens = (x.detach().contiguous().numpy() for x in given)
     voxel, truncation = np.float32(voxel), np.float32(truncation)
-    farthest = np.float32(measured.max(initial=0)) + truncation
+    farthest = np.where(depth < INFINITE, depth, ZERO).max() + truncation
+    chosen = np.empty(len(blocks), np.int64)
     count = _visible(blocks, *depth.shape, pose, lens, voxel, farthest, chosen)
+    pixels = (x.reshape(-1) for x in (depth, rgb, trust))
     numbers = voxel, truncation, np.float32(edge), np.float32(max_weight)
-    _fuse(voxels.numpy(), blocks, chosen[:count], *given, *numbers)
+    _fuse(voxels.view(-1).numpy(), blocks, chosen[:count], *pixels, *depth.shape, pose, lens, *numbers)

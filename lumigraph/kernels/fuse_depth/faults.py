@@ -1,7 +1,7 @@
 """Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
-    "depth along the axis": ("cpu", "_fuse", "np.sqrt(px * px + py * py + pz * pz)", "qz"),
+    "depth along the axis": ("cpu", "_fuse", "np.sqrt(across + pz * pz)", "qz"),
     "a weight forgotten": ("cpu", "_fuse", "min(weight + w, max_weight)", "min(weight + ONE, max_weight)"),
     "no end of the weight": ("cpu", "_fuse", "min(weight + w, max_weight)", "weight + w"),
     "blocks at the border dropped": ("cpu", "_visible", "v + top * w < -slant_t", "v + top * w < slant_t"),

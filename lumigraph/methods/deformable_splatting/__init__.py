@@ -81,7 +81,7 @@ class DeformableSplatting(CloudMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that move, are refined and told apart within some twenty quick steps."""
-        motion = MotionNumbers(4, 4, 1, 4, 8, still_until=0.1, told_apart=0.6, rigid_samples=32)
+        motion = MotionNumbers(4, 4, 1, 4, 8, still_until=0.0, told_apart=0.6, rigid_samples=32)
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
         adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
         c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, ssim_weight=0.2, motion=motion)

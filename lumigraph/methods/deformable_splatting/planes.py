@@ -22,6 +22,7 @@ from ...geometry import multiply, to_matrix
 
 PAIRS = tuple(combinations(range(4), 2))  # axes of the six planes; 3 is time
 TIME = 3
+FIRST_MOTION = 1e-4  # largest weight of the last layer at first
 NEIGHBOURS = 6  # of a Gaussian, that move rigidly with it
 PROBED_MOMENTS = 12  # at which one sees whether a Gaussian moves
 MIN_DISTANCE = 1e-6  # between neighbours, scene units
@@ -98,6 +99,7 @@ class PlaneMotion(Addition):
     moves:      which Gaussians move; the others cost nothing
     neighbours: of each Gaussian among those that move, for rigidity
     active:     whether anything moves yet
+    extent:     of the cameras, in scene units
     """
 
     grows: ClassVar[tuple[str, ...]] = ("moves", "neighbours")
@@ -105,6 +107,7 @@ class PlaneMotion(Addition):
     moves: Tensor
     neighbours: Tensor
     active: Tensor
+    extent: Tensor
 
     def __init__(self, frame: Frame, numbers: MotionNumbers, count: int):
         super().__init__()
@@ -115,12 +118,13 @@ class PlaneMotion(Addition):
         self.planes = SpaceTimePlanes(numbers)
         self.network = nn.Sequential(nn.Linear(self.planes.width, numbers.motion_width), nn.ReLU())
         self.heads = nn.Linear(numbers.motion_width, 9)
-        nn.init.zeros_(self.heads.weight)
+        nn.init.uniform_(self.heads.weight, -FIRST_MOTION, FIRST_MOTION)
         nn.init.zeros_(self.heads.bias)
         self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
         self.register_buffer("neighbours", torch.arange(count)[:, None].repeat(1, NEIGHBOURS))
         self.register_buffer("active", torch.tensor(False))
-        self.progress, self.extent = 0.0, 1.0
+        self.register_buffer("extent", torch.tensor(1.0))
+        self.progress = 0.0
 
     # The cloud at a moment
 
@@ -155,6 +159,7 @@ class PlaneMotion(Addition):
     # Learning
 
     def begin_cloud(self, method: Any) -> None:
+        self.extent.copy_(method.cloud.extent)
         self.follow_cloud(method.cloud.means.detach())
 
     @torch.no_grad()
@@ -183,12 +188,11 @@ class PlaneMotion(Addition):
         self.moves, self.neighbours = self.moves[kept], torch.where(left < 0, own[:, None], left)
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
-        self.progress, self.extent = progress, float(method.cloud.extent)
-        self.active.fill_(self.times is not None and progress >= self.numbers.still_until)
+        self.progress = progress
+        self.active.fill_(progress >= self.numbers.still_until)
 
     def before_raster(self, method: Any, step: Step) -> None:
-        if step.camera.time is not None:
-            step.cloud = self.at(step.cloud, float(step.camera.time))
+        step.cloud = self.at(step.cloud, method.moment_of(step.camera))
 
     def regularize(self, method: Any, step: Step) -> None:
         """Smooth planes, and neighbours at fixed places in each other's frame (Luiten 2024, eq. 9)."""
@@ -197,8 +201,8 @@ class PlaneMotion(Addition):
         n = self.numbers
         space, calm, moving = self.planes.terms()
         step.terms["planes"] = n.plane_smoothness * space + n.time_smoothness * calm + n.time_sparsity * moving
-        if n.rigidity and step.camera.time is not None:
-            step.terms["rigidity"] = n.rigidity * self.bending(step.whole, float(step.camera.time), step.chance)
+        if n.rigidity:
+            step.terms["rigidity"] = n.rigidity * self.bending(step.whole, method.moment_of(step.camera), step.chance)
 
     def bending(self, cloud: Gaussians, time: float, chance: torch.Generator) -> Float[Tensor, ""]:
         """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
@@ -233,6 +237,6 @@ class PlaneMotion(Addition):
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         n = self.numbers
         return {
-            name: self.extent * falling(rate, n.final_rate * rate, progress)
+            name: float(self.extent) * falling(rate, n.final_rate * rate, progress)
             for name, rate in (("planes", n.planes_lr), ("motion", n.motion_lr))
         }

@@ -41,6 +41,7 @@ class DeformationNumbers:
 
     motion: Motion = "se3"  # motion of a point: a screw motion, section 3.2, or a translation; none: only slices
     moment_code: Annotated[int, between(1, 1024)] = 8  # numbers of a moment's code, section 4; more fit more freely
+    moment_waves: bool = False  # codes begin as waves of time, which suits few steps; off: at random, section 4
     deformation_frequencies: Octaves = 8  # m, octaves of the encoding at the end of annealing, section 3.5
     deformation_depth: Layers = 6  # hidden layers, section 4; more cost time
     deformation_width: Width = 128  # channels of a layer, section 4; wider costs time
@@ -103,7 +104,7 @@ class Nerfies(FieldMethod):
                 canonical, first = (build(ambient=ambient, activation=softplus, keep_input=True) for _ in range(2))
                 self.sampler = HierarchicalSampler(space, c.rays)
                 self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
-            self.moment_codes = MomentCodes(frame, d.moment_code)
+            self.moment_codes = MomentCodes(frame, d.moment_code, d.moment_waves)
             bands = d.deformation_frequencies, d.moment_code
             motion = None if d.motion == "none" else MotionField(space, d.motion, *bands, shape, d.annealing)
             narrow = d.deformation_depth, d.slice_width, d.deformation_skip
@@ -115,11 +116,12 @@ class Nerfies(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A hash table as canonical scene, and a narrower deformation."""
+        """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
-        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
-        d = replace(d, elastic_samples=512, background_points=1024, elastic_until=0.5)
-        return replace(c, deformation=d, final_learning_rate=1e-3, decay_start=0.3, deformation_rate=0.1)
+        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
+        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.4)
+        d = replace(d, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True)
+        return replace(c, deformation=d, final_learning_rate=1e-3, decay_start=0.3, deformation_rate=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -213,7 +215,7 @@ class Nerfies(FieldMethod):
         return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
-        """How far points of the background move at random moments, by a robust loss."""
+        """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""
         count, known = self.config.deformation.background_points, self.background_points
         points = known[torch.randint(len(known), (count,), generator=generator).to(self.device)]
         first, last = self.frame.times or (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Elastic loss: how far a deformation is from a rigid motion, by its Jacobian's singular values (Park 2021, 3.3)."""
+"""Elastic loss: distance of a deformation from a rigid motion, by singular values of its Jacobian (Park 2021, 3.3)."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from ...method.controls import Control, moment
 
 SMALL_ANGLE = 1e-2  # radians, below which a motion's coefficients are their series; exact to 1e-9
 FIRST_MOTION = 1e-4  # largest weight of the last layer at first: the scene begins as it is (Park 2021, supplement)
-FIRST_CODE = 0.05  # largest number of a code at first
+FIRST_CODE, WAVE = 0.05, 0.5  # largest number of a code at first, at random and as a wave
 
 Motion = Literal["se3", "translation", "none"]
 
@@ -29,14 +29,15 @@ Motion = Literal["se3", "translation", "none"]
 class MomentCodes(Part):
     """A code for each moment of training, which photographs of one moment share; interpolated in between.
 
+    waves:   whether codes begin as waves of time, so that what one moment learns helps its neighbours; else at random
     moments: ascending, infinite in rows without a moment
     """
 
     moments: Tensor
 
-    def __init__(self, frame: Frame, width: int):
+    def __init__(self, frame: Frame, width: int, waves: bool = False):
         super().__init__()
-        self.times = frame.times
+        self.times, self.waves = frame.times, waves
         rows = max(frame.image_count, 2)
         self.register_buffer("moments", torch.linspace(*(frame.times or (0.0, 1.0)), rows))
         self.codes = nn.Parameter(FIRST_CODE * torch.rand(rows, width))
@@ -46,6 +47,13 @@ class MomentCodes(Part):
             found = data.cameras.time[data.splits["train"]].unique()
             self.moments.fill_(math.inf)
             self.moments[: len(found)] = found
+            if self.waves and self.times:
+                self.codes.data[: len(found)] = self.wave((found - self.times[0]) / (self.times[1] - self.times[0]))
+
+    def wave(self, share: Float[Tensor, " moment"]) -> Float[Tensor, "moment width"]:
+        """Sines and cosines of half a period over the capture, of two halves, of three ..."""
+        column = torch.arange(self.codes.shape[1], device=share.device)
+        return WAVE * torch.sin(math.pi * ((column // 2 + 1) * share[:, None] + 0.5 * (column % 2)))
 
     def forward(self, times: Float[Tensor, " ray"]) -> Float[Tensor, "ray width"]:
         after = torch.searchsorted(self.moments, times.contiguous()).clamp(1, len(self.moments) - 1)

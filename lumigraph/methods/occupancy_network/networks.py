@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -14,9 +16,9 @@ VOXELS = 32  # voxels a side that the encoder of voxels takes
 
 
 def of_cloud(
-    block: ResNetLayers, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
+    block: Any, x: Float[Tensor, "member point some"], whole: Float[Tensor, "member others"]
 ) -> Float[Tensor, "member point output"]:
-    """Residual layers of points' features and those of their whole cloud, which are multiplied once for each cloud."""
+    """ResNetLayers of the features of points and of their whole cloud, which are multiplied once for each cloud."""
     inner = joined(block.first, x.relu(), whole.relu())
     return joined(block.shortcut, x, whole) + block.second(inner.relu())
 

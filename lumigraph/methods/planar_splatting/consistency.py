@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d
 
 from ...camera import Camera
-from ...components.clouds.flat_view import GREY
 from ...datasets.scene import Photograph
+from ...depth_maps.flat_view import GREY
 from ...geometry import unit
 from .planes import MIN_FACING, PlaneMaps, normals_of
 

@@ -60,7 +60,7 @@ class Config:
     likelihood_weight: NonNegative = 1e-3  # weight of the patches' negative log likelihood, eq. 8; 0: no flow
     opacity_weight: NonNegative = 0.0  # weight of the patches' entropy of opacity before objects; higher: less fog
     flow_steps: Steps = 400  # steps that train the normalising flow of eq. 8, of 512 patches each
-    coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels are added; 0: at once
+    coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves of the network are added; 0: at once
     occlusion_weight: NonNegative = 0.0  # weight of density right before cameras (Yang 2023, eq. 5); 0: off
     occlusion_range: Share = 0.1  # share of each ray that counts as right before its camera
     random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
@@ -80,13 +80,14 @@ class Config:
     # Of the hash table and its networks.
     table_learning_rate: LearningRate = 1e-2  # learning rate of the hash table and its networks at first
     final_table_learning_rate: LearningRate = 1e-3  # learning rate of the hash table and its networks at the end
+    table_coarse_to_fine: Share = 0.0  # share of the budget in which finer levels of the table are added; 0: at once
     table_width: Width = 64  # neurons of a hidden layer behind the hash table; wider costs time
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # of the hash table: samples in a step
     transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates; higher is faster, less exact
     table_occupancy_threshold: NonNegative = 0.05  # of the table: optical thickness of an empty cell; higher: faster
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # of the hash table: residual at which the loss turns from squared to linear
-    sweep_weight: NonNegative = 0.03  # of the hash table: weight of plane-sweep depth in the open at first; 0: off
+    stereo_weight: NonNegative = 0.03  # of the hash table: weight of stereo depth in the open at first; 0: off
 
     @property
     def occupancy(self) -> OccupancyNumbers:
@@ -99,7 +100,7 @@ class Config:
     @property
     def proposals(self) -> ProposalNumbers:
         """Numbers of the hash table's samples in scenes without bounds."""
-        return ProposalNumbers(sweep_weight=self.sweep_weight)
+        return ProposalNumbers(stereo_weight=self.stereo_weight)
 
 
 DECAY_START = 0.3  # share of the budget before the table's learning rate falls
@@ -134,7 +135,8 @@ class RegNeRF(FieldMethod):
         super().__init__(frame, c)
         space, self.by_table = space_of(frame), field_of(frame, c) == "hash"
         self.poses = poses_for(frame, c.poses)
-        self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine else None
+        share = c.table_coarse_to_fine if self.by_table else c.coarse_to_fine
+        self.bands = BandSchedule(share) if share else None
         joining = joining_of(self.poses, self.bands)
         if self.by_table:
             with torch.random.fork_rng(devices=[]):
@@ -159,7 +161,7 @@ class RegNeRF(FieldMethod):
         network = NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16)
         c = Config(**CPU_NETWORK, network=network, unseen_patches=8, annealing=0.25, depth_settling=0.25)
         c = replace(c, depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5)
-        c = replace(c, density_noise=0.0, gradient_clip=0.0)
+        c = replace(c, density_noise=0.0, gradient_clip=0.0, coarse_to_fine=0.9)
         c = replace(c, field="auto", table=CPU_HASH["table"], steps=CPU_HASH["steps"], table_width=32)
         c = replace(c, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15)
         return replace(c, table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)

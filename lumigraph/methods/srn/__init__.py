@@ -23,7 +23,7 @@ from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
-from .networks import Layer, LayerNetwork, RayMarcher, perceptron, scene_features
+from .networks import Layer, RayMarcher, SceneHyperNetwork, perceptron, scene_features
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class SRN(RayMethod):
         super().__init__(frame, c)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
-            self.hyper = LayerNetwork(c.code, (3, *[c.hidden_width] * c.depth), c.hyper_layers)
+            self.hyper = SceneHyperNetwork(c.code, (3, *[c.hidden_width] * c.depth), c.hyper_layers)
             self.marcher = RayMarcher(c.hidden_width, c.marcher_state, c.march_steps)
             outputs = 4 if frame.has_alpha else 3
             widths = [c.hidden_width] * (c.pixel_layers + 1)

@@ -22,7 +22,7 @@ def perceptron(*widths: int, normalised: bool = True) -> nn.Sequential:
     return nn.Sequential(*(layers if normalised else layers[:-2]))
 
 
-class LayerNetwork(nn.Module):
+class SceneHyperNetwork(nn.Module):
     """Psi: codes to the layers of Phi, each by a perceptron of its own (Sitzmann 2019, section 3.3, eq. 5).
 
     widths: of Phi, inputs first

@@ -47,4 +47,4 @@ def world(time: float) -> World:
 
 def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0) -> SyntheticStage:
     bounds = ((-0.95, -0.75, -0.75), (0.95, 0.75, 0.75))
-    return SyntheticStage(world(0.0), film(size, views, seed, rig), bounds, reach=1.0, near=1.5, moving=world)
+    return SyntheticStage(world(0.0), film(size, views, seed, rig), bounds, reach=0.95, near=1.5, moving=world)

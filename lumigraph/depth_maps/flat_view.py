@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from ...camera.lens import Pinhole
-from ...datasets.scene import Photograph
+from ..camera.lens import Pinhole
+from ..datasets.scene import Photograph
 
 MAX_ANGLE = math.radians(50.0)  # from the axis to the left and right border, where a lens sees further
 GREY = (0.299, 0.587, 0.114)
@@ -38,12 +38,16 @@ class FlatView:
         return self.rgb @ torch.tensor(GREY)
 
     @cached_property
-    def rays(self) -> Float[Tensor, "height width 3"]:
-        """From the camera towards each pixel in the world's frame, one unit along the axis."""
+    def local_rays(self) -> Float[Tensor, "height width 3"]:
+        """From the camera towards each pixel in its own frame, one unit along the axis: K^-1 (x, y, 1)."""
         height, width = self.trust.shape
         y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-        pixels = torch.stack([x, y, torch.ones_like(x)], -1)
-        return pixels @ (self.pose[:, :3] @ self.intrinsics.inverse()).T
+        return torch.stack([x, y, torch.ones_like(x)], -1) @ self.intrinsics.inverse().T
+
+    @cached_property
+    def rays(self) -> Float[Tensor, "height width 3"]:
+        """The same in the world's frame."""
+        return self.local_rays @ self.pose[:, :3].T
 
     def project(self, points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 2"], Float[Tensor, " point"]]:
         """Pixels of points, and how far along the axis they lie; pixels of what lies behind mean nothing."""
@@ -60,7 +64,7 @@ class FlatView:
         return seen, row.clamp(0, height - 1), column.clamp(0, width - 1), depth
 
     def warp_to(self, other: FlatView) -> Float[Tensor, "3 4"]:
-        """(A | b) of `kernels.plane_sweep`: from a pixel here and its inverse depth along the axis to a pixel there."""
+        """(A | b) of `kernels.patch_cost`: from a pixel here and its inverse depth along the axis to a pixel there."""
         rotation, towards = other.pose[:, :3].T @ self.pose[:, :3], self.pose[:, 3] - other.pose[:, 3]
         along = other.intrinsics @ rotation @ self.intrinsics.inverse()
         return torch.cat([along, (other.intrinsics @ other.pose[:, :3].T @ towards)[:, None]], 1)

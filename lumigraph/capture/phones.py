@@ -1,0 +1,145 @@
+"""Captures of phones with a depth sensor, as Polycam and Record3D export them.
+
+Polycam, raw data: keyframes/cameras/N.json or keyframes/corrected_cameras/N.json (rows t_00 to t_23 of camera-to-world,
+focal lengths, centre, size), keyframes/images/N.jpg or keyframes/corrected_images/N.jpg, keyframes/depth/N.png (16
+bits, millimetres). Record3D, RGBD: metadata.json (K by columns, poses as qx qy qz qw x y z, size of the depth) and
+rgbd/N.jpg, rgbd/N.depth (float32 metres, compressed by LZFSE). Camera axes are OpenGL's, y is up, depth is along the
+optical axis, 0 and NaN where nothing was measured. Lengths are metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..camera.lens import Pinhole
+from ..errors import LumigraphError
+from ..files import read_bytes, read_json
+from ..files.names import natural
+from ..files.ranges import Coordinate, Positive, Side
+from ..geometry import to_matrix
+from .capture import Capture, PixelPlane, Shot
+from .pictures import find_file
+
+EXPECTED_FILES = "keyframes/ (Polycam, raw data) or metadata.json and rgbd/ (Record3D)"
+OPENCV = np.diag([1.0, -1.0, -1.0])  # from OpenGL's camera axes
+UP = (0.0, 1.0, 0.0)
+MILLIMETRES = 1e-3
+
+
+@dataclass(frozen=True)
+class PolycamCamera:
+    """A pose and a lens of one picture."""
+
+    t_00: Coordinate
+    t_01: Coordinate
+    t_02: Coordinate
+    t_03: Coordinate
+    t_10: Coordinate
+    t_11: Coordinate
+    t_12: Coordinate
+    t_13: Coordinate
+    t_20: Coordinate
+    t_21: Coordinate
+    t_22: Coordinate
+    t_23: Coordinate
+    fx: Positive
+    fy: Positive
+    cx: Coordinate
+    cy: Coordinate
+    width: Side
+    height: Side
+
+    @property
+    def pose(self) -> np.ndarray:
+        return np.array([[getattr(self, f"t_{i}{j}") for j in range(4)] for i in range(3)])
+
+
+@dataclass(frozen=True)
+class Record3DMetadata:
+    """K: by columns; poses: qx qy qz qw x y z of each picture; dw, dh: size of the depth"""
+
+    w: Side
+    h: Side
+    K: list[Coordinate]
+    poses: list[list[Coordinate]]
+    dw: Side
+    dh: Side
+    perFrameIntrinsicCoeffs: list[list[Coordinate]] | None = None  # noqa: N815 (fx fy cx cy)
+
+
+def recognises(folder: Path) -> bool:
+    return is_polycam(folder) or ((folder / "metadata.json").is_file() and (folder / "rgbd").is_dir())
+
+
+def is_polycam(folder: Path) -> bool:
+    return any((folder / "keyframes" / name).is_dir() for name in ("cameras", "corrected_cameras"))
+
+
+def read(folder: Path) -> Capture:
+    """Raises LumigraphError for malformed files."""
+    return read_polycam(folder) if is_polycam(folder) else read_record3d(folder)
+
+
+def opencv(pose: np.ndarray) -> np.ndarray:
+    return np.concatenate([pose[:, :3] @ OPENCV, pose[:, 3:]], 1)
+
+
+def read_polycam(folder: Path) -> Capture:
+    """The corrected poses with their pictures, where Polycam has optimised them."""
+    frames = folder / "keyframes"
+    corrected = "corrected_" if (frames / "corrected_cameras").is_dir() else ""
+    shots, missing = [], []
+    for path in sorted((frames / f"{corrected}cameras").glob("*.json"), key=lambda path: natural(path.name)):
+        said, picture = read_json(path, PolycamCamera), find_file(frames / f"{corrected}images" / path.stem)
+        if not picture.is_file():
+            missing.append(f"keyframes/{corrected}images/{path.stem}")
+            continue
+        lens = Pinhole(torch.tensor([[said.fx, said.fy]]), torch.tensor([[said.cx, said.cy]]))
+        depth = frames / "depth" / f"{path.stem}.png"
+        planes = {"depth": PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0,))} if depth.is_file() else {}
+        size = (said.width, said.height)
+        shots.append(Shot(path.stem, opencv(said.pose), lens, size, {1: picture}, planes=planes))
+    return Capture(str(folder), shots, missing=missing, up=UP)
+
+
+def read_record3d(folder: Path) -> Capture:
+    path = folder / "metadata.json"
+    said = read_json(path, Record3DMetadata)
+    if len(said.K) != 9 or any(len(pose) != 7 for pose in said.poses):
+        raise LumigraphError(f"{path} has a camera of other than 9 numbers or a pose of other than 7; export it again")
+    own, shots, missing = said.perFrameIntrinsicCoeffs, [], []
+    for i, (qx, qy, qz, qw, *place) in enumerate(said.poses):
+        picture, depth = find_file(folder / "rgbd" / f"{i}"), folder / "rgbd" / f"{i}.depth"
+        if not picture.is_file():
+            missing.append(f"rgbd/{i}")
+            continue
+        fx, fy, cx, cy = (said.K[0], said.K[4], said.K[6], said.K[7]) if own is None or i >= len(own) else own[i]
+        rotation = to_matrix(torch.tensor([[qw, qx, qy, qz]], dtype=torch.float64))[0].numpy()
+        pose = opencv(np.concatenate([rotation, np.array(place)[:, None]], 1))
+        lens = Pinhole(torch.tensor([[fx, fy]]), torch.tensor([[cx, cy]]))
+        values = partial(unpacked, depth, (said.dh, said.dw))
+        plane = PixelPlane(values, "z-depth", unknown=(0.0,), dtype=np.dtype(np.float32), identity=str(depth))
+        planes = {"depth": plane} if depth.is_file() else {}
+        shots.append(Shot(f"rgbd/{i}", pose, lens, (said.w, said.h), {1: picture}, planes=planes))
+    return Capture(str(folder), shots, missing=missing, up=UP)
+
+
+def unpacked(path: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Depth of a file of Record3D. Raises LumigraphError without the library that unpacks it, or for another size."""
+    try:
+        import liblzfse
+    except ImportError as fault:
+        raise LumigraphError(
+            f"{path} is compressed by LZFSE; install what unpacks it: pip install 'lumigraph[record3d]'"
+        ) from fault
+    try:
+        found = np.frombuffer(liblzfse.decompress(read_bytes(path)), np.float32)
+        return found.reshape(shape)
+    except (liblzfse.error, ValueError) as fault:
+        height, width = shape
+        raise LumigraphError(f"{path} holds no {width}x{height} numbers ({fault}); export it again") from fault

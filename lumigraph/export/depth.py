@@ -1,0 +1,73 @@
+"""Depth maps of photographs as a scene on disk: flat pictures, 16-bit depth, cameras, and a contact sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ..capture.transforms import OPENCV_FROM_OPENGL
+from ..datasets.scene import Scene
+from ..depth_maps import DepthMap
+from ..errors import LumigraphError
+from ..figures import Row, colour_depth, contact_sheet, depth_range, save_picture, to_image
+from ..files import replacing_folder, write_json
+
+MAX_LEVEL = 65534  # of 16 bits; 0 and 65535 stand for unknown depth
+SHEET = "depth.png"
+
+
+def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap]) -> None:
+    """A folder that opens as a scene with a layer of depth: images, depth, transforms.json, and a contact sheet.
+
+    Depth is 16-bit distance along rays in units of a MAX_LEVEL-th of the farthest; 0 where it is not sure. Poses and
+    depth are in the capture's frame. Raises LumigraphError where nothing is sure.
+    """
+    sure = [seen.depth[seen.solid] for seen in maps]
+    if not any(map(len, sure)):
+        raise LumigraphError(
+            f"No two photographs of {scene.source} agree on the depth of anything; their poses may be wrong, or they "
+            "have too little in common"
+        )
+    unit = float(torch.cat(sure).max()) / MAX_LEVEL
+    to_source = scene.frame.to_source
+    frames: list[dict[str, Any]] = []
+    with replacing_folder(folder, "depth maps") as partial:
+        for part in ("images", "depth"):
+            (partial / part).mkdir()
+        for seen in maps:
+            name = f"{Path(scene.names[int(seen.camera.image_index)]).stem}.png"  # type: ignore[arg-type]
+            levels = (seen.depth.nan_to_num(0, 0, 0) / unit).round().clamp(0, MAX_LEVEL).numpy()
+            Image.fromarray(levels.astype(np.uint16)).save(partial / "depth" / name)
+            to_image(seen.rgb).save(partial / "images" / name)
+            frames.append({"file_path": f"images/{name}", "depth_file_path": f"depth/{name}", **about(seen, to_source)})
+        scale = {"depth_unit_scale_factor": unit * to_source.scale, "is_euclidean_depth": True}
+        write_json(partial / "transforms.json", {"camera_model": "PINHOLE", **scale, "frames": frames}, ours=True)
+        save_picture(partial / SHEET, depth_sheet(scene, maps), ours=True)
+
+
+def about(seen: DepthMap, to_source: Any) -> dict[str, Any]:
+    """Size, lens and pose of a depth map's camera, as transforms.json has them."""
+    camera = seen.camera
+    pose = np.eye(4)
+    pose[:3, :3] = to_source.directions(camera.pose[0, :, :3].T.double()).T.numpy() * OPENCV_FROM_OPENGL
+    pose[:3, 3] = to_source.points(camera.position.double())[0].numpy()
+    (width, height), focal, centre = camera.size[0].tolist(), camera.lens.focal[0], camera.lens.centre[0]  # type: ignore[attr-defined]
+    numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), [*focal.tolist(), *centre.tolist()], strict=True))
+    return {"w": width, "h": height, **numbers, "transform_matrix": pose.tolist()}
+
+
+def depth_sheet(scene: Scene, maps: Sequence[DepthMap]) -> Image.Image:
+    """Photographs beside their depth, labelled with the share of sure pixels."""
+    within = depth_range(torch.cat([x.depth.flatten() for x in maps]), torch.cat([x.opacity.flatten() for x in maps]))
+    rows = []
+    for seen in maps:
+        name = scene.names[int(seen.camera.image_index)]  # type: ignore[arg-type]
+        label = f"{name}: {100 * float(seen.solid.float().mean()):.0f} % sure"
+        depth = colour_depth(seen.surface_depth.nan_to_num(torch.inf), seen.opacity, within)
+        rows.append(Row(label, [seen.rgb, depth]))
+    return contact_sheet(f"Depth of {scene.source}", ["photograph", "depth"], rows)
