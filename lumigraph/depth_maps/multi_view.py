@@ -29,7 +29,7 @@ MEETING_ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # o
 MIN_OVERLAP = 0.02  # share of what a photograph sees, weighted by angle, that a neighbour must see
 MIN_POINTS, MIN_KNOWN_POINTS = 16, 200  # in front of a view, and in a scene, that give a range of depths
 NEARER, FARTHER = 0.7, 2.0  # times the depths of known points: the range that is searched
-DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.02, 2.0  # of depth and of reprojection, up to which two views agree
+DEPTH_TOLERANCE, PIXEL_TOLERANCE = 0.01, 1.0  # of depth and of reprojection, up to which two views agree
 MIN_AGREEING = 2  # neighbours that must agree, or the only one
 MAX_SURE_COST = 0.9  # of a plane that is sure, whatever neighbours find
 
