@@ -27,10 +27,11 @@ TEACHABLE = [
 ]
 
 
-def term(depth: float, opacity: float = 1.0, weight: float = 1.0, **extra: float) -> torch.Tensor:
-    layers = {name: torch.tensor([value]) for name, value in ({"depth": 2.0} | extra).items()}
+def term(rendered: float, opacity: float = 1.0, weight: float = 1.0, **layers_: float) -> torch.Tensor:
+    """Loss of one ray of that rendered depth. layers_: of the photograph, a depth of 2 if not given"""
+    layers = {name: torch.tensor([value]) for name, value in ({"depth": 2.0} | layers_).items()}
     config = replace(Config(), measured=DepthNumbers(weight, 0.01))
-    return depth_terms(config, layers, torch.tensor([depth]), torch.tensor([opacity])).get(
+    return depth_terms(config, layers, torch.tensor([rendered]), torch.tensor([opacity])).get(
         "measured", torch.tensor(0.0)
     )
 
@@ -86,7 +87,7 @@ def test_without_depth_a_sentence_says_so():
         0,
     )
     with pytest.raises(LumigraphError, match="no depth"):
-        method.batch(tiny.scene(), torch.Generator())
+        method.batch(replace(tiny.scene(), layers={}), torch.Generator())
 
 
 def test_the_score_of_depth():

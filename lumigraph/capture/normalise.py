@@ -224,7 +224,7 @@ def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.n
         centre = np.array([quantile(points[inside, k], weights[inside], 0.5) for k in range(3)])
         inside = np.abs(points - centre).max(-1) < half
     filled = quantile(np.abs(points[inside] - centre).max(-1), weights[inside], 0.95)
-    return centre, min(half, 1.1 * filled)
+    return centre, min(half, 1.1 * filled) if filled > ZERO_EXTENT else half
 
 
 def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | None:

@@ -105,12 +105,12 @@ def _write(
         here = nth < count
         for corner in tl.static_range(3):
             edge = tl.load(fans + (case * MOST + nth) * 3 + corner, mask=here, other=0)
-            c, axis = edge // 3, edge % 3
+            c, along = edge // 3, edge % 3
             x, y, z = i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)
             held, other = _at(x, y, z, bx, by, bz, blocks, table, mask)
             there = here & (held >= 0)
             code = tl.load(packed + held * N + other, mask=there, other=0)
-            rank = code & ((1 << axis) - 1)
+            rank = code & ((1 << along) - 1)
             index = tl.load(starts + held, mask=there, other=0) + (code >> 3) + (rank & 1) + (rank >> 1)
             tl.store(faces + (face + nth) * 3 + corner, index, mask=here)
 
