@@ -14,6 +14,7 @@ from lumigraph.budget import QUALITIES, REJOIN_PROGRESS, Budget, Effort, lasting
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, held_out_poses
+from lumigraph.method import Method
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 
@@ -76,7 +77,17 @@ def test_asking_for_the_same_total_changes_nothing():
 SCENES = [name for name in methods.available() if methods.find(name).learns_from.kind == "photographs"]
 
 
-@pytest.mark.parametrize("name", SCENES)
+DESCENDING = [name for name in SCENES if methods.find(name).steps_for is Method.steps_for]
+
+
+@pytest.mark.parametrize("name", sorted({*SCENES} - {*DESCENDING}))
+def test_what_takes_each_photograph_once_has_one_effort(name):
+    kind, scene = methods.find(name), tiny.scene()
+    method = build(kind, scene.frame, kind.smallest(), torch.device("cpu"), seed=0)
+    assert {method.steps_for(quality, scene) for quality in QUALITIES} == {len(scene.splits["train"])}
+
+
+@pytest.mark.parametrize("name", DESCENDING)
 def test_quality_means_something_for_every_method_and_size(name):
     kind, steps = methods.find(name), {}
     for views in (12, 24):

@@ -105,7 +105,7 @@ def test_the_network_is_the_papers(monkeypatch):
 def room(tmp_path_factory):
     """A short recording of the room, tracked in one sitting, and in two."""
     folder = tmp_path_factory.mktemp("room")
-    options = "--frames 8 --downscale 1 --mapping-iterations 3 --first-iterations 40 --pixels-per-frame 64"
+    options = "--frames 8 --downscale 1 --mapping-iterations 6 --first-iterations 60 --pixels-per-frame 64"
     source = "procedural:room,depth,views=300,size=48"
     for name in ("straight", "broken"):
         command = f"track imap {source} --output {folder / name} {options}".split()

@@ -31,8 +31,7 @@ def test_names_with_numbers_of_equal_length_keep_their_order(names):
 @pytest.mark.parametrize(
     ("said", "method"),
     [
-        ("splat", "gaussian-splatting"),
-        ("splats", "gaussian-splatting"),
+        ("gaussian", "gaussian-splatting"),
         ("3dgs", "gaussian-splatting"),
         ("GS", "gaussian-splatting"),
         ("ngp", "instant-ngp"),

@@ -87,7 +87,7 @@ def namesakes(sources: Sources) -> list[str]:
     places: dict[str, list[str]] = {}
     for module, source in sources.items():
         for node in ast.walk(parsed(source)):
-            if isinstance(node, ast.ClassDef) and not node.name.startswith(("_", "Config", "Options")):
+            if isinstance(node, ast.ClassDef) and node.name not in ("Config", "Options") and node.name[0] != "_":
                 places.setdefault(node.name, []).append(module)
     return [f"{name}: {', '.join(modules)}" for name, modules in sorted(places.items()) if len(modules) > 1]
 

@@ -73,7 +73,7 @@ def test_every_export_is_offered_and_its_command_line_works(ball_run, tmp_path):
     assert set(menu.formats) == offered
     options = {name: {option.name: option for option in kind.options} for name, kind in menu.formats.items()}
     assert (
-        options["mesh"]["from"].choices == ("auto", "distance", "density", "depth")
+        options["mesh"]["from"].choices == ("auto", "distance", "density", "own", "depth")
         and options["mesh"]["cell-size"].default == ""
     )
     assert options["mesh"]["unseen"].choices == ("default", "close", "cut") and "as" in options["web"]

@@ -12,6 +12,8 @@ from ..files.ranges import Downscale, between
 from .common import lines, show, typed
 from .options import ReaderOption, needed, option
 
+Views = Annotated[int, between(2, 100_000)]
+
 
 @dataclass(frozen=True)
 class Depth:
@@ -27,7 +29,7 @@ class Depth:
     """Folder for the depth maps."""
     size: Annotated[int, between(50, 4000), option("PIXELS")] = 400
     """Longer side of the depth maps, about; twice as large takes four times as long."""
-    views: Annotated[int | None, between(2, 100_000), option("N", "all")] = None
+    views: Annotated[Views | None, option("N", "all")] = None
     """Number of photographs, spread evenly."""
     downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce the photographs by this whole number before reading."""

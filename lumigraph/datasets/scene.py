@@ -85,7 +85,6 @@ class Frame:
     background:  colour behind everything
     has_alpha:   whether the photographs say how opaque each pixel is
     image_count: photographs in the scene, held-out ones included
-    train_count: photographs to learn from; 0 where that is not known
     source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
                  line up with it
     forward:     of a capture without bounds whose cameras all look one way; None for any other
@@ -93,6 +92,7 @@ class Frame:
                  for any other, and where all were taken at once
     scale:       units of exports to a unit of the capture's frame, by a length that the user knows
     origin:      of the capture's frame on Earth, where its photographs' GPS has determined it
+    train_count: photographs to learn from; 0 where that is not known
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -101,12 +101,12 @@ class Frame:
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     has_alpha: bool = False
     image_count: Annotated[int, between(0, 10**6)] = 0
-    train_count: Annotated[int, between(0, 10**6)] = 0
     source_from_scene: tuple[Row, ...] = Similarity.make(1.0).rows
     forward: Forward | None = None
     times: tuple[Coordinate, Coordinate] | None = None
     scale: Size = 1.0
     origin: GeographicOrigin | None = None
+    train_count: Annotated[int, between(0, 10**6)] = 0
 
     @property
     def is_open(self) -> bool:

@@ -32,7 +32,10 @@ LOADED_FILE = "methods.json"  # in the cache: files of methods that this user ha
 # A method that is added comes behind these, so that no colour of theirs changes from one release to the next.
 COLOURED = ("gaussian-splatting", "instant-ngp", "mip-nerf", "nerf", "fourier-features")
 
-ALIASES = {"surface": "planar-splatting"}  # words for the default method of a purpose
+ALIASES = {  # words for the default method of a purpose
+    "surface": "planar-splatting",
+    "splats": "gaussian-splatting",
+}
 
 _registered: dict[str, type[Any]] = {}  # methods from elsewhere, by name
 METHOD_FILE = "--method-file"  # an option of every command

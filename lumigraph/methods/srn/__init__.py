@@ -209,7 +209,10 @@ class SRN(RayMethod):
             with torch.no_grad():
                 self._shown = self.hyper(self.code[None])
         distance, rgb, opacity = (x[0] for x in self._seen(self._shown, rays.origins[None], rays.directions[None]))
-        depth = torch.where(opacity > MIN_OPACITY, distance.clamp_min(MIN_DEPTH), torch.inf)
+        there = opacity > MIN_OPACITY
+        if not self.frame.is_open:  # nothing bounds the marcher, which may leave the box behind
+            there &= distance < rays.through_box(torch.tensor(self.frame.bounds, device=self.device))[1]
+        depth = torch.where(there, distance.clamp_min(MIN_DEPTH), torch.inf)
         return Rendering(before(rgb.clamp(0, 1), opacity, background), depth, opacity)
 
     @property
