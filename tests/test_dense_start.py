@@ -1,4 +1,4 @@
-"""Dense points by multi-view stereo: on the surface, for every lens, and only where photographs are to be trusted."""
+"""Dense points by plane sweeps: they lie on the surface, for every lens, and only where photographs say something."""
 
 from __future__ import annotations
 
@@ -17,13 +17,11 @@ from lumigraph.camera.lens import Fisheye, OpenCV, Pinhole
 from lumigraph.components.clouds import dense_points, initialization
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
-from lumigraph.depth_maps import DepthMap, multi_view
 from lumigraph.depth_maps.flat_view import flat_view
-from lumigraph.depth_maps.patch_match import PatchMatch, PlaneMap
 
-pytestmark = budget("methods", 10)
+pytestmark = budget("methods", 8)
 
-RADIUS, SIZE, FOCAL, COUNT = 0.6, 48, 64.0, 4
+RADIUS, SIZE, FOCAL, COUNT = 0.6, 48, 64.0, 6
 
 LENSES = {
     "pinhole": Pinhole(torch.full((COUNT, 2), FOCAL), torch.full((COUNT, 2), SIZE / 2)),
@@ -70,13 +68,9 @@ def ball(lens: str = "pinhole", alpha: bool = True) -> Scene:
 
 
 @cache
-def matched(lens: str = "pinhole", alpha: bool = True) -> list[DepthMap]:
-    """Depth maps of these photographs, in which no point is known."""
-    return multi_view.multi_view_depth(ball(lens, alpha))
-
-
 def dense(lens: str = "pinhole", alpha: bool = True) -> dense_points.Points:
-    return dense_points.thinned(dense_points.points_of(matched(lens, alpha)))
+    """What sweeps find in these photographs, in which no point is known."""
+    return dense_cloud(ball(lens, alpha))
 
 
 def off_surface(points: torch.Tensor) -> torch.Tensor:
@@ -84,7 +78,7 @@ def off_surface(points: torch.Tensor) -> torch.Tensor:
     return (points.norm(dim=-1) - RADIUS).abs() / tiny.DISTANCE
 
 
-@pytest.mark.parametrize("lens", ["pinhole", "fisheye"])
+@pytest.mark.parametrize("lens", LENSES)
 def test_points_without_any_known_lie_on_the_surface(lens):
     found = dense(lens)
     assert len(found.positions) > 500
@@ -166,57 +160,19 @@ def test_a_warp_is_a_projection(generator):
     torch.testing.assert_close(u[:, :2] / u[:, 2:], there, rtol=1e-4, atol=1e-3)
 
 
-def test_a_short_budget_matches_fewer_photographs(monkeypatch):
-    clock = iter(range(1000))
-    monkeypatch.setattr(
-        multi_view.time, "perf_counter", lambda: next(clock)
-    )  # so that any piece of work takes a second
-    monkeypatch.setattr(multi_view, "MIN_VIEWS", 3)
-    improved = []
-    monkeypatch.setattr(multi_view, "improve", lambda maps, *_: improved.append(len(maps)))
-    scene = replace(ball(), points=torch.zeros(300, 3))
-    for seconds, views, rounds in ((1.0, 3, 2), (math.inf, COUNT, 2)):
-        improved.clear()
-        assert len(multi_view.multi_view_depth(scene, seconds=seconds)) == views
-        assert improved == [views] * views * rounds
+def test_a_short_budget_asks_fewer_photographs(monkeypatch):
+    clock, swept = iter(range(1000)), []
 
+    def alone(views, *_):
+        swept.append(len(views))
+        return [[] for _ in views]
 
-def test_a_plane_map_has_depth_and_normals_of_the_surface():
-    """Sure pixels of the ball; normals are where neither random planes nor fronto-parallel ones could be."""
-    maps = matched()
-    assert len(maps) == COUNT
-    for i, seen in enumerate(maps):
-        assert seen.camera.image_index.tolist() == [i]
-        assert 0.1 < float(seen.solid.float().mean()) < 0.9
-        assert seen.depth[~seen.solid].isnan().all()
-    points = torch.cat([seen.positions() for seen in maps])
-    normals = torch.cat([seen.normals[seen.solid] for seen in maps])
-    cosine = (normals * normalize(points, dim=-1)).sum(-1)
-    ways = torch.cat([normalize(seen.camera.position - seen.positions(), dim=-1) for seen in maps])
-    assert cosine.median() > 0.97
-    assert cosine.mean() > (ways * normalize(points, dim=-1)).sum(-1).mean() + 0.02
-
-
-def test_true_planes_reproject_without_error():
-    """Of two views of a plane, at pixels whose place both see; and a depth that is off by a tenth does not."""
-    views = [flat_view(ball().photograph(i), SIZE) for i in (0, 1)]
-    normal, distance = torch.tensor([0.0, 0.0, 1.0]), 0.2  # n . x = d in the world
-    maps = []
-    for view in views:
-        one = PlaneMap(view, (1.0, 10.0))
-        offset = distance - normal @ view.pose[:, 3]
-        one.planes = (normal @ view.pose[:, :3] / offset).expand(SIZE, SIZE, 3).contiguous()
-        maps.append(one)
-    matching = PatchMatch(maps[0], maps[1:], torch.Generator(), geometric=True)
-    pixels = torch.arange(SIZE * SIZE)
-    inverse = maps[0].inverse_depth.flatten()
-    error = matching.reprojection_error(
-        pixels, torch.stack([inverse, 1.1 * inverse], 1), torch.zeros_like(pixels)[:, None]
-    )
-    there = (error[:, 0, 0] < 2.9) & (inverse > 0)
-    assert there.sum() > 300
-    assert error[there, 0].max() < 1e-2
-    assert error[there, 1].median() > 0.5
+    monkeypatch.setattr(dense_points.time, "perf_counter", lambda: next(clock))  # so that a sweep takes a second
+    monkeypatch.setattr(dense_points, "MIN_VIEWS", 3)
+    monkeypatch.setattr(dense_points, "choose_neighbours", alone)
+    for seconds in (2.0, 8.0, math.inf):
+        dense_cloud(ball(), seconds)
+    assert swept == [3, 3, 4, 4, COUNT, COUNT]  # twice each, as no point is known
 
 
 def test_a_near_distance_that_is_much_too_small_keeps_the_neighbours():

@@ -6,7 +6,7 @@ import pytest
 import torch
 from budgets import budget
 from PIL import Image
-from test_dense_start import RADIUS, ball, matched
+from test_multi_view import RADIUS, ball, matched
 
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main

@@ -262,7 +262,7 @@ def test_a_table_has_numbers_of_its_own():
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
     assert (network.learning_rate, network.hidden_width) == (4e-3, 128)
     assert table == known  # all of them
-    assert table.proposals.stereo_weight == config.stereo_weight
+    assert table.proposals.sweep_weight == config.sweep_weight
 
 
 def test_few_photographs_of_an_object_are_learnt_by_the_network():
@@ -277,7 +277,7 @@ def test_few_photographs_of_an_object_are_learnt_by_the_network():
         assert isinstance(RegNeRF(frame, auto).network, kind)
 
 
-def test_what_stereo_found_counts_beside_what_is_smooth():
+def test_what_plane_sweeps_found_counts_beside_what_is_smooth():
     """In the open a table has a term "depth" of its own."""
     scene = tiny.scene()
     frame = replace(scene.frame, reach=4.0, has_alpha=False)

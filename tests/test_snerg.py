@@ -239,7 +239,7 @@ def test_voxels_are_no_finer_than_half_a_pixel(frame):
 @pytest.mark.parametrize("whole", [True, False])
 def test_an_open_capture_is_baked_whole_or_within_its_box(whole):
     scene = replace(tiny.scene(), frame=OPEN)
-    method = SNeRG(OPEN, changed(SNeRG.smallest(), whole=whole, stereo_weight=0.0))
+    method = SNeRG(OPEN, changed(SNeRG.smallest(), whole=whole, sweep_weight=0.0))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         fit(method, scene, steps=20, show=False, rehearsal=False)

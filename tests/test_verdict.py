@@ -162,7 +162,7 @@ def test_memorised_photographs_are_said_with_what_was_applied_and_what_is_next(t
 def test_priors_for_few_photographs_are_named():
     few = FewViews(FewViewNumbers("yes"))
     few.surface = torch.zeros(2, 3)
-    assert few.few_view_priors == ("dropout of Gaussians", "smooth depth", "stereo surfaces at unobserved views")
+    assert few.few_view_priors == ("dropout of Gaussians", "smooth depth", "plane-sweep surfaces at unobserved views")
     assert FewViews(FewViewNumbers("auto")).few_view_priors == ()
 
 

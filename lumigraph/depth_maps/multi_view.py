@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from .. import kernels
 from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..datasets.scene import Scene
@@ -80,12 +79,6 @@ def multi_view_depth(
         known = torch.cat([seen.positions() for seen in found])
     spans = [around(view, known) or everywhere(view, scene) for view in coarse]
     return match(chosen, pyramids, spans, "Matching photographs", seconds - (time.perf_counter() - begin))
-
-
-def compile_matching() -> None:
-    """Compile the kernel on one dark pixel, so that `multi_view_depth` takes no time for it."""
-    dark, warp, first = torch.zeros(1, 1, 1), torch.eye(3, 4)[None], torch.zeros(1, dtype=torch.int64)
-    kernels.patch_cost(dark[0], dark[0], dark, dark, warp, first, first[:, None], torch.ones(1, 1, 3))
 
 
 def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:
@@ -200,14 +193,20 @@ def depth_map(found: PlaneMap, sure: Bool[Tensor, "height width"], number: int) 
     return DepthMap(camera, depth, sure.float(), view.rgb, normals)
 
 
-def choose_neighbours(views: Sequence[FlatView], spans: Sequence[tuple[float, float]]) -> list[list[int]]:
+def choose_neighbours(
+    views: Sequence[FlatView], spans: Sequence[tuple[float, float]], count: int = NEIGHBOURS
+) -> list[list[int]]:
     """For each view those others that see most of what it sees, from neither too near nor too far aside."""
     positions = torch.stack([view.pose[:, 3] for view in views])
-    return [best_neighbours(i, views, positions, spans[i]) for i in range(len(views))]
+    return [best_neighbours(i, views, positions, spans[i], count) for i in range(len(views))]
 
 
 def best_neighbours(
-    i: int, views: Sequence[FlatView], positions: Float[Tensor, "view 3"], span: tuple[float, float]
+    i: int,
+    views: Sequence[FlatView],
+    positions: Float[Tensor, "view 3"],
+    span: tuple[float, float],
+    count: int = NEIGHBOURS,
 ) -> list[int]:
     """Neighbours of a view by how they see places on a coarse grid of pixels at some depths."""
     view = views[i]
@@ -223,5 +222,5 @@ def best_neighbours(
         off = (angle - MEETING_ANGLE) / torch.where(angle < MEETING_ANGLE, NARROWER, WIDER)
         scores[j] = (other.sees(places)[0] * torch.exp(-0.5 * off * off)).mean()
     scores[i] = 0
-    order = scores.argsort(descending=True)[:NEIGHBOURS]
+    order = scores.argsort(descending=True)[:count]
     return [j for j in order.tolist() if scores[j] > MIN_OVERLAP]

@@ -27,6 +27,7 @@ from .octree_cells import octree_cells as octree_cells
 from .octree_march import octree_march as octree_march
 from .patch_cost import patch_cost as patch_cost
 from .perceptron import perceptron as perceptron
+from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize

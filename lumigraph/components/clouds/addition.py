@@ -63,12 +63,8 @@ class Addition(Part):
     def begin_cloud(self, method: Any) -> None:
         """Follow a new cloud."""
 
-    def limit(self, method: Any, data: Scene, stereo: Callable[[], Points]) -> int:
-        """Gaussians at most for these photographs; 0 for no limit. Called before there are any."""
-        return 0
-
-    def begin_scene(self, method: Any, data: Scene, stereo: Callable[[], Points]) -> None:
-        """Initialise from the photographs. stereo: gives points that multi-view stereo finds"""
+    def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
+        """Initialise from the photographs. sweep: gives points that plane sweeps find"""
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
         """Follow a cloud of which the Gaussians of a mask, or of indices, are left."""

@@ -17,7 +17,6 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...datasets.scene import Frame, Photograph, Scene
-from ...depth_maps.multi_view import compile_matching
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
@@ -28,14 +27,14 @@ from ..training.pose_refinement import PoseRefinement
 from .addition import Addition, Step
 from .appearance import SplatAppearance
 from .cloud import Cloud, picture_share, thinned
-from .dense_points import seen_points
+from .dense_points import compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl
 from .initialization import cloud_of, initial_cloud, random_cloud, surface_cloud
 from .interval_schedule import intervals
 from .moved_cloud import seen_from
 
 BLACK = 0.0, 0.0, 0.0
-STEREO_SHARE = 0.08  # share of a budget of seconds that multi-view stereo may take
+SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
 MIN_PIXELS = 64  # along the shorter side of a photograph that is reduced
 COARSE_UNTIL = 0.5  # share of the budget with plain colours, and by default half size, where poses are refined
@@ -89,18 +88,16 @@ class CloudMethod(Method, ABC):
     def compile_begin(self) -> None:
         super().compile_begin()
         if self.config.initialization == "dense":
-            compile_matching()
+            compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        c, stereo = self.config, cache(partial(seen_points, data, STEREO_SHARE * seconds))
-        limits = [part.limit(self, data, stereo) for part in self.additions]
-        self.density_control.view_limit.fill_(min(filter(None, limits), default=0))
-        cap = self.density_control.max_count(self.cloud)
+        c, cap = self.config, self.density_control.max_count(self.cloud)
         counts = min(c.initial_gaussians, cap), cap
-        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), stereo)
+        sweep = cache(partial(seen_points, data, SWEEP_SHARE * seconds))
+        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
         self.begin_with(found, data.cameras[data.splits["train"]])
         for part in self.additions:
-            part.begin_scene(self, data, stereo)
+            part.begin_scene(self, data, sweep)
         super().begin(data, seconds)
 
     @torch.no_grad()

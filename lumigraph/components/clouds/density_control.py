@@ -39,18 +39,15 @@ class DensityControl(Addition, ABC):
     """A strategy; it may `rebuild` the cloud after a step, and keeps in buffers what a resume needs.
 
     initial_count: number of Gaussians at first
-    view_limit:    `Addition.limit` of these photographs; 0 for none
     """
 
     initial_count: Tensor
-    view_limit: Tensor
 
     def __init__(self, refine: RefineNumbers):
         super().__init__()
         self.refining = refine
         self.schedule = IntervalSchedule(refine.refine_every, refine.refine_every_share)
         self.register_buffer("initial_count", torch.tensor(0))
-        self.register_buffer("view_limit", torch.tensor(0))
         self.warned = False
 
     @abstractmethod
@@ -66,13 +63,13 @@ class DensityControl(Addition, ABC):
         return ended and intervals(step, progress, self.refining.refine_from, self.refining.refine_from_share) >= 1
 
     def max_count(self, cloud: Cloud) -> int:
-        """Cap on the number of Gaussians: `max_gaussians`, the limit, or as many as fit into free memory."""
+        """Cap on the number of Gaussians: `max_gaussians`, or as many as fit into free memory."""
         fit = len(cloud) + room_for(BYTES_PER_GAUSSIAN, cloud.means.device)
-        return min(self.refining.max_gaussians or fit, int(self.view_limit) or fit, fit)
+        return min(self.refining.max_gaussians or fit, fit)
 
     def warn_full(self, cloud: Cloud) -> None:
-        """Warn, once, that the cloud has reached its cap, unless few photographs limit it."""
-        if not self.warned and not (self.view_limit and len(cloud) >= 0.95 * int(self.view_limit)):
+        """Warn, once, that the cloud has reached its cap."""
+        if not self.warned:
             self.warned = True
             by_option = len(cloud) >= 0.95 * (self.refining.max_gaussians or math.inf)
             why = "--max-gaussians says so" if by_option else "memory is short"

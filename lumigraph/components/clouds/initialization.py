@@ -1,4 +1,4 @@
-"""Initial cloud: Gaussians at points of structure from motion and of multi-view stereo, or at random."""
+"""Initial cloud: Gaussians at points of structure from motion and of plane sweeps, or at random."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ INITIAL_OPACITY = 0.1  # Kerbl 2023; the original release
 HULL_CELLS = 64  # along an axis
 NEIGHBOURS = 3
 MIN_DENSE_POINTS = 100
-MAX_DENSE_SHARE = 1 / 3  # of the cap: points that stereo fills up to, as each makes steps slower
+MAX_DENSE_SHARE = 1 / 3  # of the cap: points that plane sweeps fill up to, as each makes steps slower
 BACKDROP_SHARE = 0.2  # of the random Gaussians: how many lie far out behind dense points, where nothing else is known
 
 
@@ -37,20 +37,20 @@ def initial_cloud(
     max_count: int,
     degree: int,
     generator: torch.Generator,
-    stereo: Callable[[], Points] | None = None,
+    sweep: Callable[[], Points] | None = None,
 ) -> Gaussians:
     """At most `max_count` Gaussians at the points that are known, or where there are none, `count` random ones.
 
-    initialization: "dense" adds to the scene's sparse points those of multi-view stereo, "sparse" takes the sparse
+    initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
                     points as they are, "random" takes neither
-    stereo:         gives points that multi-view stereo finds; `seen_points` by default
+    sweep:          gives points that plane sweeps find; `seen_points` by default
     Random ones lie inside the silhouettes of photographs with alpha, otherwise inside the box of interest.
     """
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
         means, colours = sparse_points(scene, max_count, generator)
     if initialization == "dense" and len(means) < (dense_count := math.ceil(MAX_DENSE_SHARE * max_count)):
-        found = thinned((stereo or partial(seen_points, scene))())
+        found = thinned((sweep or partial(seen_points, scene))())
         means, colours = with_dense_points(scene, means, colours, count, dense_count, generator, found)
     if len(means) < 2:
         means = random_points(scene, min(count, max_count), generator)
@@ -80,7 +80,7 @@ def with_dense_points(
     generator: torch.Generator,
     found: Points,
 ) -> tuple[Tensor, Tensor]:
-    """Sparse points and dense ones; without sparse ones also some far out, where stereo finds nothing."""
+    """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
     inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
     if len(inside) < MIN_DENSE_POINTS:
         return means, colours

@@ -2,7 +2,7 @@
 
 Proposals: samples along rays without an end, where a grid of density proposes (Barron 2022, section 3.1). Every ray
 gets the same number of samples. Terms of the loss keep the air clear: the distortion loss (Barron 2022, eq. 15),
-gradients scaled near cameras (Philip 2023), and at first depth from multi-view stereo with
+gradients scaled near cameras (Philip 2023), and at first depth from plane sweeps over neighbouring photographs with
 clear air between cameras.
 """
 
@@ -20,14 +20,13 @@ from torch.nn.functional import normalize
 
 from ...camera.rays import Rays
 from ...datasets.scene import Frame, Scene
-from ...depth_maps.multi_view import compile_matching
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, between
 from ...method import Field, Pass, Sampler
 from ...method.field import Points as Places
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import weights_of
-from ..clouds.dense_points import Points, seen_points
+from ..clouds.dense_points import Points, compile_sweep, seen_points
 from ..fields.hash_field import CPU_TABLE, TINY_TABLE
 from ..training.regularizers import depth_loss, distortion_loss, places_between, scale_gradients
 from ..training.row_optimizers import LazyAdam
@@ -38,7 +37,7 @@ from .spaces import Space
 
 CELLS = 96  # of the proposal grid, along each axis
 LEARNING_RATES = 0.1, 0.01  # of the proposal grid, at first and in the end
-STEREO_SHARE = 0.1  # share of a budget of seconds that multi-view stereo may take
+SWEEP_SHARE = 0.1  # share of a budget of seconds that plane sweeps may take
 MAX_POINTS = 1 << 16  # surface points that are kept
 DEPTH_RAYS = 128  # rays of a step with known depth
 DEPTH_MARGIN = 0.005  # of distances t / (1 + t): accuracy of a surface point
@@ -58,7 +57,7 @@ class ProposalNumbers:
     proposal_samples: Annotated[int, between(4, 1024)] = 64  # samples of a ray in the proposal grid; more cost time
     samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray in the field; more are sharper, slower
     distortion_weight: NonNegative = 0.01  # distortion loss's weight (Barron 2022, eq. 15); higher: fewer floaters
-    stereo_weight: NonNegative = 0.03  # weight of stereo depth at first, falling to 0; 0: off
+    sweep_weight: NonNegative = 0.03  # weight of plane-sweep depth at first, falling to 0; 0: off
     air_weight: NonNegative = 0.05  # weight of clear air between cameras in the first half of training; 0: off
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
@@ -132,7 +131,7 @@ class ProposalSampler(Sampler):
         terms = {"proposal": proposal_loss(last.proposals, weights)}
         if self.numbers.distortion_weight:
             terms["distortion"] = self.numbers.distortion_weight * distortion_loss(last.samples, weights)
-        weight = self.numbers.stereo_weight * (1 - self.progress / DEPTH_UNTIL)
+        weight = self.numbers.sweep_weight * (1 - self.progress / DEPTH_UNTIL)
         if weight > 0 and len(self.surface):
             chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
             origins = places_between(self.surface_from[chosen], self.stands, generator)
@@ -179,18 +178,18 @@ class ProposalSampler(Sampler):
     @property
     def few_view_priors(self) -> tuple[str, ...]:
         air = ("clear air between cameras",) if self.numbers.air_weight else ()
-        return ("stereo depth", *air) if len(self.surface) else ()
+        return ("plane-sweep depth", *air) if len(self.surface) else ()
 
     # Training
 
     def compile_begin(self) -> None:
-        compile_matching()
+        compile_sweep()
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        """Find points on surfaces by multi-view stereo, unless poses are learnt."""
-        if not self.numbers.stereo_weight or method.moves_cameras:
+        """Find points on surfaces by plane sweeps, unless poses are learnt."""
+        if not self.numbers.sweep_weight or method.moves_cameras:
             return
-        found = some(seen_points(data, STEREO_SHARE * seconds), method.random(1))
+        found = some(seen_points(data, SWEEP_SHARE * seconds), method.random(1))
         self.surface, self.surface_from = (x.to(self.surface) for x in (found.positions, found.origins))
         sparse = self.surface[:0] if data.points is None else data.points.to(self.surface)
         if len(points := torch.cat([self.surface, sparse])):
@@ -227,7 +226,7 @@ def some(points: Points, generator: torch.Generator) -> Points:
     if len(points.positions) <= MAX_POINTS:
         return points
     chosen = torch.randperm(len(points.positions), generator=generator)[:MAX_POINTS]
-    rows = {name: getattr(points, name)[chosen] for name in ("positions", "colours", "sizes", "origins", "normals")}
+    rows = {name: getattr(points, name)[chosen] for name in ("positions", "colours", "sizes", "origins")}
     return Points(**rows, share=points.share)
 
 

@@ -1,15 +1,15 @@
 """Few views: regularisation of a cloud that is learnt from few photographs.
 
 Each step drops some Gaussians, so that those behind them learn too, and looks at an unobserved view between two
-photographs. There depth is to be smooth, and where multi-view stereo has found a surface, the view is to show it:
-whatever floats in front is carved away. The number of Gaussians follows that of the photographs.
+photographs. There depth is to be smooth, and where plane sweeps have found a surface, the view is to show it: whatever
+floats in front is carved away.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -18,17 +18,16 @@ from torch.nn.functional import max_pool2d
 
 from ...camera import Camera
 from ...components.clouds.addition import Addition, Step
-from ...components.clouds.dense_points import Points
+from ...components.clouds.dense_points import Points, compile_sweep
 from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
-from ...depth_maps.multi_view import compile_matching
 from ...exchange.packing import Stored
-from ...files.ranges import NonNegative, between
+from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted, splat, view_of
 
 MAX_SPARSE_VIEWS = 40  # training photographs up to which an open capture may be sparse
-MAX_SURFACE_SHARE = 0.45  # share of pixels whose surface multi-view stereo finds, from which on a capture is not sparse
+MAX_SURFACE_SHARE = 0.2  # share of pixels whose surface plane sweeps find, from which on a capture is not sparse
 MAX_PLAIN_VIEWS = 6  # training photographs up to which colours do not depend on the direction, which would explain
 # wrong depth away
 MAX_DROP_RATE = 0.3  # share of Gaussians at the end of training, to which it grows evenly (Park 2025, section 3.2)
@@ -45,11 +44,11 @@ OCCLUSION = 1.03  # times the least depth of the pixels around, beyond which a p
 class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
-    few_views: Literal["auto", "yes", "no"] = "no"  # regularisation for few photographs; auto: if stereo finds little
+    few_views: Literal["auto", "yes", "no"] = (
+        "no"  # regularisation for few photographs; auto: if plane sweeps agree little
+    )
     roughness_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
-    gaussians_per_view: Annotated[int, between(0, 10**6)] = 3000  # cap per photograph, with few_views; 0: none
-    stereo_weight: NonNegative = 0.1  # weight of stereo depth in photographs, with few_views; 0: off
-    surface_weight: NonNegative = 0.2  # weight of stereo surfaces at unobserved views, with few_views; 0: off
+    surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
 
 
 class FewViews(Addition):
@@ -57,7 +56,7 @@ class FewViews(Addition):
 
     active: whether the capture is sparse
     plain:  whether colours stay plain
-    surface, surface_colours: points that multi-view stereo has found
+    surface, surface_colours: points that plane sweeps have found
     """
 
     grows = ("surface", "surface_colours")
@@ -83,25 +82,23 @@ class FewViews(Addition):
     def few_view_priors(self) -> tuple[str, ...]:
         numbers, known = self.numbers, len(self.surface) > 0
         depth = ("smooth depth",) if numbers.roughness_weight else ()
-        surface = ("stereo surfaces at unobserved views",) if numbers.surface_weight and known else ()
+        surface = ("plane-sweep surfaces at unobserved views",) if numbers.surface_weight and known else ()
         return ("dropout of Gaussians", *depth, *surface) if self.active else ()
 
     def compile_begin(self) -> None:
-        compile_matching()
+        compile_sweep()
 
-    def limit(self, method: Any, data: Scene, stereo: Callable[[], Points]) -> int:
-        """Decide whether the capture is sparse. Returns its limit of Gaussians."""
+    def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
+        """Decide whether the capture is sparse, and keep what plane sweeps have found."""
+        if method.moves_cameras:
+            return
         count = len(data.splits["train"])
-        if self.numbers.few_views == "auto" and not method.moves_cameras:
+        if self.numbers.few_views == "auto":
             few = data.frame.is_open and not data.frame.has_alpha and count <= MAX_SPARSE_VIEWS
-            self.active.fill_(few and stereo().share < MAX_SURFACE_SHARE)
-        return self.numbers.gaussians_per_view * count if self.active else 0
-
-    def begin_scene(self, method: Any, data: Scene, stereo: Callable[[], Points]) -> None:
-        """Keep what multi-view stereo has found."""
-        if self.active and not method.moves_cameras:
-            self.plain.fill_(len(data.splits["train"]) <= MAX_PLAIN_VIEWS)
-            found = stereo()
+            self.active.fill_(few and sweep().share < MAX_SURFACE_SHARE)
+        if self.active:
+            self.plain.fill_(count <= MAX_PLAIN_VIEWS)
+            found = sweep()
             self.surface, self.surface_colours = (x.to(self.surface) for x in (found.positions, found.colours))
 
     def before_raster(self, method: Any, step: Step) -> None:
@@ -111,11 +108,6 @@ class FewViews(Addition):
     def regularize(self, method: Any, step: Step) -> None:
         if not self.active or method.cameras is None:
             return
-        if self.numbers.stereo_weight and len(self.surface):
-            place, depth, index = visible_points(self.surface, step.camera)
-            if len(index):
-                weight = self.numbers.stereo_weight * (1 - method.progress)
-                step.terms["observed_depth"] = weight * depth_error(step.picture, place, depth)
         camera = camera_between(method.cameras, step.chance).to(method.device)
         camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
         seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
@@ -166,13 +158,8 @@ def surface_error(
     seen: Splatted, place: tuple[Tensor, Tensor], depth: Float[Tensor, " point"], colours: Float[Tensor, "point 3"]
 ) -> Float[Tensor, ""]:
     """Error of a picture at points that it is to show: of colours, of the logarithm of depth, and light that passes."""
-    colour = (seen.rgb[place] - colours).abs().mean()
-    return colour + SURFACE_WEIGHT * depth_error(seen, place, depth)
-
-
-def depth_error(seen: Splatted, place: tuple[Tensor, Tensor], depth: Float[Tensor, " point"]) -> Float[Tensor, ""]:
-    """Error of the logarithm of a picture's depth at points, and light that passes them."""
     opacity = seen.opacity[place]
     ratio = (seen.depth[place] / opacity.clamp_min(1e-3)).clamp_min(1e-4) / depth
     off = (ratio.log().abs().clamp(max=MAX_LOG_ERROR) * opacity.detach()).mean()
-    return off + OPACITY_WEIGHT * (1 - opacity).mean()
+    colour = (seen.rgb[place] - colours).abs().mean()
+    return colour + SURFACE_WEIGHT * (off + OPACITY_WEIGHT * (1 - opacity).mean())

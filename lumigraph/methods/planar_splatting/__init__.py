@@ -66,7 +66,7 @@ class Config:
     sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
     sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
     ssim_weight: Share = 0.2  # share of D-SSIM in the loss; higher gives structure more weight
-    initialization: Initialization = "sparse"  # first Gaussians: sparse points, stereo points too, or random
+    initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
@@ -103,7 +103,7 @@ class Planes(Addition):
         super().__init__()
         self.numbers = numbers
 
-    def begin_scene(self, method: Any, data: Scene, stereo: Any) -> None:
+    def begin_scene(self, method: Any, data: Scene, sweep: Any) -> None:
         if self.numbers.discs:
             method.cloud.replace(discs(method.cloud.gaussians()))
 

@@ -18,7 +18,7 @@ from ...geometry import to_matrix, to_quaternion, unit
 MIN_FACING = 0.02  # cosine between a plane's normal and a ray; below it they have no crossing that counts
 DISC_NEIGHBOURS = 10  # nearest points that determine the normal of a disc
 DISC_THICKNESS = 0.2  # of its width, at first
-DISC_OPACITY = 0.7  # at first: points that multi-view stereo finds lie on surfaces
+DISC_OPACITY = 0.7  # at first: points that plane sweeps find lie on surfaces
 
 
 @dataclass(frozen=True)

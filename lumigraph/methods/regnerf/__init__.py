@@ -87,7 +87,7 @@ class Config:
     table_occupancy_threshold: NonNegative = 0.05  # of the table: optical thickness of an empty cell; higher: faster
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # of the hash table: residual at which the loss turns from squared to linear
-    stereo_weight: NonNegative = 0.03  # of the hash table: weight of stereo depth in the open at first; 0: off
+    sweep_weight: NonNegative = 0.03  # of the hash table: weight of plane-sweep depth in the open at first; 0: off
 
     @property
     def occupancy(self) -> OccupancyNumbers:
@@ -100,7 +100,7 @@ class Config:
     @property
     def proposals(self) -> ProposalNumbers:
         """Numbers of the hash table's samples in scenes without bounds."""
-        return ProposalNumbers(stereo_weight=self.stereo_weight)
+        return ProposalNumbers(sweep_weight=self.sweep_weight)
 
 
 DECAY_START = 0.3  # share of the budget before the table's learning rate falls
