@@ -6,7 +6,8 @@ import pytest
 import torch
 from budgets import budget
 from PIL import Image
-from test_multi_view import RADIUS, ball, matched
+from test_dense_start import RADIUS, ball
+from test_multi_view import matched
 
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
