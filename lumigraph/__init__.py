@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from .datasets.shapes import Shapes as Shapes
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
+    from .gaussians.rasterization import rasterization as rasterization
+    from .library import call as call
+    from .library import capture as capture
+    from .library import open as open
+    from .library import train as train
     from .method import Method as Method
     from .method import RayMethod as RayMethod
     from .run import Opened as Opened
@@ -50,11 +55,15 @@ _homes = {
     "Samples": "camera.rays",
     "Scene": "datasets.scene",
     "Shapes": "datasets.shapes",
+    "call": "library",
     "composite": "volume",
     "fit": "training",
+    "open": "library",
     "open_any": "run",
     "open_dataset": "capture",
     "open_scene": "capture",
+    "rasterization": "gaussians.rasterization",
+    "train": "library",
 }
 __all__ = sorted(_homes)
 

@@ -69,6 +69,7 @@ def test_every_block_has_a_test():
         "docs/convert.md",
         "docs/datasets.md",
         "docs/layers.md",
+        "docs/python.md",
     }
     assert set(blocks()) == tested | ELSEWHERE | NEEDS_DATA
     assert written("```python\na = 1\n```\n```\nb\n```\n") == ["a = 1\n"]
@@ -77,6 +78,24 @@ def test_every_block_has_a_test():
 def test_a_run_renders(in_folder_of_runs):
     view = execute("README.md")["view"]
     assert view.rgb.shape == (tiny.SIZE, tiny.SIZE, 3) and view.rgb.std() > 0.05
+
+
+def test_from_python(in_folder_of_runs, ball_folder, monkeypatch):
+    Path("photos").symlink_to(ball_folder)
+    scale = {
+        'lumigraph.capture("photos")': 'lumigraph.open_scene("photos")',
+        "seconds=60": "steps=40, seed_count=400",
+        "frames=90": "frames=2, size=24",
+        '"procedural:still-life", SparseNGP, steps=300': '"photos", SparseNGP, steps=2, table_size=1024',
+    }
+    names: dict[str, Any] = {}
+    for source in blocks()["docs/python.md"]:
+        for before, after in scale.items():
+            source = source.replace(before, after)
+        exec(compile(source, "docs/python.md", "exec"), names)
+    assert names["picture"].shape == (1, 48, 64, 3) and names["run"].method_name == "sparse-ngp"
+    assert all(Path(name).stat().st_size for name in ("film.mp4", "page.html", "scene.spz"))
+    assert names["run"].metrics() is not None
 
 
 def test_a_run_is_converted(in_folder_of_runs):

@@ -4,6 +4,8 @@ Each format has one reader; bounds and splits are found in one place."""
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -158,7 +160,8 @@ def open_scene(
         scene = with_all_views(scene)
     if views is not None:
         scene = with_fewer_views(scene, views)
-    return multiscale(scene, scales, memory, cache)
+    options = {"downscale": downscale, "reader": reader, "views": views, "scales": scales}
+    return replace(multiscale(scene, scales, memory, cache), options=options)
 
 
 def confirm(source: str | Path) -> None:
@@ -201,3 +204,13 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
         f"{folder} holds no camera poses ({pictures} images were found): looked for "
         f"{'; '.join(r.EXPECTED_FILES for r in asked.values())}; find the poses first: lumigraph capture {folder}"
     )
+
+
+class CallablePackage(ModuleType):
+    """This package as `lumigraph.capture(photographs)`: a call has the name of its command, which is this package's."""
+
+    def __call__(self, *photographs: Any, **options: Any) -> Scene:
+        return import_module("..library", __package__).capture(*photographs, **options)
+
+
+sys.modules[__name__].__class__ = CallablePackage

@@ -23,7 +23,9 @@ def before(
 
 
 def over(
-    light: Float[Tensor, "*pixels 3"], opacity: Float[Tensor, "*pixels"], background: Float[Tensor, "*#pixels 3"]
-) -> Float[Tensor, "*pixels 3"]:
+    light: Float[Tensor, "*pixels channel"],
+    opacity: Float[Tensor, "*pixels"],
+    background: Float[Tensor, "*#pixels channel"],
+) -> Float[Tensor, "*pixels channel"]:
     """Light that was stopped on its way, as renderings have it (colours times opacity), and what passes from behind."""
     return light + (1 - opacity)[..., None] * background

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
 
 MAX_LINES = 12  # lines of one kind that are printed
+_kept: ContextVar[dict[str, Any] | None] = ContextVar("kept", default=None)  # rows in place of the terminal
 
 
 def choose_device(name: str) -> Any:
@@ -103,8 +106,28 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+@contextlib.contextmanager
+def kept_rows() -> Iterator[dict[str, Any]]:
+    """A block whose `show` prints nothing; the dictionary has its rows."""
+    rows: dict[str, Any] = {}
+    token = _kept.set(rows)
+    try:
+        yield rows
+    finally:
+        _kept.reset(token)
+
+
+def show_table(table: Any) -> None:
+    """Print a rich Table, unless rows are kept."""
+    if _kept.get() is None:
+        console().print(table)
+
+
 def show(rows: Mapping[str, Any]) -> None:
     """Results, text or rich Text, names aligned; further lines of a text stand below its first."""
+    if (kept := _kept.get()) is not None:
+        kept.update(rows)
+        return
     out, width = console(soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
         if isinstance(value, str):

@@ -13,8 +13,7 @@ from tyro.conf import Positional
 from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
-from ..system.console import console
-from .common import choose_device, say, show, typed
+from .common import choose_device, say, show, show_table, typed
 from .options import DeviceOption, PhotographsOption, needed, option
 
 LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
@@ -72,7 +71,7 @@ class Compress:
         except KeyboardInterrupt:
             say(f"Stopped; {self.run_folder} is as it was and nothing else is kept, so the same command begins anew")
             raise
-        console().print(table(made))
+        show_table(table(made))
         against = str(made.compared_with)
         if made.psnr_before is None:
             against += ", for its photographs cannot be opened; --scene says where they are"

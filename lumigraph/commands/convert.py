@@ -13,8 +13,7 @@ from tyro.conf import Positional
 from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Count, Seconds
-from ..system.console import console
-from .common import about_quality, choose_device, given_budget, method_config, say, show, typed
+from .common import about_quality, choose_device, given_budget, method_config, say, show, show_table, typed
 from .compress import size
 from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, needed, option
 
@@ -87,7 +86,7 @@ class Convert:
         except KeyboardInterrupt:
             say(kept(self.output))
             raise
-        console().print(table(made))
+        show_table(table(made))
         took = f"{made.taking_over:.1f} s to take over, {made.steps} steps in {made.seconds:.1f} s to learn on"
         rows = {"alike": f"{made.psnr:.2f} dB, the mean of {made.views} held-out views", "by": f"{made.how}; {took}"}
         rows |= {"cost": cost(made), "learnt from": made.learnt_from, "saved": str(self.output)}

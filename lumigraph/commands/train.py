@@ -238,7 +238,8 @@ class Train:
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
 
-    def run(self) -> int:
+    def run(self, watch: Any = None) -> int:
+        """Train, and print the outcome. watch: who looks on, in place of the viewer of --view; see `fit`"""
         from ..capture import confirm, kind_of, open_dataset
         from ..datasets.dataset import check_kind
         from ..run import Run, build, check_new
@@ -269,11 +270,12 @@ class Train:
             asked = self.quality
             budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)
         run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
-        with watching(self.view, method, data, run, self.host, self.port) as watch:
+        with watching(self.view, method, data, run, self.host, self.port) as viewer:
             with run.kept_if_learnt():
-                outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
+                looking = viewer or watch
+                outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
             show_outcome(run, outcome, method, data)
-            keep_showing(watch, outcome.signal)
+            keep_showing(viewer, outcome.signal)
         return exit_code(outcome.signal)
 
 

@@ -266,6 +266,7 @@ class Scene:
     about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
     full_sizes: width and height of the photographs before they were reduced, where they come from files
     digests: size and hash of each photograph's file, "" where it comes from none
+    options: how the source was opened: downscale, reader, views, scales
     """
 
     kind: ClassVar[str] = "photographs"
@@ -283,6 +284,7 @@ class Scene:
     about: dict[str, Tensor] = field(default_factory=dict)
     full_sizes: Int[Tensor, "photograph 2"] | None = None
     digests: list[str] = field(default_factory=list)
+    options: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)

@@ -264,6 +264,10 @@ class Run(Trained):
         return self.has_state and self._checkpoints.weights.name == PACKED_FILE
 
     @property
+    def version(self) -> str:
+        return str(self._checkpoints.weights)
+
+    @property
     def model_bytes(self) -> int:
         """Size of the trained weights, which are all that rendering needs."""
         return self._checkpoints.weights.stat().st_size

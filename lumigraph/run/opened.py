@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 
 from ..camera import Camera, dome, ring
+from ..camera.rays import Rendering
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
@@ -17,6 +19,7 @@ from ..exchange import size_of
 from ..gaussians import Gaussians
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
+from ..system.work import at_work
 from .checkpoint import State
 from .records import read_evaluation
 from .settings import Settings, Source
@@ -31,6 +34,7 @@ class Opened(ABC):
 
     path: Path
     frame: Frame
+    _ready: tuple[Any, Method] | None = None  # version and device of the method that renders
 
     @property
     def title(self) -> str:
@@ -46,6 +50,55 @@ class Opened(ABC):
     def paths(self) -> Path:
         """Folder of saved camera paths."""
         return self.renders / "paths"
+
+    # Commands as calls: see `library`
+
+    def render(self, camera: Camera, device: str = "auto", **controls: Any) -> Rendering:
+        """What one camera sees, as (height, width) pictures. The method is loaded once.
+
+        camera:   in `frame`, as those of `cameras()`
+        controls: values of the method's controls, such as time=0.3
+        """
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        version = (self.version, device)
+        if self._ready is None or self._ready[0] != version:
+            self._ready = version, self.method(device)
+        with at_work(), torch.no_grad():
+            return self._ready[1].given(**controls).render(camera)
+
+    def film(self, path: Path | str, **options: Any) -> Path:
+        """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
+        return library().film(self, path, **options)
+
+    def export(self, kind: str, path: Path | str, **options: Any) -> Path:
+        """Write files for other programs. kind: mesh, splats, points, web, panorama and others, as in
+        `lumigraph export`; options: those of `lumigraph export KIND`."""
+        return library().export(self, kind, path, **options)
+
+    def evaluate(self, **options: Any) -> dict[str, Any]:
+        """Compare with held-out photographs or shapes: the contents of eval.json. options: those of `lumigraph eval`.
+
+        Raises LumigraphError for what is no run.
+        """
+        return library().evaluate(self, **options)
+
+    def convert(self, method: str, output: Path | str, **options: Any) -> Opened:
+        """Run of another method, initialised from this one. options: those of `lumigraph convert`."""
+        return library().derive("convert", self, output, method, **options)
+
+    def compress(self, output: Path | str, **options: Any) -> Opened:
+        """Run of a fraction of the size. options: those of `lumigraph compress`."""
+        return library().derive("compress", self, output, **options)
+
+    def clean(self, output: Path | str, **options: Any) -> Opened:
+        """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
+        return library().derive("clean", self, output, **options)
+
+    @property
+    def version(self) -> str:
+        """Name of the state that rendering shows; another one after more training."""
+        return ""
 
     @abstractmethod
     def method(self, device: torch.device | str = "cpu") -> Method:
@@ -145,3 +198,8 @@ class Trained(Opened):
         """Contents of eval.json, if it has been evaluated."""
         path = self.folder / "eval.json"
         return read_evaluation(path) if path.exists() else None
+
+
+def library() -> Any:
+    """The module of calls, by name, for that room stands above this one."""
+    return importlib.import_module("..library", __package__)

@@ -62,8 +62,9 @@ class Watch(Protocol):
     def give_way(self, stopping: Callable[[], object]) -> None:
         """Render, in eval mode; return at once where stopping() is true."""
 
-    def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
-        """So many steps are done. row: the line of metrics.jsonl, empty for most steps."""
+    def note(self, step: int, progress: float, row: dict[str, Any]) -> bool | None:
+        """So many steps are done. row: the line of metrics.jsonl, empty for most steps. Returns true to end training
+        as a first Ctrl-C does."""
 
 
 @at_work()
@@ -115,7 +116,7 @@ def fit(
             run.forget_after(state.step)
         method.train()
         share_seen, passes, losses = shares_seen(data), state.passes, list[float]()
-        clock, step, watched = Clock(state.seconds), state.step, 0.0
+        clock, step, watched, ended = Clock(state.seconds), state.step, 0.0, False
         if fresh:
             with display.aside():
                 method.begin(data, budget.seconds or math.inf)
@@ -142,7 +143,7 @@ def fit(
         def refuse(fault: str) -> None:
             raise LumigraphError(stop(fault, step, run, method, save))
 
-        while (progress := spent()) < 1 and step != pause_at and not interrupt.signal:
+        while (progress := spent()) < 1 and step != pause_at and not (ended or interrupt.signal):
             if watch and watch.asked:
                 watched += give_way(watch, method, clock, interrupt)
                 continue
@@ -158,7 +159,7 @@ def fit(
             row = record(step, clock.seconds, terms, method, losses, passes) if logged or display.due else {}
             display.update(step, clock.seconds, budget, batch, row)
             if watch:
-                watch.note(step, progress, row)
+                ended = bool(watch.note(step, progress, row))
             if logged:
                 losses.clear()
             if run and logged:
