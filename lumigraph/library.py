@@ -30,11 +30,11 @@ from .method import Method
 from .run import Opened, open_any
 from .system.work import at_work
 
-FRAMES = re.compile("[╭╮╰╯│─]+")  # lines of the boxes around faults of options
+FRAMES = re.compile("[╭╮╰╯│─]+|-{3,}|For full helptext, run .*")  # around faults of options
 Progress = Callable[[int, float, dict[str, Any]], object]
 
 
-def call(command: str, *arguments: object, **options: Any) -> dict[str, str]:
+def call(command: str, /, *arguments: object, **options: Any) -> dict[str, str]:
     """Run a command by its name, as "export mesh" or "bench views", with its arguments in order and its options.
 
     Returns what the command line prints: text by name.
@@ -91,16 +91,16 @@ def open(path: str | Path) -> Opened:
     return open_any(path)
 
 
-def film(opened: Opened, path: str | Path, **options: Any) -> Path:
+def film(opened: Opened, file: str | Path, /, **options: Any) -> Path:
     """Render a film; see `Opened.film`."""
-    call("render", opened.path, output=path, **options)
-    return Path(path)
+    call("render", opened.path, output=file, **options)
+    return Path(file)
 
 
-def export(opened: Opened, kind: str, path: str | Path, **options: Any) -> Path:
+def export(opened: Opened, kind: str, file: str | Path, /, **options: Any) -> Path:
     """Write files for other programs; see `Opened.export`."""
-    call(f"export {kind}", opened.path, path, **options)
-    return Path(path)
+    call(f"export {kind}", opened.path, file, **options)
+    return Path(file)
 
 
 def evaluate(opened: Opened, **options: Any) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def evaluate(opened: Opened, **options: Any) -> dict[str, Any]:
     return read_evaluation(opened.path / f"{stem(options.get('split', 'test'))}.json")
 
 
-def derive(command: str, opened: Opened, output: str | Path, *arguments: str, **options: Any) -> Opened:
+def derive(command: str, opened: Opened, output: str | Path, /, *arguments: str, **options: Any) -> Opened:
     """Make a run, or a file, of another one by `convert`, `compress` or `clean`, and open it."""
     call(command, opened.path, *arguments, output=output, **options)
     return open_any(output)
@@ -144,7 +144,7 @@ def understood(words: list[str]) -> Any:
         except SystemExit:
             pass  # with its fault in `said`
     fault = " ".join(FRAMES.sub(" ", said.getvalue()).split())
-    raise LumigraphError(f"lumigraph {' '.join(words)}: {fault}")
+    raise LumigraphError(f"{fault or words}; `lumigraph {words[0]} --help` lists what there is")
 
 
 @at_work()

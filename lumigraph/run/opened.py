@@ -67,14 +67,14 @@ class Opened(ABC):
         with at_work(), torch.no_grad():
             return self._ready[1].given(**controls).render(camera)
 
-    def film(self, path: Path | str, **options: Any) -> Path:
+    def film(self, file: Path | str, /, **options: Any) -> Path:
         """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
-        return library().film(self, path, **options)
+        return library().film(self, file, **options)
 
-    def export(self, kind: str, path: Path | str, **options: Any) -> Path:
+    def export(self, kind: str, file: Path | str, /, **options: Any) -> Path:
         """Write files for other programs. kind: mesh, splats, points, web, panorama and others, as in
         `lumigraph export`; options: those of `lumigraph export KIND`."""
-        return library().export(self, kind, path, **options)
+        return library().export(self, kind, file, **options)
 
     def evaluate(self, **options: Any) -> dict[str, Any]:
         """Compare with held-out photographs or shapes: the contents of eval.json. options: those of `lumigraph eval`.
@@ -83,15 +83,15 @@ class Opened(ABC):
         """
         return library().evaluate(self, **options)
 
-    def convert(self, method: str, output: Path | str, **options: Any) -> Opened:
+    def convert(self, method: str, output: Path | str, /, **options: Any) -> Opened:
         """Run of another method, initialised from this one. options: those of `lumigraph convert`."""
         return library().derive("convert", self, output, method, **options)
 
-    def compress(self, output: Path | str, **options: Any) -> Opened:
+    def compress(self, output: Path | str, /, **options: Any) -> Opened:
         """Run of a fraction of the size. options: those of `lumigraph compress`."""
         return library().derive("compress", self, output, **options)
 
-    def clean(self, output: Path | str, **options: Any) -> Opened:
+    def clean(self, output: Path | str, /, **options: Any) -> Opened:
         """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
         return library().derive("clean", self, output, **options)
 
