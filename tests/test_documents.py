@@ -86,7 +86,7 @@ def test_from_python(in_folder_of_runs, ball_folder, monkeypatch):
         'lumigraph.capture("photos")': 'lumigraph.open_scene("photos")',
         "seconds=60": "steps=40, initial_gaussians=400",
         "frames=90": "frames=2, size=24",
-        '"procedural:still-life", SparseNGP, steps=300': '"photos", SparseNGP, steps=2, table_size=1024',
+        '"procedural:still-life", SparseNGP, steps=300': '"photos", SparseNGP, steps=2, log2_hashmap_size=10',
     }
     names: dict[str, Any] = {}
     for source in blocks()["docs/python.md"]:

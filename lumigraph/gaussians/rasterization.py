@@ -125,7 +125,7 @@ def rasterization(
             depth = depth / alpha.clamp_min(MIN_OPACITY)
         pictures.append(torch.cat([picture, depth[..., None]], -1) if "D" in render_mode else picture)
         opaque.append(alpha[..., None])
-    meta = {"means2d": centres, "radii": radii, "depths": depths, "conics": conics, "opacities": alphas}
+    meta: dict[str, Any] = {"means2d": centres, "radii": radii, "depths": depths, "conics": conics, "opacities": alphas}
     meta |= {"width": width, "height": height, "n_cameras": count}
     return torch.stack(pictures), torch.stack(opaque), meta
 
