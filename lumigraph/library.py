@@ -73,7 +73,7 @@ def train(
               which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes
     options:  those of `lumigraph train METHOD`
     """
-    if isinstance(scene, Dataset):
+    if not isinstance(scene, str | Path):
         if not scene.source:
             raise LumigraphError("This dataset came from no path, so a run could not open it again; train it by `fit`")
         options = {**getattr(scene, "options", {}), **options}

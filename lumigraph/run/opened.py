@@ -54,7 +54,7 @@ class Opened(ABC):
     # Commands as calls: see `library`
 
     def render(self, camera: Camera, device: str = "auto", **controls: Any) -> Rendering:
-        """What one camera sees, as (height, width) pictures. The method is loaded once.
+        """Picture of one camera, with leading axes (height, width). The method is loaded once.
 
         camera:   in `frame`, as those of `cameras()`
         controls: values of the method's controls, such as time=0.3
