@@ -39,7 +39,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "rays.coarse_samples": 32,
         "rays.fine_samples": 12,
         "tracking.first_estimate": "velocity",
-        "tracking.tracking_pixels": 200,
+        "descent.tracking_pixels": 200,
         "mapping.window": 5,
         "mapping.pixels_per_frame": 200,
         "mapping.active_sampling": True,

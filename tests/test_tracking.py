@@ -15,7 +15,7 @@ from lumigraph.capture import Unposed, without_poses
 from lumigraph.capture.capture import Capture, PixelPlane, Shot
 from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.imap.alignment import aligned
+from lumigraph.components.tracking.alignment import aligned
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
 
 pytestmark = budget("methods", 4)

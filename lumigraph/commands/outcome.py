@@ -73,7 +73,7 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     """Write the trajectory of a run and print its errors, lost frames and next commands."""
     from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, write_tracking
 
-    state, sequence = outcome.state, method.sequence(data)
+    state, sequence = outcome.state, method.tracker.sequence(data)
     followed = min(state.step, len(sequence))
     speed = followed / max(state.seconds, 1e-9)
     figures = {"frames_per_second": speed}

@@ -38,8 +38,8 @@ class Tracked:
 
     @staticmethod
     def of(method: Any, scene: Scene) -> Tracked:
-        """method: one with a `trajectory`"""
-        state, order = method.trajectory.state.cpu(), order_of(scene.cameras)
+        """method: one with a `tracker`"""
+        state, order = method.tracker.trajectory.state.cpu(), order_of(scene.cameras)
         chosen = order[state[order] == KNOWN]
         cameras = method.refined(scene.cameras[chosen]).transformed(scene.frame.to_source.matrix)
         times = scene.cameras.time
