@@ -49,6 +49,26 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "terms.depth_weight": 1.0,
         "terms.distance_weight": 0.0,
     },
+    "splat-slam": {  # spla-tam/SplaTAM, configs/replica/splatam.py; the paper's sections 3.2 to 3.4
+        "tracking.first_estimate": "velocity",
+        "descent.tracking_iterations": 40,
+        "descent.rotation_rate": 2 * 4e-4,  # cam_unnorm_rots, of a quaternion's numbers
+        "descent.shift_rate": 2e-3,
+        "descent.tracking_silhouette": 0.99,
+        "mapping.mapping_iterations": 60,
+        "mapping.first_iterations": 60,
+        "mapping.window": 24,
+        "mapping.keyframe_every": 5,
+        "mapping.depth_weight": 1.0,
+        "mapping.colour_weight": 0.5,
+        "mapping.ssim_weight": 0.2,
+        "rates.means_lr": 1e-4,
+        "rates.final_means_lr": 1e-4,
+        "rates.sh_lr": 2.5e-3 / 0.28209479177387814,  # rgb_colors, of a colour itself
+        "rates.opacities_lr": 0.05,
+        "rates.scales_lr": 1e-3,
+        "reduction": 1,
+    },
     "nerf": {  # bmild/nerf, run_nerf.py, paper_configs/blender_config.txt and llff_config.txt
         "network.depth": 8,
         "network.skip_layer": 5,

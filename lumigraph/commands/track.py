@@ -31,7 +31,7 @@ class Track:
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
-    """Method that tracks and maps: imap."""
+    """Method that tracks and maps: imap or splat-slam."""
     recording: Annotated[Positional[str], needed("RECORDING")]
     """Frames with depth: a folder, or procedural:room,depth."""
     output: Annotated[Path | None, option("RUN", "runs/RECORDING-METHOD-N")] = None

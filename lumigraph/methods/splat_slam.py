@@ -60,6 +60,7 @@ class MappingNumbers:
     """A Config's numbers of densification and mapping (sections 3.3 and 3.4)."""
 
     mapping_iterations: Iterations = 60  # descents on the map for each frame; more learn more, slower
+    first_iterations: Iterations = 60  # descents on the map for the first frame
     window: Annotated[int, between(2, 1000)] = 24  # frames k of a frame's mapping: itself, the latest keyframe, others
     keyframe_every: Count = 5  # frames from one keyframe to the next
     depth_weight: NonNegative = 1.0  # weight of depth, metres
@@ -112,14 +113,14 @@ class SplatSlam(Method):
     def cpu_preset(cls) -> Any:
         """Frames of half the size, aligned with the rendered surface first; few descents."""
         tracking = TrackingNumbers(first_estimate="surface")
-        mapping = MappingNumbers(mapping_iterations=8, window=10)
+        mapping = MappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
         rates = replace(Config().rates, sh_lr=2e-2, scales_lr=5e-3)
         return Config(tracking, PoseNumbers(tracking_iterations=5), mapping, rates, reduction=2)
 
     @classmethod
     def smallest(cls) -> Any:
         """Few descents a frame."""
-        mapping = MappingNumbers(mapping_iterations=2, window=4, keyframe_every=2)
+        mapping = MappingNumbers(2, 2, window=4, keyframe_every=2)
         return Config(descent=PoseNumbers(tracking_iterations=4), mapping=mapping)
 
     # The sequence
@@ -145,9 +146,9 @@ class SplatSlam(Method):
     def step(self, batch: Moment, step: int, descend: Descend) -> dict[str, Tensor]:
         """Follow the next frame, densify where it sees something new, then map."""
         c, chance, frame, tracker = self.config.mapping, self.random(step), batch.frame, self.tracker
-        iterations = 1 if self.rehearses else max(c.mapping_iterations, 1)
+        first = int(tracker.turn) == 0
+        iterations = 1 if self.rehearses else max(c.first_iterations if first else c.mapping_iterations, 1)
         if frame is not None:
-            first = int(tracker.turn) == 0
             share = tracker.follow(
                 frame, batch, lambda pose: self.tracked(frame, pose, chance), lambda pose: self.explained(frame, pose)
             )
@@ -160,6 +161,9 @@ class SplatSlam(Method):
         terms = self.map(window, iterations, chance, descend) if window else {}
         if frame is not None and (len(tracker.keyframes) * c.keyframe_every <= self.mapped(batch, frame)):
             tracker.add_keyframe(frame)
+            before = tracker.trajectory.poses.clone()
+            if tracker.close_loop(frame, batch.scene, chance):
+                self.carry(before)
         self.figures |= {"gaussians": len(self.cloud), "keyframes": len(tracker.keyframes)}
         return terms
 
@@ -194,9 +198,7 @@ class SplatSlam(Method):
         """Share of measured pixels whose depth the map explains."""
         depth, known = axial(frame)
         seen = self.seen(self.gaussians(), frame, pose)
-        right = (seen.opacity > NEW_SILHOUETTE) & (
-            (seen.depth / seen.opacity.clamp_min(1e-3) - depth).abs() < DEPTH_TOLERANCE * depth
-        )
+        right = (seen.opacity > NEW_SILHOUETTE) & ((surface_depth(seen) - depth).abs() < DEPTH_TOLERANCE * depth)
         return float((right & known).sum() / known.sum().clamp_min(1))
 
     # Tracking (section 3.2)
@@ -219,11 +221,11 @@ class SplatSlam(Method):
             at = moved(pose[None], torch.cat([turn, shift * self.unit], -1))[0]
             seen = self.seen(cloud, frame, at)
             sure = known & (seen.opacity.detach() > t.tracking_silhouette)
-            away = c.depth_weight * (seen.depth - depth).abs() / self.unit
+            away = c.depth_weight * (surface_depth(seen) - depth).abs() / self.unit
             error = away + c.colour_weight * (self.shown(seen) - rgb).abs().sum(-1)
             loss = torch.where(sure, error, 0.0).sum() / sure.sum().clamp_min(1)
-            if float(loss) < best:
-                best, found = float(loss), at.detach()
+            if (value := loss.item()) < best:
+                best, found = value, at.detach()
             turn.grad, shift.grad = torch.autograd.grad(loss, [turn, shift])
             optimizer.step()
         return found
@@ -264,9 +266,10 @@ class SplatSlam(Method):
         if first:
             self.radius.copy_(depth[known].amax() / RADIUS_RATIO if known.any() else torch.tensor(1.0))
         seen = self.seen(self.gaussians(), frame, pose)
-        error = torch.where(known, (seen.depth - depth).abs(), 0.0)
+        shown = surface_depth(seen)
+        error = torch.where(known, (shown - depth).abs(), 0.0)
         median = error[known].median() if known.any() else 0.0
-        new = (seen.opacity < NEW_SILHOUETTE) | (depth < seen.depth) & (error > DEPTH_ERROR_FACTOR * median)
+        new = (seen.opacity < NEW_SILHOUETTE) | (depth < shown) & (error > DEPTH_ERROR_FACTOR * median)
         chosen = (new & known).flatten().nonzero()[:, 0]
         room = c.max_gaussians - len(self.cloud)
         if len(chosen) > room:
@@ -288,6 +291,13 @@ class SplatSlam(Method):
         """Append Gaussians to the map; `map` begins with fresh moments."""
         self.cloud.replace(joined([self.cloud.gaussians(), added]))
         self.anchor = torch.cat([self.anchor, torch.full((len(added),), image, device=self.device)])
+
+    @torch.no_grad()
+    def carry(self, before: Float[Tensor, "image 3 4"]) -> None:
+        """Move each Gaussian with the frame at which it was added. before: poses of all images until now"""
+        old, new = before[self.anchor], self.tracker.trajectory.poses[self.anchor]
+        local = torch.einsum("nji,nj->ni", old[:, :, :3], self.cloud.means - old[:, :, 3])
+        self.cloud.means.copy_(torch.einsum("nij,nj->ni", new[:, :, :3], local) + new[:, :, 3])
 
     # Mapping (section 3.4)
 
@@ -378,13 +388,18 @@ def axial(frame: DepthFrame) -> tuple[Float[Tensor, "height width"], Bool[Tensor
     return depth.view(height, width), known.view(height, width)
 
 
+def surface_depth(seen: Splatted) -> Float[Tensor, "height width"]:
+    """Mean depth of what a pixel shows: rendered depth over the silhouette, which stays a little below 1."""
+    return seen.depth / seen.opacity.clamp_min(1e-3)
+
+
 def surface_of(
     frame: DepthFrame, seen: Splatted, sure: float
 ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
     """Points and normals of a rendered surface in the camera's frame, and where both are known."""
     width, height = frame.size
     rays = frame.rays.directions.view(height, width, 3)
-    points = rays * (seen.depth / seen.opacity.clamp_min(1e-3) / rays[..., 2])[..., None]
+    points = rays * (surface_depth(seen) / rays[..., 2])[..., None]
     n, normals = NORMAL_STEP, torch.zeros_like(points)
     across = points[n:-n, 2 * n :] - points[n:-n, : -2 * n]
     down = points[2 * n :, n:-n] - points[: -2 * n, n:-n]

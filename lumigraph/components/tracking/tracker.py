@@ -14,6 +14,7 @@ from ...errors import LumigraphError
 from ...files.ranges import BatchSize, Share, between
 from ...method import Part
 from .frames import DepthFrame, Moment, order_of
+from .loops import Loops
 from .trajectory import KNOWN, Pose, Trajectory, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
@@ -31,6 +32,7 @@ class TrackingNumbers:
     alignment_points: BatchSize = 3000  # pixels of a frame that are aligned with the map's surface
     alignment_iterations: Iterations = 12  # Gauss-Newton steps of that
     lost_share: Share = 0.3  # share of explained pixels below which a frame is lost
+    close_loops: bool = False  # recognise places by features and correct the path by a pose graph; slower
 
 
 class Tracker(Part):
@@ -50,6 +52,7 @@ class Tracker(Part):
         super().__init__()
         self.numbers, self.unit, self.reduction = numbers, unit, reduction
         self.trajectory = Trajectory(image_count)
+        self.loops = Loops(unit) if numbers.track and numbers.close_loops else None
         self.register_buffer("turn", torch.tensor(0))
         self.register_buffer("is_keyframe", torch.zeros(image_count, dtype=torch.bool))
         self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
@@ -87,6 +90,16 @@ class Tracker(Part):
         self.is_keyframe[frame.index] = True
         self.trajectory.anchor[frame.index] = frame.index
         self._held[frame.index] = frame
+
+    @torch.no_grad()
+    def close_loop(self, frame: DepthFrame, data: Scene, chance: torch.Generator) -> bool:
+        """Recognise the place of the latest keyframe, and correct the path if it was seen before. True if it was."""
+        keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
+        older = [self.held(data, i) for i in keyframes if i != frame.index]
+        if self.loops is None or not self.loops.find(frame, older, chance):
+            return False
+        self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))
+        return True
 
     @property
     def keyframes(self) -> list[int]:

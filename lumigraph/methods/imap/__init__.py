@@ -54,7 +54,7 @@ class MappingNumbers:
     """A Config's numbers of joint mapping (sections 3.3 and 3.4)."""
 
     mapping_iterations: Iterations = 10  # descents on map and keyframes' poses for each frame; more learn more, slower
-    first_iterations: Iterations = 200  # descents on the map for the first frame
+    first_iterations: Iterations = 200  # descents on the map for the first frame, and after a loop was closed
     window: Annotated[int, between(1, 1000)] = 5  # keyframes W of a descent, with the latest and the current one
     pixels_per_frame: BatchSize = 200  # pixels of each frame in the window, section 3.4
     active_sampling: bool = True  # draw pixels and keyframes by their loss, section 3.4; else evenly
@@ -159,7 +159,7 @@ class IMap(FieldMethod):
 
     def step(self, batch: Moment, step: int, descend: Descend) -> dict[str, Tensor]:
         """Follow the next frame, then map."""
-        c, chance, frame, first = self.config.mapping, self.random(step), batch.frame, int(self.tracker.turn) == 0
+        c, chance, frame, afresh = self.config.mapping, self.random(step), batch.frame, int(self.tracker.turn) == 0
         if frame is not None:
             share = self.tracker.follow(
                 frame,
@@ -177,11 +177,12 @@ class IMap(FieldMethod):
             ):
                 self.tracker.add_keyframe(frame)
                 self.snapshot.load_state_dict(self.network.state_dict())
+                afresh |= self.tracker.close_loop(frame, batch.scene, chance)  # the map follows the corrected poses
             frame = frame if learns else None
         return self.map(
             frame,
             batch,
-            1 if self.rehearses else c.first_iterations if first else c.mapping_iterations,
+            1 if self.rehearses else c.first_iterations if afresh else c.mapping_iterations,
             chance,
             descend,
         )
