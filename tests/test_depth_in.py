@@ -19,7 +19,7 @@ from test_depth_readers import SIZE, picture, poses, write_scannet
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene, read_capture
 from lumigraph.capture.inner_depth import InnerDepth, inner_depth, of_heic, of_jpeg
-from lumigraph.capture.surveyed import registered, seen_depth, with_surveyed
+from lumigraph.capture.surveyed import Surveyed, registered, seen_depth, with_surveyed
 from lumigraph.errors import LumigraphError
 
 pytestmark = budget("capture", 8)
@@ -82,12 +82,11 @@ def test_a_cloud_or_a_mesh_is_the_depth_of_every_photograph(name, tmp_path):
 
 def test_what_a_cloud_hides_is_not_seen_through_its_gaps():
     """A sparse wall at 2 m before a dense one at 4 m: between its points the far one is not taken for seen."""
-    camera = SimpleNamespace(pose=np.eye(3, 4), lens=LENS, size=SIZE)
     x, y = np.meshgrid(np.linspace(-4, 4, 90), np.linspace(-4, 4, 90))
     near = np.stack([x, y, np.full_like(x, 2)], -1).reshape(-1, 3)
-    far = np.concatenate([2 * wall_points(60_000)[:, :2], np.full((60_000, 1), 4.0)], 1)
-    found = SimpleNamespace(points=np.concatenate([near, far]), faces=np.zeros((0, 3), int))
-    depth = seen_depth(camera.pose, camera.lens, camera.size, found)  # type: ignore[arg-type]
+    far = np.concatenate([2 * wall_points(60_000)[:, :2], np.full((60_000, 1), 4.5)], 1)
+    found = Surveyed(np.concatenate([near, far]), np.zeros((0, 3), np.int64))
+    depth = seen_depth(np.eye(3, 4), LENS, SIZE, found)
     along = depth * np.cos(np.arctan(np.hypot(*np.meshgrid(np.arange(40) - 19.5, np.arange(30) - 14.5)) / 20))
     assert np.nanmax(along) < 2.6 and np.isfinite(along).mean() > 0.5
 
@@ -212,12 +211,11 @@ def test_depth_of_another_camera_is_carried_over():
     stored = np.repeat((2 / (1 - 0.3 * x))[None], 30, 0)  # the plane z = 2 + 0.3 x
     shift = np.eye(3, 4)
     shift[0, 3] = -0.1  # from the depth camera's frame to that of the colours
-    found = registered(stored, wide, LENS, (80, 60), shift)
+    found = registered(stored, wide, LENS.resized(torch.tensor([[2.0, 2.0]])), (80, 60), shift)
     assert found.shape == (30, 40) and np.isfinite(found).mean() > 0.5
-    colours = LENS.resized(torch.tensor([[0.5, 0.5]]))
     rows, columns = np.nonzero(np.isfinite(found))
     pixels = torch.from_numpy(np.stack([columns, rows], -1) + 0.5).float()
-    points = colours.unproject(pixels) * torch.from_numpy(found[rows, columns])[:, None]
+    points = LENS.unproject(pixels) * torch.from_numpy(found[rows, columns])[:, None]
     error = points[:, 2] - (2 + 0.3 * (points[:, 0] + 0.1))
     assert float(error.abs().mean()) < 0.03
 

@@ -169,11 +169,11 @@ def test_a_loop_spreads_the_drift():
     images = list(range(0, 40, 2))
     found = loops.closed(images, poses)
     before, after = (float((x[:, :, 3] - truth[:, :, 3]).norm(dim=-1).max()) for x in (poses, found))
-    assert before > 0.2 and after < 0.3 * before and torch.equal(found[0], poses[0])
+    assert before > 0.2 and after < 0.4 * before and torch.equal(found[0], poses[0])
     loops.pairs = torch.cat([loops.pairs, torch.tensor([[10, 30]])])
     loops.motions = torch.cat([loops.motions, torch.eye(3, 4)[None]])
     wrong = loops.closed(images, poses)
-    assert float((wrong[:, :, 3] - truth[:, :, 3]).norm(dim=-1).max()) < 1.2 * before
+    assert float((wrong[:, :, 3] - truth[:, :, 3]).norm(dim=-1).max()) < 0.6 * before
 
 
 def recording(depth: np.ndarray | None) -> Capture:

@@ -1,4 +1,4 @@
-"""Measured geometry as the depth that each photograph sees of it: clouds of a LiDAR, meshes, depth of another camera."""
+"""Measured geometry as the depth that each photograph sees of it: a LiDAR's cloud, a mesh, depth of another camera."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ SUFFIXES = (*CLOUD_SUFFIXES, *meshes.SUFFIXES)
 POINT_BYTES = 200  # of memory for each point while a photograph sees the cloud
 LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
 CELL = 3  # pixels along a square whose nearest point hides what is behind it
-HIDDEN = 1.03  # times the distance of the nearest point in its square, beyond which a point is hidden
+HIDDEN = 0.03  # of the distance of the nearest point around, behind which a point is hidden
+SLOPE = 4.0  # tangent of the angle up to which a slanted surface does not hide itself
 CHECKED_POINTS, CHECKED_VIEWS = 2000, 16  # sparse points and photographs by which a file's frame is checked
 MAX_OFFSET = 0.05  # of the extent of sparse points, that their median distance from the file's may be
 MIN_SEEN = 0.01  # share of a photograph's squares that show something of the file
@@ -203,16 +204,21 @@ def cloud_depth(camera: Camera, points: Float[Tensor, "point 3"]) -> Float[Tenso
     """Distance of the nearest point in each pixel, NaN without one. A point clearly behind the nearest one in its
     square of pixels, or in a square beside that, is hidden: between points of a cloud one sees through it.
 
+        d > d_nearest (1 + 0.03 + SLOPE alpha),    alpha the angle from a square's middle to the end of the next one
+
     points: about the camera, which is at the origin
     """
     width, height = camera.size[0].tolist()
+    middle = camera.size[0] / 2
+    one, beside = camera.rays(torch.stack([middle, middle + torch.tensor([1.0, 0.0])])).directions
+    behind = 1 + HIDDEN + SLOPE * 1.5 * CELL * float((one - beside).norm())
     places, inside = camera.locate(points)
     places, away = places[inside], points[inside].norm(dim=-1)
     rows, columns = -(-height // CELL), -(-width // CELL)
     cell = places[:, 0] // CELL * columns + places[:, 1] // CELL
     nearest = torch.full((rows * columns,), torch.inf).scatter_reduce(0, cell, away, "amin")
     around = -torch.nn.functional.max_pool2d(-nearest.view(1, rows, columns), 3, 1, 1).flatten()
-    seen = away <= HIDDEN * around[cell]
+    seen = away <= behind * around[cell]
     pixel = places[seen, 0] * width + places[seen, 1]
     depth = torch.full((height * width,), torch.inf).scatter_reduce(0, pixel, away[seen], "amin")
     return torch.where(depth.isfinite(), depth, torch.nan).view(height, width)

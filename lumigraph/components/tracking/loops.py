@@ -32,6 +32,7 @@ MIN_AGE = 10  # keyframes between the two ends of a loop
 HYPOTHESES = 200  # motions from three matches each
 TOLERANCE = 0.05  # metres between matched points of one place
 MIN_INLIERS, MIN_INLIER_SHARE = 25, 0.5  # matches that a loop's motion explains, and their share
+MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
 DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
 
 
@@ -168,5 +169,6 @@ def optimised(
         for end in (a, b):
             known[6 * edge : 6 * edge + 6, 6 * end : 6 * end + 6] = 1
     start = np.zeros(6 * (len(poses) - 1))
-    found = least_squares(residuals, start, jac_sparsity=known[:, 6:], loss="soft_l1", method="trf", x_scale=0.1)
+    sparsity = known[:, 6:]
+    found = least_squares(residuals, start, jac_sparsity=sparsity, loss="soft_l1", x_scale=0.1, max_nfev=MAX_STEPS)
     return at(found.x)
