@@ -146,7 +146,7 @@ class SplatSlam(Method):
     def step(self, batch: Moment, step: int, descend: Descend) -> dict[str, Tensor]:
         """Follow the next frame, densify where it sees something new, then map."""
         c, chance, frame, tracker = self.config.mapping, self.random(step), batch.frame, self.tracker
-        first = int(tracker.turn) == 0
+        self.figures, first = {}, int(tracker.turn) == 0
         iterations = 1 if self.rehearses else max(c.first_iterations if first else c.mapping_iterations, 1)
         if frame is not None:
             share = tracker.follow(

@@ -160,6 +160,7 @@ class IMap(FieldMethod):
     def step(self, batch: Moment, step: int, descend: Descend) -> dict[str, Tensor]:
         """Follow the next frame, then map."""
         c, chance, frame, afresh = self.config.mapping, self.random(step), batch.frame, int(self.tracker.turn) == 0
+        self.figures = {}
         if frame is not None:
             share = self.tracker.follow(
                 frame,
