@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from lumigraph.capture import choose_reader, open_scene, read_capture
-from lumigraph.errors import LumigraphError
+from lumigraph.errors import LumigraphError, LumigraphWarning
 
 SIZE = (40, 30)
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -147,3 +147,35 @@ def test_depth_of_another_shape_is_named(tmp_path):
     depth(tmp_path / "scan" / "frames" / "depth" / "1.png", 1000, (20, 20))
     with pytest.raises(LumigraphError, match="its shape 20x20 is not the photograph's"):
         open_scene(tmp_path / "scan").photograph(1, ("depth",))
+
+
+def write_tum(folder: Path, moments: list[float]) -> None:
+    """Lists of files and poses, whose moments a user gives in any order."""
+    folder.mkdir()
+    for i in range(3):
+        picture(folder / "rgb" / f"{i}.png")
+        depth(folder / "depth" / f"{i}.png", 5000)
+    for kind in ("rgb", "depth"):
+        lines = [f"{moment} {kind}/{i}.png" for i, moment in enumerate(moments)]
+        (folder / f"{kind}.txt").write_text("# timestamp filename\n" + "\n".join(lines))
+    rows = [f"{i}.0 {0.1 * i} 0 0 0 0 0 1" for i in range(3)]
+    (folder / "groundtruth.txt").write_text("\n".join(rows))
+
+
+def test_moments_that_go_back_are_said_and_paired(tmp_path):
+    write_tum(tmp_path / "scan", [0.0, 2.0, 1.0])
+    capture = read_capture(tmp_path / "scan")
+    assert [shot.pose[0, 3] for shot in capture.shots] == pytest.approx([0.0, 0.2, 0.1])
+    (note,) = capture.notes
+    assert "moments go back 1 times" in note and "paired by the nearest moment" in note
+
+
+def test_missing_frames_are_said_and_the_others_used(tmp_path):
+    write_tum(tmp_path / "scan", [0.0, 1.0, 2.0])
+    (tmp_path / "scan" / "rgb" / "1.png").unlink()
+    (tmp_path / "scan" / "depth" / "2.png").unlink()
+    with pytest.warns(LumigraphWarning, match="lists 2 files that do not exist; using the other 2 photographs"):
+        scene = open_scene(tmp_path / "scan")
+    assert len(scene) == 2 and len(scene.layers["depth"]) == 1
+    with pytest.raises(LumigraphError, match="no depth for rgb/2.png; tracking needs"):
+        open_scene(tmp_path / "scan", unposed={})

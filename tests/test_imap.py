@@ -141,7 +141,7 @@ def test_a_lost_frame_is_told_and_left_out(room, capsys):
 
     run = Run(room / "straight")
     method, scene = run.method(), run.scene()
-    method.trajectory.state[3] = LOST
+    method.tracker.trajectory.state[3] = LOST
     show_tracking(run, Outcome(run.state, True), method, scene)
     told = capsys.readouterr().out
     assert scene.names[3] in told and "kept" in told

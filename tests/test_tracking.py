@@ -13,9 +13,11 @@ from budgets import budget
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import Unposed, without_poses
 from lumigraph.capture.capture import Capture, PixelPlane, Shot
+from lumigraph.components.tracking.alignment import aligned
+from lumigraph.components.tracking.loops import Loops, Place, motion, motion_between
 from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
+from lumigraph.components.training.shared_points import Seen
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.imap.alignment import aligned
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
 
 pytestmark = budget("methods", 4)
@@ -124,6 +126,54 @@ def test_alignment_finds_the_motion(colours):
     found = aligned(field, torch.eye(3, 4), local, rgb, torch.full((3000,), 0.03), colours, 25)
     turn, shift = relative(truth, found.pose)
     assert shift.norm() < 2e-3 and (turn - torch.eye(3)).norm() < 4e-3 and found.share > 0.99
+
+
+def corner(count: int, seed: int) -> torch.Tensor:
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) + torch.tensor([-0.5, -0.5, 1.5])
+
+
+def place(points: torch.Tensor, pose: torch.Tensor, descriptors: torch.Tensor) -> Place:
+    """Points of the world as features of a camera at a pose."""
+    local = (points - pose[:, 3]) @ pose[:, :3]
+    bearings = torch.nn.functional.normalize(local, dim=-1)
+    return Place(Seen(bearings, descriptors), local, torch.zeros(4))
+
+
+def test_a_place_is_recognised_by_a_motion_that_its_points_agree_on():
+    """A third of the matches are wrong in depth. The motion is exact; two places of other things have none."""
+    chance = torch.Generator().manual_seed(0)
+    points = corner(90, 1)
+    descriptors = torch.nn.functional.normalize(torch.randn(90, 128, generator=chance), dim=-1)
+    first, second = (torch.from_numpy(pose).float() for pose in walk(9)[[0, 8]])
+    one, other = place(points, first, descriptors), place(points, second, descriptors)
+    other.points[:30] += 0.3
+    found = motion_between(one, other, 0.05, chance)
+    assert found is not None
+    torch.testing.assert_close(found, motion(first, second), atol=1e-4, rtol=0)
+    assert motion_between(one, place(corner(90, 2), second, descriptors), 0.05, chance) is None
+
+
+def test_a_loop_spreads_the_drift():
+    """Twenty poses around a circle, each step turned and shifted a little too far. One loop from the last to the first
+    brings the largest error down to a part of the drift, and a wrong loop beside it does little harm."""
+    angle = torch.arange(20) * (2 * math.pi / 20)
+    turn = moved(torch.eye(3, 4).repeat(20, 1, 1), torch.stack([0 * angle, -angle, 0 * angle, *3 * [0 * angle]], -1))
+    truth = torch.cat([turn[:, :, :3], torch.stack([angle.cos(), 0 * angle, angle.sin()], -1)[:, :, None]], -1)
+    drifted = [truth[0]]
+    for i in range(19):
+        step = moved(motion(truth[i], truth[i + 1])[None], torch.tensor([[0.0, 0.01, 0, 0.01, 0.005, 0]]))[0]
+        last = drifted[-1]
+        drifted.append(torch.cat([last[:, :3] @ step[:, :3], (last[:, :3] @ step[:, 3] + last[:, 3])[:, None]], -1))
+    poses, loops = torch.stack(drifted), Loops(1.0)
+    loops.pairs, loops.motions = torch.tensor([[0, 38]]), motion(truth[0], truth[19])[None]
+    images = list(range(0, 40, 2))
+    found = loops.closed(images, poses)
+    before, after = (float((x[:, :, 3] - truth[:, :, 3]).norm(dim=-1).max()) for x in (poses, found))
+    assert before > 0.2 and after < 0.4 * before and torch.equal(found[0], poses[0])
+    loops.pairs = torch.cat([loops.pairs, torch.tensor([[10, 30]])])
+    loops.motions = torch.cat([loops.motions, torch.eye(3, 4)[None]])
+    wrong = loops.closed(images, poses)
+    assert float((wrong[:, :, 3] - truth[:, :, 3]).norm(dim=-1).max()) < 0.6 * before
 
 
 def recording(depth: np.ndarray | None) -> Capture:

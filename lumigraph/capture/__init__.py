@@ -26,6 +26,7 @@ from .assemble import Before as Before
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
+from .inner_depth import with_inner_depth
 from .masks import with_masks
 from .part import CapturePart as CapturePart
 from .part import Places as Places
@@ -33,6 +34,7 @@ from .part import part_of
 from .part import places_of as places_of
 from .pictures import list_images
 from .raw import with_raw
+from .surveyed import with_surveyed
 from .unposed import Unposed as Unposed
 from .unposed import unposed as without_poses
 from .views import multiscale as multiscale
@@ -129,6 +131,7 @@ def open_scene(
     whole: bool | None = None,
     part: CapturePart | dict[str, Any] | None = None,
     unposed: Unposed | dict[str, Any] | None = None,
+    depth_from: str | Path | None = None,
 ) -> Scene:
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
@@ -142,6 +145,7 @@ def open_scene(
     before:    how they were opened for a run; see `Before`
     whole:     learn from every photograph, also from those that test, unless the source itself says which do
     part:      some photographs of a large capture alone, of one place in it
+    depth_from: a cloud or a mesh, in the frame of the photographs' poses, that gives their depth
     unposed:   leave out the poses of a depth camera's frames, for they are to be found; options of `unposed.unposed`
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
@@ -155,6 +159,8 @@ def open_scene(
         capture = without_poses(capture, typed(Unposed, unposed, str(source)) if isinstance(unposed, dict) else unposed)
     if part is not None:
         capture = part_of(capture, typed(CapturePart, part, str(source)) if isinstance(part, dict) else part)
+    if depth_from is not None:
+        capture = with_surveyed(capture, expanded(depth_from))
     scene = assemble(capture, downscale, memory, cache, before)
     if whole and not any(shot.split for shot in capture.shots):
         scene = with_all_views(scene)
@@ -179,7 +185,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     if (request := requested(source)) is not None:
         return synthetic().read(request)
     path = expanded(source)
-    return with_raw(with_masks(choose_reader(path, reader).read(path), path), path)
+    return with_inner_depth(with_raw(with_masks(choose_reader(path, reader).read(path), path), path))
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:

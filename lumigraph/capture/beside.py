@@ -133,8 +133,8 @@ def read_plane(
 
 
 def with_depth_points(capture: Capture) -> Capture:
-    """An RGB-D capture with sparse points: random pixels of some photographs, back-projected by their z-depth, with
-    their colours. Unchanged where there is no depth."""
+    """An RGB-D capture with sparse points: random pixels of some photographs, back-projected by their depth, with their
+    colours. Unchanged where there is no depth."""
     chosen = evenly([shot for shot in capture.shots if "depth" in shot.planes], DEPTH_VIEWS)
     if not chosen:
         return capture
@@ -142,7 +142,7 @@ def with_depth_points(capture: Capture) -> Capture:
     for shot in chosen:
         assert shot.size is not None and isinstance(shot.image, dict)
         plane = settled(shot.planes["depth"], "depth")
-        assert plane.dtype is not None and plane.encoding == "z-depth"
+        assert plane.dtype is not None and plane.encoding in DEPTH_KINDS
         stored = read_plane(plane, "depth", plane.dtype, shot.size, np.eye(3))
         rows, columns = np.nonzero(known(stored, plane.unknown, 1))
         some = random.permutation(len(rows))[:POINTS_PER_VIEW]
@@ -150,7 +150,8 @@ def with_depth_points(capture: Capture) -> Capture:
         camera = Camera(torch.from_numpy(shot.pose)[None].float(), shot.lens, torch.tensor([shot.size]))
         pixels = torch.from_numpy(np.stack([x, y], -1) + 0.5).float()
         depth = torch.from_numpy(plane.scale * stored[y, x]).float()
-        positions.append(back_project(camera, pixels, depth, along_axis=True).double().numpy())
+        along_axis = plane.encoding == "z-depth"
+        positions.append(back_project(camera, pixels, depth, along_axis).double().numpy())
         colours.append(read_image(shot.image[1], False, shot.size)[y, x, :3])
     points = np.concatenate(positions)
     return replace(capture, points=points, point_colours=np.concatenate(colours), sightings=np.full(len(points), 2))

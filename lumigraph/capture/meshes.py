@@ -58,6 +58,12 @@ def read_shapes(path: Path, partial: bool = False) -> Shapes:
 
 def read_shape(path: Path, name: str) -> Shape:
     """All that one file holds, as one shape. Raises LumigraphError if that is nothing."""
+    made, up = read_mesh(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP
+    return normalised(name, made, None if len(made.faces) else normals_of(path), up)
+
+
+def read_mesh(path: Path) -> Mesh:
+    """All triangles of a file, or all its points, in its own frame. Raises LumigraphError if that is nothing."""
     import trimesh  # which takes a while
 
     if path.stat().st_size > free_memory():
@@ -85,9 +91,7 @@ def read_shape(path: Path, name: str) -> Shape:
         )
     if meshes and not len(made.faces):
         raise LumigraphError(f"{path} has triangles, and none of them has an area; export it once more")
-    return normalised(
-        name, made, None if meshes else normals_of(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP
-    )
+    return made
 
 
 def is_sound(part: Any) -> bool:

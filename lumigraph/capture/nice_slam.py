@@ -3,12 +3,14 @@
 Replica: traj.txt, one camera-to-world matrix (16 numbers, rows, OpenCV axes) a line; results/frame000000.jpg and
 results/depth000000.png; cam_params.json in the folder or above it. ScanNet: frames/color/0.jpg, frames/depth/0.png,
 frames/pose/0.txt (4x4, camera-to-world), frames/intrinsic/intrinsic_color.txt, or the same without frames/. Depth is
-along the optical axis, 16 bits, 0 where nothing was measured; ScanNet's in millimetres. Lengths are metres.
+along the optical axis, 16 bits, 0 where nothing was measured; ScanNet's in millimetres. Where intrinsic_depth.txt
+differs, depth is carried over to the camera of the colours. Lengths are metres.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +23,10 @@ from ..files.names import natural
 from ..files.ranges import Positive, Side
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
-from .pictures import find_file, measure
+from .numbers import read_numbers
+from .pictures import find_file, measure, readable, stat
 from .seven_scenes import read_matrix
+from .surveyed import registered
 
 EXPECTED_FILES = "traj.txt and results/ (Replica), or color/, depth/ and pose/ (ScanNet), as NICE-SLAM has them"
 MILLIMETRES = 1e-3
@@ -105,6 +109,8 @@ def read_scannet(folder: Path) -> Capture:
         raise LumigraphError(f"{place} has no intrinsic/intrinsic_color.txt; export it with the pictures")
     camera = read_matrix(path, 4)
     lens = pinhole(camera[0, 0], camera[1, 1], camera[0, 2], camera[1, 2])
+    own = path.with_name("intrinsic_depth.txt")
+    depth_lens = pinhole(*read_matrix(own, 4)[[0, 1, 0, 1], [0, 1, 2, 2]]) if own.is_file() else None
     shots, missing = [], []
     for file in sorted((place / "pose").glob("*.txt"), key=lambda path: natural(path.name)):
         pose, picture, depth = read_matrix(file, 4), find_file(place / "color" / file.stem), None
@@ -113,7 +119,29 @@ def read_scannet(folder: Path) -> Capture:
             missing.append(name)
             continue
         depth = place / "depth" / f"{file.stem}.png"
-        planes = {"depth": PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0, 65535))} if depth.is_file() else {}
+        plane = PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0, 65535))
+        size = measure(picture)[0]
+        if depth_lens is not None and depth.is_file() and differ(depth_lens, measure(depth)[0], lens, size):
+            values = partial(registered_file, depth, depth_lens, lens, size)
+            identity = f"{depth.resolve()} {stat(depth)} registered"
+            plane = PixelPlane(values, "distance", dtype=np.dtype(np.float32), identity=identity)
         if np.isfinite(pose).all():
-            shots.append(Shot(name, pose[:3], lens, measure(picture)[0], {1: picture}, planes=planes))
+            planes = {"depth": plane} if depth.is_file() else {}
+            shots.append(Shot(name, pose[:3], lens, size, {1: picture}, planes=planes))
     return Capture(str(folder), shots, missing=missing)
+
+
+def differ(depth: Pinhole, depth_size: tuple[int, int], colour: Pinhole, size: tuple[int, int]) -> bool:
+    """True if the two cameras see different parts, by more than a pixel of the depth."""
+    as_depth = colour.resized(torch.tensor([depth_size]) / torch.tensor([size]))
+    edges = torch.tensor([[0.0, 0.0], list(map(float, depth_size))])
+    seen = [(edges - lens.centre) / lens.focal * depth.focal for lens in (depth, as_depth)]
+    return bool((seen[0] - seen[1]).abs().max() > 1)
+
+
+def registered_file(path: Path, depth: Pinhole, colour: Pinhole, size: tuple[int, int]) -> np.ndarray:
+    """Depth of a file as the camera of the colours sees it. Both are in one place, as ScanNet's export says."""
+    with readable(path):
+        stored = read_numbers(path, "depth").astype(np.float64)
+    metres = np.where((stored == 0) | (stored == 65535), np.nan, MILLIMETRES * stored)
+    return registered(metres, depth, colour, size, np.eye(3, 4))

@@ -71,9 +71,9 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
 
 def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seconds: float | None = None) -> None:
     """Write the trajectory of a run and print its errors, lost frames and next commands."""
-    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, write_tracking
+    from ..evaluation.tracking import DRIFT_FILE, TRAJECTORY_FILE, mapping_scores, write_tracking
 
-    state, sequence = outcome.state, method.sequence(data)
+    state, sequence = outcome.state, method.tracker.sequence(data)
     followed = min(state.step, len(sequence))
     speed = followed / max(state.seconds, 1e-9)
     figures = {"frames_per_second": speed}
@@ -81,7 +81,8 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     if processor_seconds is not None and followed:
         figures["processor_seconds_per_frame"] = processor_seconds / followed
         rows["tracking"] += f", {processor_seconds / followed:.2f} processor seconds a frame"
-    found = write_tracking(run, method, data, figures)
+    mapped = mapping_scores(method, data) if outcome.finished else []
+    found = write_tracking(run, method, data, figures, mapped)
     if not outcome.finished:
         say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
     rows["trajectory"] = f"{run.folder / TRAJECTORY_FILE}, {len(found.images)} of {len(sequence)} poses"
@@ -95,6 +96,7 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     if (errors := found.errors) is not None:
         rows |= {score.name: str(score) for score in errors.scores}
         rows["drift"] = f"{run.folder / DRIFT_FILE}, {100 * errors.largest:.2f} cm at most in {errors.path:.2f} m"
+    rows |= {score.name: str(score) for score in mapped}
     show(rows | (next_commands(run) if outcome.finished else {}))
 
 

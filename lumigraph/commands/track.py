@@ -31,7 +31,7 @@ class Track:
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
-    """Method that tracks and maps: imap."""
+    """Method that tracks and maps: imap or splat-slam."""
     recording: Annotated[Positional[str], needed("RECORDING")]
     """Frames with depth: a folder, or procedural:room,depth."""
     output: Annotated[Path | None, option("RUN", "runs/RECORDING-METHOD-N")] = None
@@ -82,7 +82,7 @@ class Track:
         config = replace(config, tracking=replace(config.tracking, track=True))
         seed = getattr(config, "seed", self.seed)
         method: Any = build(kind, data.frame, config, device, seed, learning=True)
-        budget = Budget(len(method.sequence(data)) + (self.steps_after or 0))
+        budget = Budget(len(method.tracker.sequence(data)) + (self.steps_after or 0))
         run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as watch:
             begin = time.process_time()

@@ -80,7 +80,7 @@ class BlockOptions:
         few = places.splits.count("train") < MIN_LARGE_VIEWS
         if few and not other and (self.blocks, self.workers, self.address) == (None, None, None):
             return None
-        for name in ("view", "pause_at", "views"):
+        for name in ("view", "pause_at", "views", "depth_from"):
             if getattr(train, name):
                 raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
         return self._all(train, source, places)
@@ -223,6 +223,8 @@ class Train:
     reader: ReaderOption = None
     views: Annotated[Count | None, option("N", "all")] = None
     """Train on only this number of photographs, spread evenly over the cameras."""
+    depth_from: Annotated[str | None, option("FILE", "depth beside the photographs")] = None
+    """Cloud (.las, .laz, .e57, .ply) or mesh that gives the photographs their depth, in the frame of their poses."""
     scales: Annotated[Scales, option("N")] = 1
     """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
     seed: SeedOption = 0
@@ -262,6 +264,8 @@ class Train:
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
         options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
+        if self.depth_from is not None:
+            options["depth_from"] = str(Path(self.depth_from).resolve())
         data = open_dataset(source, kind.learns_from, **options)
         config = method_config(self, self.method)
         seed = getattr(config, "seed", self.seed)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from .. import files
@@ -13,10 +15,13 @@ from ..components.tracking.frames import order_of
 from ..components.tracking.trajectory import KNOWN, LOST
 from ..datasets.scene import Scene
 from ..figures.charts import Series, line_chart, standalone
+from ..geometry import evenly
 from ..method import Method
+from ..metrics import Score, psnr
 from ..metrics.trajectory import Poses, TrajectoryErrors, position_errors, relative_errors, to_tum
 from .held_out_poses import TRUE_POSE
 
+MAPPED_VIEWS = 8  # held-out frames at which a map is compared
 TRAJECTORY_FILE, TRUTH_FILE, ERRORS_FILE, DRIFT_FILE = "trajectory.txt", "truth.txt", "tracking.json", "drift.svg"
 MIN_POSES = 3  # frames that errors are measured on
 
@@ -38,8 +43,8 @@ class Tracked:
 
     @staticmethod
     def of(method: Any, scene: Scene) -> Tracked:
-        """method: one with a `trajectory`"""
-        state, order = method.trajectory.state.cpu(), order_of(scene.cameras)
+        """method: one with a `tracker`"""
+        state, order = method.tracker.trajectory.state.cpu(), order_of(scene.cameras)
         chosen = order[state[order] == KNOWN]
         cameras = method.refined(scene.cameras[chosen]).transformed(scene.frame.to_source.matrix)
         times = scene.cameras.time
@@ -76,10 +81,36 @@ def tracks(method: Method) -> bool:
     return bool(tracking is not None and tracking.track)
 
 
-def write_tracking(run: Any, method: Method, scene: Scene, figures: dict[str, float]) -> Tracked:
+@torch.no_grad()
+def mapping_scores(method: Any, scene: Scene) -> list[Score]:
+    """PSNR and error of depth of a map, at held-out frames from the poses that were found; empty if none was found.
+
+    The error is the mean of |depth - measured depth| along rays, where both are known.
+    """
+    state = method.tracker.trajectory.state.cpu()
+    held_out = [i for i in scene.splits.get("test", torch.tensor([])).tolist() if state[i] == KNOWN]
+    psnrs, errors = [], []
+    method.eval()
+    for index in evenly(held_out, MAPPED_VIEWS):
+        shot = scene.photograph(index, ["depth"])
+        seen, measured = method.render(method.refined(shot.camera)).cpu(), shot.extra["depth"]
+        psnrs.append(psnr(seen.rgb.clamp(0, 1), shot.before(scene.frame.background)))
+        error = (seen.depth - measured).abs()
+        errors.append(float(error[error.isfinite()].mean()) * scene.frame.to_source.scale)
+    if not psnrs:
+        return []
+    return [
+        Score("held-out PSNR", float(np.mean(psnrs)), "dB", "higher", 2),
+        Score("depth L1", 100 * float(np.mean(errors)), "cm", "lower", 2),
+    ]
+
+
+def write_tracking(
+    run: Any, method: Method, scene: Scene, figures: dict[str, float], mapped: Sequence[Score] = ()
+) -> Tracked:
     """Write RUN/trajectory.txt and, where poses are known, truth.txt, the errors and the plot of the drift.
 
-    figures: further ones for tracking.json
+    figures: further ones for tracking.json; mapped: scores of the map
     """
     found = Tracked.of(method, scene)
     files.write_bytes(run.folder / TRAJECTORY_FILE, to_tum(found.moments, found.poses).encode(), ours=True)
@@ -89,6 +120,8 @@ def write_tracking(run: Any, method: Method, scene: Scene, figures: dict[str, fl
         assert found.truth is not None
         files.write_bytes(run.folder / TRUTH_FILE, to_tum(found.moments, found.truth).encode(), ours=True)
         files.write_bytes(run.folder / DRIFT_FILE, standalone(found.drift), ours=True)
-        about["scores"] = [score.to_json() for score in errors.scores]
+    scores = [*([] if errors is None else errors.scores), *mapped]
+    if scores:
+        about["scores"] = [score.to_json() for score in scores]
     files.write_json(run.folder / ERRORS_FILE, about)
     return found

@@ -1,8 +1,5 @@
 """Marching cubes in blocks, only where the zero level can be (Lorensen and Cline 1987); and postprocessing of triangle
-meshes: removal of small pieces, smoothing, simplification.
-
-The topology of ambiguous cubes is that of Lewiner et al. (2003), from scikit-image.
-"""
+meshes: removal of small pieces, smoothing, simplification."""
 
 from __future__ import annotations
 
@@ -14,10 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.ndimage import binary_dilation
 from scipy.sparse.csgraph import connected_components
-from skimage.measure import marching_cubes
 from torch import Tensor
 
+from ..depth_maps.level_set import zero_level_of_blocks
 from ..system.progress import track
 
 BLOCK = 16  # corners of a block along each axis
@@ -69,30 +67,11 @@ def zero_level(
     active:    blocks of BLOCK^3 corners to evaluate; each corner once
     elsewhere: value of all corners of the other blocks
     """
-    held = np.full(active.shape, -1)
-    where = np.argwhere(active)
-    held[active] = np.arange(len(where))
-    blocks = evaluate(grid, values, where)
-    held, elsewhere = np.pad(held, (0, 1), constant_values=-1), np.pad(elsewhere, (0, 1), constant_values=np.nan)
-    keys, places, faces, count = [], [], [], 0
-    marched = np.argwhere(touched(active))
-    for block in track(marched, "Marching through cubes", len(marched)):
-        cube = with_neighbours(block, blocks, held, elsewhere)
-        known = np.isfinite(cube)
-        cube = np.where(known, cube, -1.0)
-        if not cube.min() < 0 < cube.max():
-            continue
-        vertices, triangles, _, _ = marching_cubes(cube, 0.0, gradient_direction="ascent")
-        key, sure = edges(vertices, known)
-        keys.append(key + (block * BLOCK) @ STRIDES)
-        places.append(vertices + block * BLOCK)
-        faces.append(triangles[sure[triangles].all(-1)] + count)
-        count += len(vertices)
-    if not count:
-        return np.zeros((0, 3)), np.zeros((0, 3), int)
-    _, first, same = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
-    vertices = np.array(grid.low) + grid.cell * np.concatenate(places)[first].astype(np.float64)
-    return compact(vertices, same[np.concatenate(faces)])
+    where, beside = np.argwhere(active), np.argwhere(binary_dilation(active, np.ones((3, 3, 3))) & ~active)
+    constant = np.broadcast_to(elsewhere[tuple(beside.T)][:, None, None, None], (len(beside), *(BLOCK,) * 3))
+    blocks = np.concatenate([evaluate(grid, values, where), constant.astype(np.float32)])
+    vertices, faces = zero_level_of_blocks(blocks, np.concatenate([where, beside]))
+    return np.array(grid.low) + grid.cell * vertices, faces
 
 
 def evaluate(
@@ -107,54 +86,6 @@ def evaluate(
         corners = (some[:, None] * BLOCK + inside).reshape(-1, 3)
         out[first : first + len(some)] = values(grid.points(corners)).reshape(-1, BLOCK, BLOCK, BLOCK).numpy()
     return np.where(np.abs(out) < MIN_ABS_VALUE, np.where(out < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), out)
-
-
-def touched(active: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
-    """Blocks whose cubes have a corner in an active block: these, and their neighbours on the lower sides."""
-    out = active.copy()
-    for axis in range(3):
-        ahead = np.roll(out, -1, axis)
-        ahead[(slice(None),) * axis + (-1,)] = False
-        out |= ahead
-    return out
-
-
-def with_neighbours(
-    block: Int[np.ndarray, " 3"],
-    blocks: Float[np.ndarray, "block BLOCK BLOCK BLOCK"],
-    held: Int[np.ndarray, "i j k"],
-    elsewhere: Float[np.ndarray, "i j k"],
-) -> Float[np.ndarray, "side side side"]:
-    """A block's corners, and the first ones of its neighbours on the upper sides."""
-    cube = np.empty((BLOCK + 1,) * 3, np.float32)
-    for step in np.ndindex(2, 2, 2):
-        target = tuple(slice(BLOCK, BLOCK + 1) if s else slice(0, BLOCK) for s in step)
-        part = tuple(slice(0, 1) if s else slice(0, BLOCK) for s in step)
-        x, y, z = block + step
-        cube[target] = blocks[held[x, y, z]][part] if held[x, y, z] >= 0 else elsewhere[x, y, z]
-    return cube
-
-
-# of a key: 20 bits an axis, 4 for the direction, 3 in a cube's middle
-STRIDES = np.array([1 << 44, 1 << 24, 1 << 4], np.int64)
-
-
-def edges(
-    vertices: Vertices, known: Bool[np.ndarray, "side side side"]
-) -> tuple[Int[np.ndarray, " vertex"], Bool[np.ndarray, " vertex"]]:
-    """A number for the grid's edge that each vertex lies on, and whether the function is known at its ends.
-
-    Neighbouring blocks find the same vertex to the last bits but one; its edge is the same to the last.
-    """
-    nearest = np.rint(vertices)
-    between = np.abs(vertices - nearest) > 0.4 * MIN_ABS_VALUE
-    corner = np.where(between, np.floor(vertices), nearest).astype(np.int64)
-    kind = np.where(between.sum(-1) == 1, between.argmax(-1), 3)
-    sure = np.ones(len(vertices), bool)
-    for step in np.ndindex(2, 2, 2):
-        x, y, z = (corner + np.where(between, step, 0)).T
-        sure &= known[x, y, z]
-    return corner @ STRIDES + kind, sure
 
 
 def compact(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "used 3"], Faces]:

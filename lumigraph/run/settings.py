@@ -33,6 +33,7 @@ class SourceOptions:
     part: CapturePart | None = None
     partial: bool | None = None
     unposed: Unposed | None = None
+    depth_from: str | None = None
 
 
 @dataclass(frozen=True)

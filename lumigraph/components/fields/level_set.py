@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from skimage.measure import marching_cubes
 
 from ...datasets.mesh import Mesh
+from ...depth_maps.level_set import zero_level_of_grid
 
 GREY = 160  # of a mesh that has no colours yet
 
@@ -18,6 +18,6 @@ def level_set(values: Float[np.ndarray, "x y z"], low: Float[np.ndarray, " 3"], 
     cell: distance of corners, one for all axes or one for each
     """
     closed = np.pad(values, 1, constant_values=min(float(values.min()), -1e-3))
-    vertices, faces, _, _ = marching_cubes(closed.astype(np.float32), 0.0, gradient_direction="ascent")
-    vertices = low + (vertices.astype(np.float64) - 1) * cell
-    return Mesh(vertices, faces.astype(np.int64), np.full((len(vertices), 3), GREY, np.uint8))
+    vertices, faces = zero_level_of_grid(closed.astype(np.float32))
+    vertices = low + (vertices - 1) * cell
+    return Mesh(vertices, faces, np.full((len(vertices), 3), GREY, np.uint8))

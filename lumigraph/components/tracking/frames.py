@@ -32,10 +32,13 @@ class DepthFrame:
     size: tuple[int, int]
 
     @staticmethod
-    def of(scene: Scene, index: int, device: torch.device, like: DepthFrame | None = None) -> DepthFrame:
-        """like: another frame, whose rays are taken where the lens is the same"""
+    def of(
+        scene: Scene, index: int, device: torch.device, like: DepthFrame | None = None, reduction: int = 1
+    ) -> DepthFrame:
+        """like: another frame, whose rays are taken where the lens is the same; reduction: factor by which a frame is
+        smaller than its photograph"""
         layers = ["depth"] if "depth" in scene.layers else []
-        photograph = scene.photograph(index, layers).to(device)
+        photograph = scene.photograph(index, layers).reduced(reduction).to(device)
         camera = replace(photograph.camera, pose=torch.eye(3, 4, device=device)[None])
         same = like is not None and same_lens(like.camera, camera)
         rays = like.rays if like is not None and same else camera.rays(camera.pixels())

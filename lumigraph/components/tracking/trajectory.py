@@ -59,11 +59,14 @@ class Trajectory(Part):
         turn, shift = relative(self.poses[before[1]], last)
         return torch.cat([last[:, :3] @ turn, (last[:, :3] @ shift + last[:, 3])[:, None]], -1)
 
-    @torch.no_grad()
     def correct(self, keyframes: Int[Tensor, " keyframe"], twists: Twist) -> None:
         """Move keyframes by twists, and with each the frames that were tracked beside it."""
-        corrected = rigid(moved(self.poses[keyframes], twists))
-        for keyframe, pose in zip(keyframes.tolist(), corrected, strict=True):
+        self.place(keyframes.tolist(), moved(self.poses[keyframes], twists))
+
+    @torch.no_grad()
+    def place(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> None:
+        """Put keyframes at other poses, and with each the frames that were tracked beside it."""
+        for keyframe, pose in zip(keyframes, rigid(poses), strict=True):
             beside = self.anchor == keyframe
             turn, shift = relative(self.poses[keyframe], self.poses[beside])
             there = torch.cat([pose[:, :3] @ turn, (shift @ pose[:, :3].T + pose[:, 3])[:, :, None]], -1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -18,20 +17,19 @@ from ...camera.rays import Rays
 from ...color.blending import before
 from ...components.fields.hash_field import TINY_TABLE, HashNumbers
 from ...components.sampling.spaces import Box
-from ...components.tracking.frames import DepthFrame, Moment, order_of
-from ...components.tracking.trajectory import KNOWN, Pose, Trajectory, moved, relative
+from ...components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
+from ...components.tracking.frames import DepthFrame, Moment
+from ...components.tracking.tracker import Iterations, Tracker, TrackingNumbers
+from ...components.tracking.trajectory import Pose, moved
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
-from ...errors import LumigraphError
 from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...method import FieldMethod, Pass
 from ...method.method import Descend
 from ...volume import composite
-from .alignment import aligned
 from .fields import DistanceTable, MapNetwork
 from .sampler import MapSampler, SampleNumbers
 
-Iterations = Annotated[int, between(0, 10_000)]
 FREQUENCY_ROWS = 93  # of B, section 3.1
 REGIONS = 8  # along each side of a frame, of which active sampling keeps losses (section 3.4)
 UNKNOWN_LOSS = 1.0  # of a region that has not been compared yet
@@ -39,26 +37,16 @@ MIN_LOSS = 1e-3  # added to losses, so that each region and keyframe can be draw
 SURFACE_BAND = 0.7  # truncations from a table's surface within which a point is explained
 SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness term, and metres between them
 MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
-SENSOR_DEVIATION = 0.005, 0.0025  # metres: of depth, and of its square by the metre (Khoshelham and Elberink 2012)
-COLOUR_DEVIATION = 0.08  # of luminance in alignment
 EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
-MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
 
 
 @dataclass(frozen=True)
-class TrackingNumbers:
-    """A Config's numbers of tracking (section 3.3)."""
+class PoseNumbers:
+    """A Config's numbers of a frame's pose (section 3.3)."""
 
-    track: bool = False  # find the poses of frames in order, as `lumigraph track` does; else they are those given
-    first_estimate: Literal["velocity", "surface"] = (
-        "velocity"  # first pose: constant velocity, or aligned with the map
-    )
-    alignment_points: BatchSize = 3000  # pixels of a frame that are aligned with the map's surface
-    alignment_iterations: Iterations = 12  # Gauss-Newton steps of that
     tracking_iterations: Iterations = 50  # descents on a frame's pose; more follow faster motion, slower
     tracking_pixels: BatchSize = 200  # pixels of each of these descents, section 3.4
     tracking_rate: LearningRate = 3e-3  # Adam's rate of a frame's pose, radians and scene units
-    lost_share: Share = 0.3  # share of explained pixels below which a frame is lost
 
 
 @dataclass(frozen=True)
@@ -66,7 +54,7 @@ class MappingNumbers:
     """A Config's numbers of joint mapping (sections 3.3 and 3.4)."""
 
     mapping_iterations: Iterations = 10  # descents on map and keyframes' poses for each frame; more learn more, slower
-    first_iterations: Iterations = 200  # descents on the map for the first frame
+    first_iterations: Iterations = 200  # descents on the map for the first frame, and after a loop was closed
     window: Annotated[int, between(1, 1000)] = 5  # keyframes W of a descent, with the latest and the current one
     pixels_per_frame: BatchSize = 200  # pixels of each frame in the window, section 3.4
     active_sampling: bool = True  # draw pixels and keyframes by their loss, section 3.4; else evenly
@@ -93,6 +81,7 @@ class Config:
     table: HashNumbers = HashNumbers(sh_bands=1)
     rays: SampleNumbers = SampleNumbers()
     tracking: TrackingNumbers = TrackingNumbers()
+    descent: PoseNumbers = PoseNumbers()
     mapping: MappingNumbers = MappingNumbers()
     terms: LossNumbers = LossNumbers()
     field: Literal["network", "hash"] = "network"  # map: the paper's network, or a faster hash table of a distance
@@ -109,19 +98,15 @@ class IMap(FieldMethod):
     """One step is one frame: find its pose in the map, decide whether it is a keyframe, then descend on the map and the
     poses of keyframes together. Steps after the last frame map on.
 
-    is_keyframe: of each image
-    losses:      of each image and region of active sampling, as they were last measured; those of keyframes count
-    snapshot:    the map when the latest keyframe was added, by which frames are judged (section 3.4)
-    turn:        number of frames that were followed
+    losses:   of each image and region of active sampling, as they were last measured; those of keyframes count
+    snapshot: the map when the latest keyframe was added, by which frames are judged (section 3.4)
     """
 
     Config = Config
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH
     network: MapNetwork | DistanceTable
     sampler: MapSampler
-    is_keyframe: Tensor
     losses: Tensor
-    turn: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -135,22 +120,20 @@ class IMap(FieldMethod):
             else:
                 self.network = MapNetwork(c.layers, c.hidden_width, FREQUENCY_ROWS, c.frequency_deviation)
         self.sampler = MapSampler(space, c.rays, c.truncation * self.unit if hashed else None)
-        self.trajectory = Trajectory(frame.image_count)
+        self.tracker = Tracker(frame.image_count, c.tracking, self.unit)
         self.snapshot = copy.deepcopy(self.network).requires_grad_(False)
-        self.register_buffer("is_keyframe", torch.zeros(frame.image_count, dtype=torch.bool))
         self.register_buffer("losses", torch.full((frame.image_count, REGIONS * REGIONS), UNKNOWN_LOSS))
-        self.register_buffer("turn", torch.tensor(0))
         self.rehearses = False
-        self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
         table = HashNumbers(8, 2, 16, 16, 512, geometry_features=16, colour_layers=1, sh_bands=1)
-        tracking = TrackingNumbers(first_estimate="surface", tracking_iterations=0)
+        tracking, descent = TrackingNumbers(first_estimate="surface"), PoseNumbers(tracking_iterations=0)
         mapping = MappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
         mapping = replace(mapping, keyframe_pose_rate=2e-4)
-        c = Config(table, SampleNumbers(16, 10), tracking, mapping, LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3), "hash")
+        terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3)
+        c = Config(table, SampleNumbers(16, 10), tracking, descent, mapping, terms, "hash")
         return replace(c, hidden_width=32, learning_rate=1e-2)
 
     @classmethod
@@ -158,56 +141,49 @@ class IMap(FieldMethod):
         """A tiny hash table and few descents a frame."""
         mapping = MappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
         terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-4)
-        c = Config(replace(TINY_TABLE, sh_bands=1), SampleNumbers(12, 8), TrackingNumbers(), mapping, terms, "hash")
+        c = Config(replace(TINY_TABLE, sh_bands=1), SampleNumbers(12, 8), mapping=mapping, terms=terms, field="hash")
         return replace(c, hidden_width=16, truncation=0.2, sharpness=4.0, learning_rate=2e-2)
 
     # The sequence
 
     def steps_per_pass(self, data: Any) -> float:
-        return len(self.sequence(data))
-
-    def sequence(self, data: Scene) -> list[int]:
-        """Images in the order of their exposure: all where poses are to be found, else those to learn from."""
-        order, learnt = order_of(data.cameras).tolist(), set(data.splits["train"].tolist())
-        return order if self.config.tracking.track else [i for i in order if i in learnt]
+        return len(self.tracker.sequence(data))
 
     def compile_begin(self) -> None:
         super().compile_begin()
         self.rehearses = True
 
-    def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        super().begin(data, seconds)
-        if self.config.tracking.track and "depth" not in data.layers:
-            raise LumigraphError(
-                f"{data.source} has no depth, which tracking needs; train with the poses of its photographs"
-            )
-
     def batch(self, data: Scene, generator: torch.Generator) -> Moment:  # type: ignore[override]
         """The frame that is next, and the scene."""
-        sequence, turn = self.sequence(data), int(self.turn)
-        return Moment(data, self._frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
-
-    def _frame(self, data: Scene, index: int) -> DepthFrame:
-        if index not in self._held:
-            return DepthFrame.of(data, index, self.device, next(iter(self._held.values()), None))
-        return self._held[index]
+        return self.tracker.moment(data)
 
     def step(self, batch: Moment, step: int, descend: Descend) -> dict[str, Tensor]:
         """Follow the next frame, then map."""
-        c, chance, frame, first = self.config.mapping, self.random(step), batch.frame, int(self.turn) == 0
+        c, chance, frame, afresh = self.config.mapping, self.random(step), batch.frame, int(self.tracker.turn) == 0
+        self.figures = {}
         if frame is not None:
-            known = self.follow(frame, batch, chance)
-            learns = known and bool((batch.scene.splits["train"] == frame.index).any())
+            share = self.tracker.follow(
+                frame,
+                batch,
+                lambda pose: self.tracked(frame, pose, chance),
+                lambda pose: self.explained(self.network, frame, pose, chance),
+            )
+            learns = share is not None and bool((batch.scene.splits["train"] == frame.index).any())
+            if share is not None:
+                self.figures["explained"] = share
             if learns and (
-                not self.is_keyframe.any() or self.explained(self.snapshot, frame, chance) < c.keyframe_share
+                not self.tracker.keyframes
+                or self.explained(self.snapshot, frame, self.tracker.trajectory.poses[frame.index], chance)
+                < c.keyframe_share
             ):
-                self.add_keyframe(frame)
+                self.tracker.add_keyframe(frame)
+                self.snapshot.load_state_dict(self.network.state_dict())
+                afresh |= self.tracker.close_loop(frame, batch.scene, chance)  # the map follows the corrected poses
             frame = frame if learns else None
-            self.turn += 1
         return self.map(
             frame,
             batch,
-            1 if self.rehearses else c.first_iterations if first else c.mapping_iterations,
+            1 if self.rehearses else c.first_iterations if afresh else c.mapping_iterations,
             chance,
             descend,
         )
@@ -215,12 +191,12 @@ class IMap(FieldMethod):
     # Keyframes (section 3.4)
 
     @torch.no_grad()
-    def explained(self, field: Any, frame: DepthFrame, chance: torch.Generator) -> float:
+    def explained(self, field: Any, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> float:
         """Share P of pixels whose depth a map explains (eq. 9): of a table, whose surface is near what was measured."""
         pixels = frame.drawn(EXPLAINED_PIXELS, chance, measured=True)
         if not len(pixels):
             return 0.0
-        rays, depth = self.world_rays(frame.rays[pixels], self.trajectory.poses[frame.index][None]), frame.depth[pixels]
+        rays, depth = self.world_rays(frame.rays[pixels], pose[None]), frame.depth[pixels]
         if isinstance(field, DistanceTable):
             distance = field.distance_of(field.geometry(rays.at(depth))[1])
             return float((distance.abs() < SURFACE_BAND).float().mean())
@@ -232,52 +208,13 @@ class IMap(FieldMethod):
         error = (found.depth * found.opacity).nan_to_num(0, 0) - depth
         return float((error.abs() / depth < self.config.mapping.depth_tolerance).float().mean())
 
-    def add_keyframe(self, frame: DepthFrame) -> None:
-        self.is_keyframe[frame.index] = True
-        self.trajectory.anchor[frame.index] = frame.index
-        self._held[frame.index] = frame
-        self.snapshot.load_state_dict(self.network.state_dict())
-
-    def keyframes(self) -> list[int]:
-        """Images that are keyframes, in the order of their exposure if their numbers are."""
-        return self.is_keyframe.nonzero()[:, 0].tolist()
-
     # Tracking (section 3.3)
-
-    def follow(self, frame: DepthFrame, batch: Moment, chance: torch.Generator) -> bool:
-        """Find the pose of the next frame. False if tracking is lost: the last known pose is kept for it then."""
-        t, trajectory = self.config.tracking, self.trajectory
-        given = batch.scene.cameras.pose[frame.index].to(self.device)
-        anchor = max(self.keyframes(), default=frame.index)
-        if not t.track or not batch.before:
-            trajectory.know(frame.index, given, anchor)
-            return True
-        known = [i for i in batch.before if trajectory.state[i] == KNOWN][::-1]
-        steady = batch.before[-1:] == known[:1]
-        starts = (
-            [trajectory.predicted(known[:2]), trajectory.poses[known[0]]] if steady else [trajectory.poses[known[0]]]
-        )
-        for start in starts:
-            pose = self.tracked(frame, start, chance)
-            trajectory.know(frame.index, pose, anchor)
-            share = self.explained(self.network, frame, chance)
-            if share > t.lost_share and self.plausible(trajectory.poses[known[0]], pose):
-                self.figures["explained"] = share
-                return True
-        trajectory.lose(frame.index, trajectory.poses[known[0]])
-        return False
-
-    def plausible(self, last: Pose, pose: Pose) -> bool:
-        """True for a motion that a hand can make between two frames."""
-        turn, shift = relative(last, pose)
-        angle = torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))
-        return float(shift.norm()) < MAX_STEP[0] * self.unit and float(angle) < MAX_STEP[1]
 
     def tracked(self, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
         """The frame's pose: aligned with the map's surface, or as given, then by descents on the loss of its pixels."""
-        t = self.config.tracking
+        t = self.config.descent
         with frozen(self.network):
-            if t.first_estimate == "surface" and isinstance(self.network, DistanceTable):
+            if self.config.tracking.first_estimate == "surface" and isinstance(self.network, DistanceTable):
                 pose = self.aligned(frame, pose, chance)
             twist = torch.zeros(1, 6, device=self.device, requires_grad=True)
             optimizer = PoseAdam([twist], t.tracking_rate)
@@ -291,12 +228,11 @@ class IMap(FieldMethod):
             return moved(pose[None], twist.detach())[0]
 
     def aligned(self, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
-        t, field, unit = self.config.tracking, self.network, self.unit
+        t, field = self.config.tracking, self.network
         assert isinstance(field, DistanceTable)
         pixels = frame.drawn(t.alignment_points, chance, measured=True)
         points = frame.rays[pixels].at(frame.depth[pixels])
-        metres = frame.depth[pixels] / unit
-        deviation = (SENSOR_DEVIATION[0] + SENSOR_DEVIATION[1] * metres.square()) * unit / field.truncation
+        deviation = sensor_deviation(frame.depth[pixels] / self.unit) * self.unit / field.truncation
 
         def seen(world: Tensor) -> tuple[Tensor, Tensor]:
             _, features = field.geometry(world)
@@ -312,14 +248,15 @@ class IMap(FieldMethod):
     ) -> dict[str, Tensor]:
         """Descend on the map and the poses of keyframes together. current: the frame that joins the keyframes"""
         c, terms = self.config.mapping, dict[str, Tensor]()
-        joined = sorted({*self.keyframes(), *([] if current is None else [current.index])})
-        numbers, poses = torch.tensor(joined), self.trajectory.poses[joined]
+        joined = sorted({*self.tracker.keyframes, *([] if current is None else [current.index])})
+        numbers, poses = torch.tensor(joined), self.tracker.trajectory.poses[joined]
         twists = torch.zeros(len(joined), 6, device=self.device, requires_grad=self.config.tracking.track)
         optimizer = PoseAdam([twists], c.keyframe_pose_rate)
         for _ in range(iterations):
             window = self.window(joined, current, chance)
             frames = [
-                current if current and current.index == joined[i] else self.held(batch.scene, joined[i]) for i in window
+                current if current and current.index == joined[i] else self.tracker.held(batch.scene, joined[i])
+                for i in window
             ]
             drawn = [(f, self.pixels(f, chance)) for f in frames]
             moving = moved(poses, twists * (numbers != joined[0])[:, None].to(twists))  # the first frame stays
@@ -334,15 +271,9 @@ class IMap(FieldMethod):
                 twists.grad = None
             self.remember(drawn, error)
         if self.config.tracking.track:
-            self.trajectory.correct(numbers, twists.detach() * (numbers != joined[0])[:, None])
-        self.figures["keyframes"] = int(self.is_keyframe.sum())
+            self.tracker.trajectory.correct(numbers, twists.detach() * (numbers != joined[0])[:, None])
+        self.figures["keyframes"] = len(self.tracker.keyframes)
         return terms
-
-    def held(self, data: Scene, index: int) -> DepthFrame:
-        """A keyframe's pixels, which are kept."""
-        if index not in self._held:
-            self._held[index] = self._frame(data, index)
-        return self._held[index]
 
     def window(self, joined: list[int], current: DepthFrame | None, chance: torch.Generator) -> list[int]:
         """Places in `joined` of the frames of one descent: the current and the latest keyframe, others by their mean

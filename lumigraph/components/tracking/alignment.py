@@ -13,12 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...components.tracking.trajectory import Pose, moved
+from .trajectory import Pose, moved
 
 HUBER = 1.5  # deviations from which on a residual counts by its size, not its square
 DAMPING = 1e-4  # of the normal matrix's diagonal
 GREY = (0.299, 0.587, 0.114)  # of red, green, blue in luminance
 MIN_POINTS = 50  # in the band of the field, below which a pose is not determined
+SENSOR_DEVIATION = 0.005, 0.0025  # metres: of depth, and of its square by the metre (Khoshelham and Elberink 2012)
+COLOUR_DEVIATION = 0.08  # of luminance
 SMALL_TURN, SMALL_SHIFT = 1e-5, 1e-5  # radians and scene units of a last step
 
 
@@ -73,6 +75,11 @@ def aligned(
         if step[:3].norm() < SMALL_TURN and step[3:].norm() < SMALL_SHIFT:
             break
     return Aligned(pose, share)
+
+
+def sensor_deviation(metres: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
+    """Standard deviation of measured depth, metres."""
+    return SENSOR_DEVIATION[0] + SENSOR_DEVIATION[1] * metres.square()
 
 
 def normal_equations(residual: Tensor, slope: Tensor, arm: Tensor, band: Tensor) -> tuple[Tensor, Tensor]:

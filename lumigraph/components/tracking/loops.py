@@ -1,0 +1,174 @@
+"""Loops: places that a camera comes back to are recognised, and a pose graph spreads the drift over the path.
+
+Keyframes that look alike are candidates. Features that both show, with their depth, give a rigid motion between them by
+RANSAC, which is the proof. Poses then minimise the error of motions between neighbours and across loops
+(Grisetti et al. 2010, eq. 7), with a robust loss by SciPy: COLMAP's pose graph holds pairs of views and optimises none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import least_squares
+from scipy.sparse import lil_matrix
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d, normalize
+
+from ...datasets.scene import Photograph
+from ...method import Part
+from ..training.bundle_adjustment import rotation_vector
+from ..training.shared_points import Seen, features, matched
+from .frames import DepthFrame
+from .trajectory import Pose, moved, relative
+
+THUMBNAIL = 12, 16  # rows and columns of a picture by which places are compared
+MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
+CANDIDATES = 3  # keyframes that a new one is compared with by features
+MIN_AGE = 10  # keyframes between the two ends of a loop
+HYPOTHESES = 200  # motions from three matches each
+TOLERANCE = 0.05  # metres between matched points of one place
+MIN_INLIERS, MIN_INLIER_SHARE = 25, 0.5  # matches that a loop's motion explains, and their share
+MAX_STEPS = 50  # evaluations of the pose graph's Jacobian
+DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to the next and across a loop
+
+
+@dataclass(frozen=True)
+class Place:
+    """A keyframe as it is recognised. points: of its features, camera's frame, NaN where nothing was measured"""
+
+    seen: Seen
+    points: Float[Tensor, "feature 3"]
+    thumbnail: Float[Tensor, " pixel"]
+
+    @staticmethod
+    @torch.no_grad()
+    def of(frame: DepthFrame) -> Place:
+        width, height = frame.size
+        picture = frame.rgb.view(height, width, 3)
+        seen = features(Photograph(frame.camera, picture))
+        depth = frame.depth.view(height, width)
+        places, inside = frame.camera.locate(seen.bearings)
+        along = torch.where(inside, depth[places[:, 0], places[:, 1]], torch.nan)
+        small = adaptive_avg_pool2d(picture.mean(-1)[None, None], THUMBNAIL).flatten()
+        return Place(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
+
+
+class Loops(Part):
+    """Loops that were found: pairs of images, the earlier one first, and the pose of the later one in its frame."""
+
+    grows: ClassVar[tuple[str, ...]] = ("pairs", "motions")
+    pairs: Tensor
+    motions: Tensor
+
+    def __init__(self, unit: float):
+        super().__init__()
+        self.unit = unit
+        self.register_buffer("pairs", torch.zeros(0, 2, dtype=torch.int64))
+        self.register_buffer("motions", torch.zeros(0, 3, 4))
+        self._places: dict[int, Place] = {}
+
+    def place(self, frame: DepthFrame) -> Place:
+        if frame.index not in self._places:
+            self._places[frame.index] = Place.of(frame)
+        return self._places[frame.index]
+
+    def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
+        """Look for the place of a new keyframe among older ones; True if it is one of theirs."""
+        own, others = self.place(frame), [self.place(other) for other in older[:-MIN_AGE]]
+        if not others:
+            return False
+        likeness = torch.stack([other.thumbnail @ own.thumbnail for other in others])
+        for i in likeness.argsort(descending=True, stable=True)[:CANDIDATES].tolist():
+            if likeness[i] < MIN_LIKENESS:
+                break
+            motion = motion_between(others[i], own, TOLERANCE * self.unit, chance)
+            if motion is not None:
+                pair = torch.tensor([[older[i].index, frame.index]]).to(self.pairs)
+                self.pairs = torch.cat([self.pairs, pair])
+                self.motions = torch.cat([self.motions, motion[None].to(self.motions)])
+                return True
+        return False
+
+    def closed(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> Float[Tensor, "keyframe 3 4"]:
+        """Poses of keyframes with all loops closed; the first one stays."""
+        number = {image: i for i, image in enumerate(keyframes)}
+        neighbours = torch.arange(len(poses) - 1)
+        loops = torch.tensor([[number[a], number[b]] for a, b in self.pairs.tolist()])
+        edges = torch.cat([torch.stack([neighbours, neighbours + 1], -1), loops])
+        steps = [motion(poses[i], poses[i + 1]) for i in neighbours.tolist()]
+        motions = torch.cat([torch.stack(steps), self.motions.to(poses)])
+        return optimised(poses.double(), edges, motions.double(), self.unit).to(poses)
+
+
+def motion(first: Pose, second: Pose) -> Pose:
+    """Pose of the second in the frame of the first."""
+    turn, shift = relative(first, second)
+    return torch.cat([turn, shift[:, None]], -1)
+
+
+def motion_between(first: Place, second: Place, tolerance: float, chance: torch.Generator) -> Pose | None:
+    """Pose of the second place's camera in the frame of the first, if enough matched points agree on one."""
+    pairs = matched(first.seen, second.seen)
+    a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]
+    known = (a.isfinite() & b.isfinite()).all(-1)
+    a, b = a[known].double(), b[known].double()
+    if len(a) < MIN_INLIERS:
+        return None
+    best = torch.zeros(len(a), dtype=torch.bool)
+    for _ in range(HYPOTHESES):
+        agree = agreeing(fitted(a, b, torch.randperm(len(a), generator=chance)[:3]), a, b, tolerance)
+        best = agree if agree.sum() > best.sum() else best
+    if int(best.sum()) < max(MIN_INLIERS, MIN_INLIER_SHARE * len(a)):
+        return None
+    return fitted(a, b, best.nonzero()[:, 0]).float()
+
+
+def agreeing(pose: Pose, a: Tensor, b: Tensor, tolerance: float) -> Bool[Tensor, " point"]:
+    return (b @ pose[:, :3].T + pose[:, 3] - a).norm(dim=-1) < tolerance
+
+
+def fitted(a: Float[Tensor, "point 3"], b: Float[Tensor, "point 3"], chosen: Int[Tensor, " chosen"]) -> Pose:
+    """Rotation and shift from points b to points a by least squares (Umeyama 1991, without a scale)."""
+    a, b = a[chosen], b[chosen]
+    u, _, vt = torch.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
+    sign = torch.ones(3).to(a)
+    sign[2] = torch.linalg.det(u @ vt).sign()
+    turn = u * sign @ vt
+    return torch.cat([turn, (a.mean(0) - turn @ b.mean(0))[:, None]], -1)
+
+
+def optimised(
+    poses: Float[Tensor, "pose 3 4"], edges: Int[Tensor, "edge 2"], motions: Float[Tensor, "edge 3 4"], unit: float
+) -> Float[Tensor, "pose 3 4"]:
+    """Poses that minimise the robust sum over edges (i, j) of |log(Z_ij^-1 T_i^-1 T_j)|^2 over DEVIATION; the first
+    stays.
+
+    motions: Z_ij, measured pose of j in the frame of i; unit: scene units of a metre
+    """
+    i, j = edges.unbind(-1)
+    turn, shift = motions[:, :, :3], motions[:, :, 3]
+
+    def at(twists: np.ndarray) -> Tensor:
+        moves = torch.cat([torch.zeros(1, 6).double(), torch.from_numpy(twists).view(-1, 6)])
+        return moved(poses, torch.cat([moves[:, :3], moves[:, 3:] * unit], -1))
+
+    def residuals(twists: np.ndarray) -> np.ndarray:
+        there = at(twists)
+        back = there[i, :, :3].mT
+        turned = turn.mT @ back @ there[j, :, :3]
+        away = torch.einsum("eab,eb->ea", back, there[j, :, 3] - there[i, :, 3]) - shift
+        parts = rotation_vector(turned) / DEVIATION[0], away / (DEVIATION[1] * unit)
+        return torch.cat(parts, -1).flatten().numpy()
+
+    known = lil_matrix((6 * len(edges), 6 * len(poses)), dtype=np.int8)
+    for edge, (a, b) in enumerate(edges.tolist()):
+        for end in (a, b):
+            known[6 * edge : 6 * edge + 6, 6 * end : 6 * end + 6] = 1
+    start = np.zeros(6 * (len(poses) - 1))
+    sparsity = known[:, 6:]
+    found = least_squares(residuals, start, jac_sparsity=sparsity, loss="soft_l1", x_scale=0.1, max_nfev=MAX_STEPS)
+    return at(found.x)

@@ -1,0 +1,143 @@
+"""Tracker: the frames of a recording in order, their poses, and which of them are keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from ...datasets.scene import Scene
+from ...errors import LumigraphError
+from ...files.ranges import BatchSize, Share, between
+from ...method import Part
+from .frames import DepthFrame, Moment, order_of
+from .loops import Loops
+from .trajectory import KNOWN, Pose, Trajectory, relative
+
+Iterations = Annotated[int, between(0, 10_000)]
+MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
+
+
+@dataclass(frozen=True)
+class TrackingNumbers:
+    """A Config's numbers of tracking that methods share."""
+
+    track: bool = False  # find the poses of frames in order, as `lumigraph track` does; else they are those given
+    first_estimate: Literal["velocity", "surface"] = (
+        "velocity"  # first pose: constant velocity, or aligned with the map
+    )
+    alignment_points: BatchSize = 3000  # pixels of a frame that are aligned with the map's surface
+    alignment_iterations: Iterations = 12  # Gauss-Newton steps of that
+    lost_share: Share = 0.3  # share of explained pixels below which a frame is lost
+    close_loops: bool = False  # recognise places by features and correct the path by a pose graph; slower
+
+
+class Tracker(Part):
+    """Follows the frames of a recording one after another.
+
+    unit:        scene units of a metre
+    reduction:   whole number by which frames are smaller than photographs
+    turn:        number of frames that were followed
+    is_keyframe: of each image
+    """
+
+    moves_cameras: ClassVar[bool] = True
+    turn: Tensor
+    is_keyframe: Tensor
+
+    def __init__(self, image_count: int, numbers: TrackingNumbers, unit: float, reduction: int = 1):
+        super().__init__()
+        self.numbers, self.unit, self.reduction = numbers, unit, reduction
+        self.trajectory = Trajectory(image_count)
+        self.loops = Loops(unit) if numbers.track and numbers.close_loops else None
+        self.register_buffer("turn", torch.tensor(0))
+        self.register_buffer("is_keyframe", torch.zeros(image_count, dtype=torch.bool))
+        self._held: dict[int, DepthFrame] = {}  # frames of keyframes, read again where a run goes on
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        if self.numbers.track and "depth" not in data.layers:
+            raise LumigraphError(
+                f"{data.source} has no depth, which tracking needs; train with the poses of its photographs"
+            )
+
+    def sequence(self, data: Scene) -> list[int]:
+        """Images in the order of their exposure: all where poses are to be found, else those to learn from."""
+        order, learnt = order_of(data.cameras).tolist(), set(data.splits["train"].tolist())
+        return order if self.numbers.track else [i for i in order if i in learnt]
+
+    def moment(self, data: Scene) -> Moment:
+        """The frame that is next, and the scene."""
+        sequence, turn = self.sequence(data), int(self.turn)
+        return Moment(data, self.frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
+
+    def frame(self, data: Scene, index: int) -> DepthFrame:
+        """A frame, which is read unless it is a keyframe that is held."""
+        if index not in self._held:
+            like = next(iter(self._held.values()), None)
+            return DepthFrame.of(data, index, self.turn.device, like, self.reduction)
+        return self._held[index]
+
+    def held(self, data: Scene, index: int) -> DepthFrame:
+        """A keyframe, which is kept."""
+        if index not in self._held:
+            self._held[index] = self.frame(data, index)
+        return self._held[index]
+
+    def add_keyframe(self, frame: DepthFrame) -> None:
+        self.is_keyframe[frame.index] = True
+        self.trajectory.anchor[frame.index] = frame.index
+        self._held[frame.index] = frame
+
+    @torch.no_grad()
+    def close_loop(self, frame: DepthFrame, data: Scene, chance: torch.Generator) -> bool:
+        """Recognise the place of the latest keyframe, and correct the path if it was seen before. True if it was."""
+        keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
+        older = [self.held(data, i) for i in keyframes if i != frame.index]
+        if self.loops is None or not self.loops.find(frame, older, chance):
+            return False
+        self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))
+        return True
+
+    @property
+    def keyframes(self) -> list[int]:
+        """Images that are keyframes, in the order of their exposure if their numbers are."""
+        return self.is_keyframe.nonzero()[:, 0].tolist()
+
+    def follow(
+        self,
+        frame: DepthFrame,
+        moment: Moment,
+        find: Callable[[Pose], Pose],
+        explained: Callable[[Pose], float],
+    ) -> float | None:
+        """Find the pose of the next frame, from constant velocity, then from the last known pose. Gives the share of
+        its pixels that the map explains, or None if tracking is lost: the last known pose is kept for it then.
+
+        find: pose from a first estimate; explained: share of explained pixels at a pose
+        """
+        trajectory = self.trajectory
+        self.turn += 1
+        anchor = max(self.keyframes, default=frame.index)
+        if not self.numbers.track or not moment.before:
+            trajectory.know(frame.index, moment.scene.cameras.pose[frame.index].to(self.turn.device), anchor)
+            return 1.0
+        known = [i for i in moment.before if trajectory.state[i] == KNOWN][::-1]
+        last = trajectory.poses[known[0]]
+        steady = moment.before[-1:] == known[:1]
+        for start in [trajectory.predicted(known[:2]), last] if steady else [last]:
+            pose = find(start)
+            share = explained(pose)
+            if share > self.numbers.lost_share and self.plausible(last, pose):
+                trajectory.know(frame.index, pose, anchor)
+                return share
+        trajectory.lose(frame.index, last)
+        return None
+
+    def plausible(self, last: Pose, pose: Pose) -> bool:
+        """True for a motion that a hand can make between two frames."""
+        turn, shift = relative(last, pose)
+        angle = torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))
+        return float(shift.norm()) < MAX_STEP[0] * self.unit and float(angle) < MAX_STEP[1]
