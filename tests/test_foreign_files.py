@@ -41,6 +41,11 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "render, a run's own name": ("render ball --frames 2 --size 16 --output ball.gif", ("ball.gif", "ball.json")),
     "export web": ("export web gs page.html", ("page.html",)),
+    "export lightfield": ("export lightfield ball grid --grid 2 --size 16", ("grid/",)),
+    "export lightfield, a quilt": (
+        "export lightfield ball q.png --quilt 2 2 --size 16",
+        ("q_qs2x2a1.00.png",),
+    ),
     "export octree": ("export octree octree o.npz", ("o.npz",)),
     "export points": ("export points ball p.ply", ("p.ply",)),
     "export splats": ("export splats gs s.spz", ("s.spz",)),

@@ -127,7 +127,7 @@ class Lumigraph(Method):
         total = torch.zeros_like(first.rgb)
         for k in range(LENS_SAMPLES):
             radius, angle = aperture * math.sqrt((k + 0.5) / LENS_SAMPLES), k * GOLDEN_ANGLE
-            aside = sheared(camera, radius * math.cos(angle), radius * math.sin(angle), focus)
+            aside = camera.sheared(radius * math.cos(angle), radius * math.sin(angle), focus)
             total += self._sharp(aside, focus).rgb
         return replace(first, rgb=total / LENS_SAMPLES)
 
@@ -140,9 +140,7 @@ class Lumigraph(Method):
         if c.geometry == "plane":
             depth = (focus or 1 / float(self.plane)) / cosines(camera).clamp_min(1e-2)
         else:
-            closed = not self.frame.has_alpha
-            depth, solid = surface_seen(self.views, chosen[: c.surface_views], camera, closed)
-            solid = solid | closed
+            depth, solid = surface_seen(self.views, chosen[: c.surface_views], camera, not self.frame.has_alpha)
         rays = camera.rays(camera.pixels())
         points = rays.at(torch.where(solid, depth, 1.0).flatten())[solid.flatten()]
         given = tables.pictures, tables.depths, tables.sizes, tables.poses, tables.lenses
@@ -152,10 +150,10 @@ class Lumigraph(Method):
         found, share = kernels.blend_views(
             points, eyes, focal_length(camera), *(x[chosen] for x in given), c.blended_views, *weights
         )
-        background = self.background.expand(height * width, 3)
-        rgb, opacity = background.clone(), solid.flatten().float()
-        rgb[solid.flatten()] = torch.where(share[:, None] > 0, found, background[solid.flatten()])
-        opacity[solid.flatten()] = (share > 0).float()
+        alpha = found[:, 3] if found.shape[1] > 3 else torch.ones_like(share)
+        rgb, opacity = self.background.repeat(height * width, 1), torch.zeros(height * width, device=self.device)
+        rgb[solid.flatten()] = torch.where(share[:, None] > 0, found[:, :3], self.background)
+        opacity[solid.flatten()] = torch.where(share > 0, alpha, 0)
         depth = torch.where(opacity > 0, depth.flatten(), torch.inf)
         return Rendering(rgb, depth, opacity).reshape(height, width)
 
@@ -164,13 +162,3 @@ class Lumigraph(Method):
         height, width = shape(camera)
         empty = torch.zeros(height, width, device=self.device)
         return Rendering(self.background.expand(height, width, 3).clone(), empty + torch.inf, empty)
-
-
-def sheared(camera: Camera, right: float, down: float, focus: float) -> Camera:
-    """A camera moved aside in its own plane, its centre moved so that all at the depth `focus` stays where it was."""
-    lens: Any = camera.lens
-    aside = torch.tensor([right, down], device=camera.pose.device)
-    position = camera.pose[:, :, 3] + camera.pose[:, :, :2] @ aside
-    centre = lens.centre + lens.focal * aside / focus
-    pose = torch.cat([camera.pose[:, :, :3], position[..., None]], -1)
-    return replace(camera, pose=pose, lens=replace(lens, centre=centre))

@@ -128,7 +128,7 @@ class ViewInterpolation(Method):
         rays = own.rays(own.pixels())
         usable = (away > 1e-5) & (away < 1e6)
         points = rays.at(away)[usable]
-        rgb = (tables.pictures[i, :height, :width].reshape(-1, 3)[usable].float()) / 255
+        rgb = (tables.pictures[i, :height, :width, :3].reshape(-1, 3)[usable].float()) / 255
         places, valid = camera.project(points)
         distance = (points - camera.position).norm(dim=-1)
         footprint = away[usable] * focal_length(camera) / (distance * focal_length(own))
@@ -160,7 +160,7 @@ class ViewInterpolation(Method):
             pixels = tables.cameras[a].pixels().to(self.device)
             there = pixels + flow
             error = (flow + sampled(back.view(height, width, 2), there)).norm(dim=-1)
-            picture = tables.pictures[a, :height, :width].reshape(-1, 3).float() / 255
+            picture = tables.pictures[a, :height, :width, :3].reshape(-1, 3).float() / 255
             importance = -error / FLOW_DISAGREEMENT
             found, cover = soft_splat(pixels + t * flow, picture, importance, (height, width), 1.0)
             layers.append(((1 - t) * cover.clamp_max(1), found))
@@ -177,7 +177,7 @@ class ViewInterpolation(Method):
 
     def _pair(self, camera: Camera) -> tuple[int, int, float]:
         """Two photographs between which the camera is, nearly, and its share of the way from the first."""
-        tables, (height, width) = self.views.tables, shape(camera)
+        tables = self.views.tables
         near = tables.nearest(camera, 8)
         best = (math.inf, near[0], near[0], 0.0)
         for n, i in enumerate(near):
@@ -196,7 +196,8 @@ class ViewInterpolation(Method):
         if (i, j) not in self._flows:
             tables = self.views.tables
             (width, height) = tables.sizes[i, :2].tolist()
-            grey = [cv2.cvtColor(tables.pictures[k, :height, :width].cpu().numpy(), cv2.COLOR_RGB2GRAY) for k in (i, j)]
+            colours = [tables.pictures[k, :height, :width, :3].contiguous().cpu().numpy() for k in (i, j)]
+            grey = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in colours]
             if i == j or min(height, width) < 16:
                 flow = np.zeros((height, width, 2), np.float32)
             else:

@@ -168,7 +168,7 @@ def mesh_distance(vertices: Tensor, faces: Tensor, camera: Camera) -> Float[Tens
 def typical_inverse_depth(
     scene: Scene, grids: Sequence[Camera], found: Sequence[Float[Tensor, "height width"]]
 ) -> float:
-    """Optimum of a single plane, 1 / z = (1 / near + 1 / far) / 2 (Chai 2000, eq. 10), over the depth that is known."""
+    """Optimum of a single plane, 1 / z = (1 / near + 1 / far) / 2 (Chai 2000, eq. 10), over known depth."""
     known = [
         cosines(grid)[depth.isfinite()] * depth[depth.isfinite()] for depth, grid in zip(found, grids, strict=True)
     ]

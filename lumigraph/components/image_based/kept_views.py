@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d
 
 from ...camera import Camera
 from ...camera.camera import PIXEL_RADIUS
 from ...camera.lens import OpenCV, Pinhole
 from ...datasets.scene import Scene, Vector
-from ..fields.kept_photographs import KeptPhotographs, padded
+from ...depth_maps.patch_match import padded
+from ..fields.kept_photographs import Kept, KeptPhotographs
 from .depth import Geometry, complete_depths, depth_camera, flattened, shape
 
 EDGE_RATIO = 1.05  # of distances within a triangle, above which one surface ends before another
@@ -37,10 +38,13 @@ class DepthGrid:
 
 @dataclass
 class ViewTables:
-    """Photographs as `kernels.blend_views` takes them."""
+    """Photographs as `kernels.blend_views` takes them.
+
+    pictures: colours before the background, and alpha where photographs have it
+    """
 
     cameras: Camera
-    pictures: UInt8[Tensor, "view rows columns 3"]
+    pictures: UInt8[Tensor, "view rows columns channel"]
     depths: Float[Tensor, "view depth_rows depth_columns"]
     sizes: Int[Tensor, "view 4"]
     poses: Float[Tensor, "view 3 4"]
@@ -66,6 +70,7 @@ class KeptViews(nn.Module):
         super().__init__()
         self.depth_size = depth_size
         self.photographs = KeptPhotographs(2)
+        self.alpha = Kept(torch.empty(0, dtype=torch.uint8))
         self._tables: ViewTables | None = None
 
     def __bool__(self) -> bool:
@@ -77,6 +82,9 @@ class KeptViews(nn.Module):
         depths = complete_depths(scene, taken, geometry, self.depth_size, mesh_file, seconds)
         device = self.photographs.pixels.rows.device
         self.photographs = KeptPhotographs.of(taken, background, 2).to(device)
+        alphas = [x.alpha.mul(255).round().byte().flatten() for x in taken if x.alpha is not None]
+        if len(alphas) == len(taken):
+            self.alpha.rows = torch.cat(alphas).to(device)
         rows = [torch.stack([one.distance, one.confidence], -1).view(-1, 2) for one in depths]
         self.photographs.found.rows = torch.cat(rows).to(device)
         self._tables = None
@@ -97,13 +105,17 @@ class KeptViews(nn.Module):
         distances = [part[:, 0].view(shape(grid)) for part, grid in zip(parts, grids, strict=True)]
         usable = [torch.where(x.isnan(), 0, x.clamp_max(NOTHING)) for x in distances]
         pictures = kept.pixels.rows.split([3 * int(size.prod()) for size in cameras.size])
-        shaped = [x.view(h, w, 3) for x, (w, h) in zip(pictures, cameras.size.tolist(), strict=True)]
+        sides = cameras.size.tolist()
+        shaped = [x.view(h, w, 3) for x, (w, h) in zip(pictures, sides, strict=True)]
+        if len(self.alpha.rows):
+            alphas = self.alpha.rows.split([w * h for w, h in sides])
+            shaped = [torch.cat([x, a.view(*x.shape[:2], 1)], -1) for x, a in zip(shaped, alphas, strict=True)]
         turn = cameras.pose[:, :, :3].mT
         poses = torch.cat([turn, -turn @ cameras.pose[:, :, 3:]], -1)
         sizes = torch.cat([cameras.size, torch.cat([grid.size for grid in grids])], 1)
         middle = torch.stack([x[x.isfinite()].median() for x in distances if x.isfinite().any()]).median()
         lenses = torch.stack([lens_row(cameras[i]) for i in range(len(cameras))])
-        stacked = padded_bytes(shaped), padded([x[..., None] for x in usable])[:, 0]
+        stacked = padded(shaped), padded(usable)
         tables = (x.to(device).contiguous() for x in (*stacked, sizes, poses, lenses, middle))
         return ViewTables(cameras.to(device), *tables)
 
@@ -122,6 +134,7 @@ class KeptViews(nn.Module):
 def depth_grid(camera: Camera, distance: Float[Tensor, "height width"], confidence: Tensor) -> DepthGrid:
     """Two triangles between any four neighbouring pixels that see one surface."""
     height, width = distance.shape
+    distance = continued(distance)
     places = camera.rays(camera.pixels()).at(distance.flatten().nan_to_num(0.0, 0.0))
     index = torch.arange(height * width, device=distance.device, dtype=torch.int32).view(height, width)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
@@ -131,21 +144,20 @@ def depth_grid(camera: Camera, distance: Float[Tensor, "height width"], confiden
     return DepthGrid(places, confidence.contiguous(), faces[one].contiguous())
 
 
+def continued(distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Distances of a surface continued by one pixel to where nothing is: photographs' alpha knows its edge better."""
+    there = distance.isfinite()
+    stacked = torch.stack([torch.where(there, distance, 0), there.float()])[None]
+    total, share = avg_pool2d(stacked, 3, 1, 1)[0]
+    return torch.where(distance.isposinf() & (share > 0), total / share.clamp_min(1e-6), distance)
+
+
 def lens_row(camera: Camera) -> Float[Tensor, " 13"]:
     """Numbers of a flat lens for `kernels.blend_views`."""
     lens = camera.lens
     if isinstance(lens, OpenCV):
         return torch.cat([lens.focal[0], lens.centre[0], lens.distortion[0], lens.fold[0]])
     return torch.cat([lens.focal[0], lens.centre[0], torch.zeros(8), torch.tensor([FLAT_LIMIT])])  # type: ignore[attr-defined]
-
-
-def padded_bytes(pictures: Sequence[UInt8[Tensor, "_ _ 3"]]) -> UInt8[Tensor, "view rows columns 3"]:
-    """Pictures of any sizes as one tensor, zero beyond each."""
-    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
-    out = pictures[0].new_zeros(len(pictures), height, width, 3)
-    for place, picture in zip(out, pictures, strict=True):
-        place[: picture.shape[0], : picture.shape[1]] = picture
-    return out
 
 
 def focal_length(camera: Camera) -> float:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import max_pool2d
 
 from ... import kernels
 from ...camera import Camera
@@ -19,7 +20,7 @@ from .warping import pushed
 AGREEMENT = 0.03  # of distance, within which two depth maps show one surface
 MIN_SUPPORT = 0.35  # of the best supported surface's, that a nearer one needs to hide it
 MAX_SPAN = 0.5  # of a picture's width: triangles that are longer go around a sphere the other way
-CRACK_NEIGHBOURS = 0.6  # share of a pixel's neighbours with a surface, from which on it is a crack
+EDGE_REACH = 0.5  # pixels of a depth map, by which a surface is continued beyond its edge
 
 
 def warped(grid: DepthGrid, camera: Camera) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
@@ -46,18 +47,22 @@ def surface_seen(
     The nearest surface counts that has MIN_SUPPORT of the confidence of the best supported one; its distance is the
     mean over all that agree. Nearer photographs count more: at a photograph's place its own depth alone.
     chosen: numbers of photographs, nearest first
-    closed: fill in pixels without any, from what is around, farther surfaces first; else cracks of a pixel alone
+    closed: fill in all pixels without any, from what is around, farther surfaces first; else those beside a surface
+            alone, where alpha shows its edge more finely than the depth maps
     """
     maps = [warped(views.grid(i), camera) for i in chosen]
     near = nearness(views, chosen, camera)
     distance = torch.stack([one for one, _ in maps])
     weight = torch.stack([confidence * share for (_, confidence), share in zip(maps, near, strict=True)])
-    depth = consensus(distance, weight)
-    seen = weight.sum(0) > 0
-    depth, filled = fill_cracks(depth, seen)
-    if closed and filled.any():
-        depth = pushed(depth[..., None], filled * depth.square())[..., 0]
-    return torch.where(filled | closed, depth, torch.inf), filled
+    depth, known = consensus(distance, weight), weight.sum(0) > 0
+    if not known.any():
+        return depth + torch.inf, known
+    depth = pushed(depth[..., None], known * depth.square())[..., 0]
+    if closed:
+        return depth, torch.ones_like(known)
+    reach = math.ceil(EDGE_REACH * max(1.0, max(depth.shape) / views.depth_size))
+    known = max_pool2d(known[None].float(), 2 * reach + 1, 1, reach)[0] > 0
+    return torch.where(known, depth, torch.inf), known
 
 
 def nearness(views: KeptViews, chosen: Sequence[int], camera: Camera) -> list[float]:
@@ -78,11 +83,3 @@ def consensus(
         nearest = torch.where((counts > 0) & (its >= best), torch.minimum(nearest, one), nearest)
     agreeing = weight * ((distance - nearest).abs() < AGREEMENT * nearest)
     return (agreeing * distance).sum(0) / agreeing.sum(0).clamp_min(1e-12)
-
-
-def fill_cracks(depth: Tensor, seen: Tensor) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """Fill in single pixels between others that have a surface."""
-    stacked = torch.stack([depth * seen, seen.float()])[None]
-    total, count = avg_pool2d(stacked, 3, 1, 1)[0]
-    crack = ~seen & (count > CRACK_NEIGHBOURS)
-    return torch.where(crack, total / count.clamp_min(1e-6), depth), seen | crack

@@ -11,6 +11,7 @@ from .._operation import Facts, door, implementation, require
 FACTS = Facts(unit="pixels", outputs=2, differentiable=(), typical=2, compiled=2)
 
 MIN_PENALTY = 1e-6  # added to a penalty, so that a weight is finite where the penalty is zero
+NOTHING = 1e8  # distance from which on a depth map shows no surface
 UNSEEN = 1e30  # penalty of a photograph that does not see a point
 BEHIND_DEPTH = 1e-6  # third coordinate up to which a point is behind a photograph
 
@@ -20,7 +21,7 @@ def blend_views(
     points: Float[Tensor, "pixel 3"],
     eyes: Float[Tensor, "pixel 3"],
     focal: float,
-    pictures: UInt8[Tensor, "view rows columns 3"],
+    pictures: UInt8[Tensor, "view rows columns channel"],
     depths: Float[Tensor, "view depth_rows depth_columns"],
     sizes: Int[Tensor, "view 4"],
     poses: Float[Tensor, "view 3 4"],
@@ -30,9 +31,9 @@ def blend_views(
     hidden_weight: float,
     tolerance: float,
     border: float,
-) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, " pixel"]]:
-    """Colour of surface points X as seen from D (Buehler 2001, sections 4 and 5), from the `count` photographs of least
-    penalty, and the largest of their shares of view (0 where no photograph sees the point).
+) -> tuple[Float[Tensor, "pixel channel"], Float[Tensor, " pixel"]]:
+    """Colours of surface points X as seen from D (Buehler 2001, sections 4 and 5), from the `count` photographs of
+    least penalty, and the largest of their shares of view (0 where no photograph sees the point).
 
         p = |d - c| (1 + hidden_weight h) + resolution_weight max(0, (|X - C| / f_C) / (|X - D| / f_D) - 1)
         h = min(max(0, min_j | |X - C| - t_j | / |X - C| - tolerance), 1)
@@ -40,12 +41,13 @@ def blend_views(
 
     for a photograph taken at C with the focal length f_C: d and c are unit directions from D and from C to X, so that
     |d - c| is their angle; t_j the four pixels of the photograph's depth map around X, so that h is 0 unless another
-    surface is seen there; p_last the next larger penalty, so that weights are continuous. v falls from 1 to 0 over the
-    share `border` of a picture along its sides. Both terms of the first factor vanish as D comes to C: there the
-    photograph alone counts (epipole consistency).
+    surface is seen there, and 0 where one t_j is NOTHING or more: what is seen past an object is its edge; p_last the
+    next larger penalty, so that weights are continuous. v falls from 1 to 0 over the share `border` of a picture along
+    its sides. Both terms of p vanish as D comes to C: there the photograph alone counts (epipole consistency).
 
     focal:    f_D in pixels
-    pictures: sRGB-encoded, filled up to one size; depths: along rays; 0 where the photograph is not to be used
+    pictures: colours, maybe with alpha, filled up to one size
+    depths:   along rays; 0 where the photograph is not to be used
     sizes:    (width, height) of each picture, then of each depth map
     poses:    world-to-camera; lenses: focal (2), centre (2), distortion (8) of `camera.lens.OpenCV`, and the largest
               radius on the plane z = 1 that it is valid for
@@ -85,7 +87,7 @@ def _inputs(pixels, views, count, distortion, generator, side=19):
 
     points = torch.tensor([-1.5, -1.0, 3.0]) + torch.tensor([3.0, 2.0, 1.5]) * uniform(pixels, 3)
     eyes = (torch.tensor([0.07, 0.02, 0.3]) + 0.1 * uniform(1, 3)).expand(pixels, 3).contiguous()
-    pictures = torch.randint(256, (views, side, side + 2, 3), generator=generator).byte()
+    pictures = torch.randint(256, (views, side, side + 2, 3 + views % 2), generator=generator).byte()
     depths = 3 + 2 * uniform(views, 6, 8)
     depths[uniform(views, 6, 8) < 0.1] = 0
     sizes = torch.tensor([[side + 2, side, 8, 6]]).repeat(views, 1)

@@ -4,10 +4,11 @@ import numpy as np
 from numba import njit, prange
 
 from .._operation import empty
-from . import BEHIND_DEPTH, MIN_PENALTY, UNSEEN
+from . import BEHIND_DEPTH, MIN_PENALTY, NOTHING, UNSEEN
 
 CHUNK = 1024  # points of a task
-MIN_DEPTH, TINY, NEVER = np.float32(BEHIND_DEPTH), np.float32(MIN_PENALTY), np.float32(UNSEEN)
+MIN_DEPTH, TINY = np.float32(BEHIND_DEPTH), np.float32(MIN_PENALTY)
+NEVER, NO_SURFACE = np.float32(UNSEEN), np.float32(NOTHING)
 ZERO, HALF, ONE, TWO, BYTE = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2), np.float32(1 / 255)
 FAST = {"fastmath": True, "error_model": "numpy"}
 
@@ -45,7 +46,7 @@ def _gap(depths, n, u, v, width, height, away):
         for column in (left, min(left + 1, width - 1)):
             t = depths[n, row, column]
             if t > ZERO:
-                best = min(best, abs(away - t))
+                best = min(best, abs(away - t) if t < NO_SURFACE else ZERO)
     return best
 
 
@@ -60,7 +61,7 @@ def _add_colour(pictures, n, u, v, width, height, weight, out, i):
     y -= np.float32(top)
     weight *= BYTE
     a, b, c, d = (ONE - y) * (ONE - x), (ONE - y) * x, y * (ONE - x), y * x
-    for k in range(3):
+    for k in range(pictures.shape[3]):
         value = a * np.float32(pictures[n, top, left, k]) + b * np.float32(pictures[n, top, right, k])
         value += c * np.float32(pictures[n, below, left, k]) + d * np.float32(pictures[n, below, right, k])
         out[i, k] += weight * value
@@ -116,7 +117,7 @@ def _blend(
                     places[k, 0], places[k, 1] = u, v
             worst = max(penalties[last], TINY) if count < views else NEVER
             total, most = ZERO, ZERO
-            rgb[i, 0] = rgb[i, 1] = rgb[i, 2] = ZERO
+            rgb[i] = ZERO
             even = penalties[0] < NEVER and penalties[0] >= worst
             for k in range(last + (1 if even else 0)):
                 if penalties[k] >= NEVER:
@@ -128,7 +129,7 @@ def _blend(
                     total += w
                     most = max(most, shares[k])
             if total > ZERO:
-                for k in range(3):
+                for k in range(rgb.shape[1]):
                     rgb[i, k] /= total
             seen[i] = most
 
@@ -137,7 +138,7 @@ def run(
     points, eyes, focal, pictures, depths, sizes, poses, lenses, count, resolution_weight, hidden_weight, tolerance,
     border,
 ):  # fmt: skip
-    rgb, seen = empty(len(points), 3), empty(len(points))
+    rgb, seen = empty(len(points), pictures.shape[3]), empty(len(points))
     centres = -(poses[:, :, :3].mT @ poses[:, :, 3:])[..., 0]
     inverse_focal = 1 / (lenses[:, 0] * lenses[:, 1]).sqrt()
     first = (x.contiguous().numpy() for x in (points, eyes))

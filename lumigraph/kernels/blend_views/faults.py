@@ -6,6 +6,7 @@ FAULTS = {
     "a point behind is seen": ("cpu", "_place", "if z <= MIN_DEPTH", "if z == ZERO"),
     "a lens without end": ("cpu", "_place", "s > lenses[n, 12] * lenses[n, 12]", "s < ZERO"),
     "hidden points count": ("cpu", "_blend", "ONE + hidden_weight * gap", "ONE"),
+    "edges count as hidden": ("cpu", "_gap", "if t < NO_SURFACE else ZERO", "if t > ZERO else ZERO"),
     "resolution forgotten": ("cpu", "_blend", "+ resolution_weight * coarse", "+ ZERO * coarse"),
     "weights that jump": ("cpu", "_blend", "(ONE - penalties[k] / worst) / (", "ONE / ("),
     "borders count in full": ("cpu", "_blend", "penalty, min(share, ONE), n", "penalty, ONE, n"),

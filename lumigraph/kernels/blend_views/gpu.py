@@ -6,9 +6,9 @@ import triton.language as tl
 
 from .._gpu import blocks, launch
 from .._operation import empty
-from . import BEHIND_DEPTH, MIN_PENALTY, UNSEEN
+from . import BEHIND_DEPTH, MIN_PENALTY, NOTHING, UNSEEN
 
-MIN_DEPTH, NEVER = tl.constexpr(BEHIND_DEPTH), tl.constexpr(UNSEEN)
+MIN_DEPTH, NO_SURFACE, NEVER = tl.constexpr(BEHIND_DEPTH), tl.constexpr(NOTHING), tl.constexpr(UNSEEN)
 BLOCK = tl.constexpr(128)
 
 
@@ -29,7 +29,7 @@ def _between(u, side):
 @triton.jit
 def _nearer(depth, at, away, gap, here):
     t = tl.load(depth + at, mask=here, other=0.0)
-    return tl.where(here & (t > 0), tl.minimum(gap, tl.abs(away - t)), gap)
+    return tl.where(here & (t > 0), tl.minimum(gap, tl.where(t < NO_SURFACE, tl.abs(away - t), 0.0)), gap)
 
 
 @triton.jit(do_not_specialize=["count", "views", "depth_rows", "depth_columns"])
@@ -103,9 +103,9 @@ def _penalties(
     tl.store(places + 2 * at + 1, v, mask=there)
 
 
-@triton.jit(do_not_specialize=["count", "views", "rows", "columns", "chosen_count"])
+@triton.jit(do_not_specialize=["count", "views", "rows", "columns", "channels", "chosen_count"])
 def _colours(
-    pictures, sizes, chosen, weights, places, rgb, count, views, rows, columns, chosen_count,
+    pictures, sizes, chosen, weights, places, rgb, count, views, rows, columns, channels, chosen_count,
 ):  # fmt: skip
     i, channel = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK), tl.program_id(1)
     here = i < count
@@ -118,14 +118,14 @@ def _colours(
         place = places + 2 * (i * views + n)
         left, right, x = _between(tl.load(place, mask=counts, other=0.5), width)
         top, below, y = _between(tl.load(place + 1, mask=counts, other=0.5), height)
-        picture = pictures + 3 * n * rows * columns + channel
-        a = tl.load(picture + 3 * (top * columns + left), mask=counts, other=0).to(tl.float32)
-        b = tl.load(picture + 3 * (top * columns + right), mask=counts, other=0).to(tl.float32)
-        c = tl.load(picture + 3 * (below * columns + left), mask=counts, other=0).to(tl.float32)
-        d = tl.load(picture + 3 * (below * columns + right), mask=counts, other=0).to(tl.float32)
+        picture = pictures + channels * n * rows * columns + channel
+        a = tl.load(picture + channels * (top * columns + left), mask=counts, other=0).to(tl.float32)
+        b = tl.load(picture + channels * (top * columns + right), mask=counts, other=0).to(tl.float32)
+        c = tl.load(picture + channels * (below * columns + left), mask=counts, other=0).to(tl.float32)
+        d = tl.load(picture + channels * (below * columns + right), mask=counts, other=0).to(tl.float32)
         value += weight * ((1 - y) * ((1 - x) * a + x * b) + y * ((1 - x) * c + x * d))
         total += weight
-    tl.store(rgb + 3 * i + channel, value / (255 * tl.maximum(total, 1e-12)), mask=here)
+    tl.store(rgb + channels * i + channel, value / (255 * tl.maximum(total, 1e-12)), mask=here)
 
 
 def run(
@@ -134,7 +134,7 @@ def run(
 ):  # fmt: skip
     pixels, views, device = len(points), len(pictures), points.device
     penalties, shares = (empty(pixels, views, device=device) for _ in range(2))
-    places, rgb = empty(pixels, views, 2, device=device), empty(pixels, 3, device=device)
+    places, rgb = empty(pixels, views, 2, device=device), empty(pixels, pictures.shape[3], device=device)
     sizes = sizes.long()
     given = (x.contiguous() for x in (points, eyes, depths, sizes, poses, lenses))
     weights = resolution_weight, hidden_weight, tolerance, border
@@ -150,5 +150,14 @@ def run(
     even = (weight.sum(1, keepdim=True) == 0) & (least < UNSEEN)
     weight = torch.where(even, share, weight).contiguous()
     sources = pictures.contiguous(), sizes.contiguous(), chosen.contiguous(), weight, places
-    launch(_colours, (blocks(pixels, BLOCK), 3), *sources, rgb, pixels, views, *pictures.shape[1:3], chosen.shape[1])
+    launch(
+        _colours,
+        (blocks(pixels, BLOCK), pictures.shape[3]),
+        *sources,
+        rgb,
+        pixels,
+        views,
+        *pictures.shape[1:],
+        chosen.shape[1],
+    )
     return rgb, torch.where(weight > 0, share, torch.zeros_like(share)).amax(1)

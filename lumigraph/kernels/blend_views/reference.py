@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from . import BEHIND_DEPTH, MIN_PENALTY, UNSEEN
+from . import BEHIND_DEPTH, MIN_PENALTY, NOTHING, UNSEEN
 
 
 def run(
@@ -20,7 +20,8 @@ def run(
         share = torch.stack([u, size[0] - u, v, size[1] - v], -1) / size[[0, 0, 1, 1]]
         share = torch.where(valid, (share.amin(-1) / border).clamp(0, 1), 0)
         t = torch.stack(corners(depth, u / size[0] * size[2], v / size[1] * size[3], size[2:])[0], -1)
-        gap = torch.where(t > 0, (away[:, None] - t).abs(), UNSEEN).amin(-1) / away.clamp_min(BEHIND_DEPTH)
+        apart = torch.where(t < NOTHING, (away[:, None] - t).abs(), 0)
+        gap = torch.where(t > 0, apart, UNSEEN).amin(-1) / away.clamp_min(BEHIND_DEPTH)
         share = torch.where((t > 0).any(-1), share, 0)
         chord = (wanted - torch.nn.functional.normalize(points - centre, dim=-1)).norm(dim=-1)
         coarse = (away * focal / (own * (lens[0] * lens[1]).sqrt()) - 1).clamp_min(0)
