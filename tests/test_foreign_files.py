@@ -67,6 +67,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),
     "eval, pictures": ("eval ball --scene photographs --save-images", ("ball/eval/ball_4.png",)),
     "explain ray": ("explain ray ball --output ray.svg", ("ray.svg", "ray.json")),
+    "explain lightfield": (
+        "explain lightfield ball --size 32 --output told2",
+        ("told2/lightfield.png", "told2/lightfield.svg", "told2/lightfield.json"),
+    ),
     "explain activation": ("explain activation --steps 2 --output edge.png", ("edge.png",)),
     "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),

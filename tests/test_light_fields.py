@@ -16,7 +16,7 @@ from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.components.image_based.depth import completed, depth_camera
 from lumigraph.components.image_based.surface import consensus
-from lumigraph.components.image_based.warping import pushed, soft_splat
+from lumigraph.components.image_based.warping import behind, soft_splat
 from lumigraph.export.light_field import grid_of, quilt, write_light_field
 from lumigraph.methods.lumigraph import Lumigraph
 from lumigraph.methods.view_interpolation import ViewInterpolation
@@ -63,37 +63,44 @@ def test_weights_are_continuous_in_the_camera(photographed):
     assert float(moves.max()) < 6 * float(moves.mean()) + 1e-3
 
 
-def test_weights_of_one_point():
-    """Buehler's equation: two photographs of three, the third's penalty the threshold."""
-    angles = [0.1, 0.2, 0.4]
-    positions = torch.tensor([[math.tan(a), 0.0, 0.0] for a in angles])
+def three_photographs(angles: list[float]) -> tuple:
+    """A red, a green and a blue photograph that see a point at angles from the new camera's ray."""
     poses = torch.eye(3, 4).repeat(3, 1, 1)
-    poses[:, :, 3] = -positions
+    poses[:, 0, 3] = -torch.tensor(angles).tan()
     pictures = torch.zeros(3, 4, 4, 3, dtype=torch.uint8)
     for i in range(3):
         pictures[i, ..., i] = 255
     lenses = torch.zeros(3, 13)
     lenses[:, :2], lenses[:, 2:4], lenses[:, 12] = 1.0, 2.0, 50.0
+    depths = (1 / torch.tensor(angles).cos())[:, None, None].expand(3, 4, 4).clone()
     point, eye = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3)
-    sizes, depths = torch.full((3, 4), 4), torch.full((3, 4, 4), 1.0)
-    found, seen = kernels.blend_views(point, eye, 1.0, pictures, depths, sizes, poses, lenses, 2, 0.0, 0.0, 1.0, 0.01)
+    return point, eye, 1.0, pictures, depths, torch.full((3, 4), 4), poses, lenses
+
+
+def test_weights_of_one_point():
+    """Buehler's equation: two photographs of three, the third's penalty the threshold."""
+    angles = [0.1, 0.2, 0.4]
+    found, seen = kernels.blend_views(*three_photographs(angles), 2, 0.0, 0.0, 1.0, 0.01)
     penalty = [2 * math.sin(a / 2) for a in angles]
     weights = torch.tensor([(1 - p / penalty[2]) / p for p in penalty[:2]])
     torch.testing.assert_close(found[0, :2], weights / weights.sum(), atol=1e-4, rtol=0)
     assert float(found[0, 2]) == 0 and float(seen) == 1
 
 
-def test_hidden_photographs_do_not_count(photographed):
-    """A point on the far side of the ball has the colour of photographs that see it."""
-    scene, tables = tiny.scene(), photographed.views.tables
-    camera = scene.cameras[4]
-    shown = photographed.render(camera)
-    truth = scene.photograph(4).before(scene.frame.background)
-    inner = (tiny.ball(camera.pose[0])[0].isfinite()) & (shown.opacity > 0)
-    assert float((shown.rgb - truth)[inner].abs().mean()) < 0.03
-    away = shown.depth[inner] - tiny.ball(camera.pose[0])[0][inner]
-    assert float(away.abs().median()) < 0.02
-    assert len(tables.grids) <= 4
+def test_hidden_photographs_do_not_count():
+    """The nearest photograph sees another surface before the point, so the next one gives the colour."""
+    given = list(three_photographs([0.1, 0.2, 0.4]))
+    given[4][0] = 0.5
+    found, _ = kernels.blend_views(*given, 1, 0.0, 1e4, 0.01, 0.01)
+    torch.testing.assert_close(found, torch.tensor([[0.0, 1.0, 0.0]]))
+
+
+def test_surfaces_are_where_the_ball_is(photographed):
+    camera = tiny.scene().cameras[4]
+    shown, truth = photographed.render(camera).depth, tiny.ball(camera.pose[0])[0]
+    both = truth.isfinite() & shown.isfinite()
+    assert float((shown - truth)[both].abs().median()) < 0.02
+    assert len(photographed.views.tables.grids) <= 4  # of the photographs near it alone
 
 
 def test_the_nearest_supported_surface_is_seen():
@@ -127,8 +134,9 @@ def test_soft_splatting_shows_the_nearer_point():
 
 def test_holes_take_the_background():
     values = torch.cat([torch.full((8, 3), 1.0), torch.zeros(8, 2), torch.full((8, 3), 4.0)], 1)
-    filled = pushed(values[..., None], (values > 0) * values.square())[..., 0]
-    assert float(filled[:, 3:5].min()) > 2.8 and torch.equal(filled[:, :3], values[:, :3])
+    filled = behind(values[..., None], values, values > 0)[..., 0]
+    torch.testing.assert_close(filled[:, 3:], torch.full((8, 5), 4.0))
+    assert torch.equal(filled[:, :3], values[:, :3])
 
 
 def test_a_sheared_camera_keeps_its_focal_plane():

@@ -410,6 +410,12 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "laplacian_weight": 0.0,
         "normal_weight": 0.0,
     },
+    "lumigraph": {  # Buehler 2001 gives no numbers; Gortler 1996, sec. 3.4: the four cameras around a ray
+        "blended_views": 4,
+    },
+    "view-interpolation": {  # Chen and Williams 1993: between two photographs
+        "warped_views": 2,
+    },
     "tsdf-fusion": {  # niessner/VoxelHashing's parameters, as in theNded/MeshHashing, include/hash_param.h
         "voxel_size": 0.004,
         "truncation": 5.0,  # 0.02 m

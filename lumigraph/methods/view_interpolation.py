@@ -16,8 +16,9 @@ from torch.nn.functional import grid_sample, interpolate, normalize
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..components.image_based.depth import cosines, shape
-from ..components.image_based.kept_views import KeptViews, focal_length
-from ..components.image_based.warping import pushed, soft_splat
+from ..components.image_based.kept_views import NOTHING, KeptViews, continued, focal_length
+from ..components.image_based.surface import consensus
+from ..components.image_based.warping import behind, pushed, soft_splat
 from ..datasets.scene import Frame, Photograph, Scene
 from ..files.ranges import NonNegative, Pixels, Positive, PositiveShare, Seed, between
 from ..geometry import to_matrix, to_quaternion
@@ -107,11 +108,11 @@ class ViewInterpolation(Method):
         chosen = tables.nearest(camera, c.warped_views)
         layers = [self._splatted(i, camera) for i in chosen]
         apart = (tables.cameras.position[chosen] - camera.position).norm(dim=-1) / tables.middle
-        near = (1e-3 + apart) ** -c.nearness
+        near = ((1e-3 + apart.min()) / (1e-3 + apart)) ** c.nearness
         rgb, depth, cover = (torch.stack(x) for x in zip(*layers, strict=True))
-        nearest = torch.where(cover > MIN_COVER, depth, torch.inf).amin(0)
-        same = (cover > MIN_COVER) & (depth < (1 + c.agreement) * nearest)
-        weight = near[:, None, None] * cover.clamp_max(1) * same
+        weight = near[:, None, None] * cover.clamp_max(1) * (cover > MIN_COVER)
+        agreed = consensus(depth, weight)
+        weight = weight * ((depth - agreed).abs() < c.agreement * agreed)
         total = weight.sum(0)
         seen = total > 0
         found = (weight[..., None] * rgb).sum(0) / total.clamp_min(1e-12)[..., None]
@@ -119,32 +120,36 @@ class ViewInterpolation(Method):
         return self._closed(found, away, seen)
 
     def _splatted(self, i: int, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-        """One photograph's colours, distances and weights in a new camera."""
+        """One photograph's colours (and alpha), distances and cover in a new camera."""
         tables, own = self.views.tables, self.views.tables.cameras[i]
         height, width = shape(own)
         rows, columns = tables.sizes[i, [3, 2]].tolist()
-        inverse = 1 / tables.depths[i, :rows, :columns].clamp_min(1e-6)
-        away = enlarged(inverse, (height, width)).reciprocal().flatten()
+        depth = tables.depths[i, :rows, :columns]
+        depth = continued(torch.where(depth < NOTHING, depth, torch.inf))
+        away = enlarged(1 / depth.clamp_min(1e-6), (height, width)).reciprocal().flatten()
         rays = own.rays(own.pixels())
-        usable = (away > 1e-5) & (away < 1e6)
+        usable = (away > 1e-5) & away.isfinite()
         points = rays.at(away)[usable]
-        rgb = (tables.pictures[i, :height, :width, :3].reshape(-1, 3)[usable].float()) / 255
+        colours = tables.pictures[i, :height, :width].flatten(0, 1)[usable].float() / 255
         places, valid = camera.project(points)
         distance = (points - camera.position).norm(dim=-1)
         footprint = away[usable] * focal_length(camera) / (distance * focal_length(own))
-        values = torch.cat([rgb, distance[:, None]], -1)[valid]
+        values = torch.cat([distance[:, None], colours], -1)[valid]
         importance = -self.config.occlusion * distance[valid].log()
         found, cover = soft_splat(places[valid], values, importance, shape(camera), float(footprint.median()))
-        return found[..., :3], found[..., 3], cover
+        return found[..., 1:], found[..., 0], cover
 
     def _closed(self, rgb: Tensor, away: Tensor, seen: Tensor) -> Rendering:
         """Fill holes with what is around them, the background first; an object's surroundings stay empty."""
-        if self.frame.has_alpha:
-            rgb = torch.where(seen[..., None], rgb, self.background)
-            return Rendering(rgb, torch.where(seen, away, torch.inf), seen.float())
+        if rgb.shape[-1] > 3:
+            opacity, rgb = (
+                torch.where(seen, rgb[..., 3], 0),
+                torch.where(seen[..., None], rgb[..., :3], self.background),
+            )
+            return Rendering(rgb, torch.where(opacity > 0, away, torch.inf), opacity)
         if not seen.any():
-            return Rendering(self.background.expand_as(rgb).clone(), away + torch.inf, seen.float())
-        filled = pushed(torch.cat([rgb, away[..., None]], -1), seen * away.square())
+            return Rendering(self.background.expand(*seen.shape, 3).clone(), away + torch.inf, seen.float())
+        filled = behind(torch.cat([rgb, away[..., None]], -1), away, seen)
         return Rendering(filled[..., :3].clamp(0, 1), filled[..., 3], torch.ones_like(away))
 
     def _by_flow(self, camera: Camera) -> Rendering:
@@ -228,4 +233,4 @@ def between_poses(a: Float[Tensor, "1 3 4"], b: Float[Tensor, "1 3 4"], share: f
     first, second = to_quaternion(a[:, :, :3]), to_quaternion(b[:, :, :3])
     second = torch.where((first * second).sum(-1, keepdim=True) < 0, -second, second)
     turn = to_matrix(normalize((1 - share) * first + share * second, dim=-1))
-    return torch.cat([turn, ((1 - share) * a + share * b)[:, :, 3:]], -1)
+    return torch.cat([turn.to(a), ((1 - share) * a + share * b)[:, :, 3:]], -1)

@@ -15,7 +15,7 @@ from ...camera import Camera
 from ...camera.lens import OpenCV, Pinhole
 from .depth import shape
 from .kept_views import DepthGrid, KeptViews
-from .warping import pushed
+from .warping import behind
 
 AGREEMENT = 0.03  # of distance, within which two depth maps show one surface
 MIN_SUPPORT = 0.35  # of the best supported surface's, that a nearer one needs to hide it
@@ -57,7 +57,7 @@ def surface_seen(
     depth, known = consensus(distance, weight), weight.sum(0) > 0
     if not known.any():
         return depth + torch.inf, known
-    depth = pushed(depth[..., None], known * depth.square())[..., 0]
+    depth = behind(depth[..., None], depth, known)[..., 0]
     if closed:
         return depth, torch.ones_like(known)
     reach = math.ceil(EDGE_REACH * max(1.0, max(depth.shape) / views.depth_size))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
 MAX_FOOTPRINT = 8  # pixels
+HOLE_RADIUS = 8  # pixels around a place, of which the farther surfaces are background
+BACKGROUND_SHARE = 0.95  # of the farthest distance there, from which on a surface is background
 
 
 def soft_splat(
@@ -56,10 +58,7 @@ def soft_splat(
 def pushed(
     values: Float[Tensor, "height width channel"], weight: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width channel"]:
-    """Fill in values without a weight from coarser and coarser weighted means (pull-push, Gortler 1996, sec. 3.3).
-
-    weight: 0 where nothing is known. Squared distances there make what comes into view beside an edge background
-    """
+    """Fill in values without a weight from coarser and coarser weighted means (pull-push, Gortler 1996, sec. 3.3)."""
     if (weight > 0).all():
         return values
     scale = weight.max().clamp_min(1e-12)
@@ -72,3 +71,16 @@ def pushed(
         known = level[:, -1:] > 0
         filled = torch.where(known, level[:, :-1] / level[:, -1:].clamp_min(1e-12), coarse)
     return filled[0].movedim(0, -1)
+
+
+def behind(
+    values: Float[Tensor, "height width channel"],
+    distance: Float[Tensor, "height width"],
+    known: Bool[Tensor, "height width"],
+) -> Float[Tensor, "height width channel"]:
+    """Fill in unknown values from farther surfaces around them: what comes into view beside an edge is background."""
+    if known.all():
+        return values
+    farthest = max_pool2d((distance * known)[None], 2 * HOLE_RADIUS + 1, 1, HOLE_RADIUS)[0]
+    weight = known * (distance > BACKGROUND_SHARE * farthest)
+    return torch.where(known[..., None], values, pushed(values, weight.float()))
