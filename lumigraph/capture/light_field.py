@@ -39,7 +39,7 @@ DEPTHS = (0.5, 4.0)  # nearest and farthest, in distances of the focal plane
 
 @dataclass(frozen=True)
 class GridAbout:
-    """What a user may say of a light field. plane_distance: in the unit of the files' names, or in cells of a grid"""
+    """Numbers of `lightfield.json`. plane_distance: in the unit of the files' names, or in cells of a grid"""
 
     field_of_view: Annotated[float, between(1, 150)] = 40.0
     plane_distance: Positive | None = None
