@@ -74,15 +74,15 @@ def face(now: Expression):
     yield Object(SoftCapsule(0.055, 0.07), skin, Pose.at(0, -0.41, -0.02, tilt=-18), "nose")
     yield Object(Cylinder(0.19, 0.22, 0.02), skin, Pose.at(0, 0.06, -0.52), "neck")
     yield Object(Ball(0.445), hair, Pose.at(0, 0.09, 0.17), "hair")
-    for side in (-1, 1):
-        yield Object(Ball(0.085), skin, Pose.at(0.41 * side, 0.03, 0.0), "ears")
+    for side, name in ((-1, "left"), (1, "right")):
+        yield Object(Ball(0.085), skin, Pose.at(0.41 * side, 0.03, 0.0), f"{name} ear")
         x, y, z = 0.15 * side, -0.325, 0.09
-        yield Object(Ball(0.078), white, Pose.at(x, y, z), "eyes")
+        yield Object(Ball(0.078), white, Pose.at(x, y, z), f"{name} eye")
         aside = 0.35 * now.gaze
         pupil = Pose.at(x + 0.046 * math.sin(aside), y - 0.046 * math.cos(aside), z)
-        yield Object(Ball(0.043), iris, pupil, "irises")
+        yield Object(Ball(0.043), iris, pupil, f"{name} iris")
         brow = Pose.at(x, -0.362, 0.20 + 0.035 * now.brow, tilt=-10) @ across
-        yield Object(SoftCapsule(0.022, 0.075, -3.0 + 1.5 * now.brow), hair, brow, "brows")
+        yield Object(SoftCapsule(0.022, 0.075, -3.0 + 1.5 * now.brow), hair, brow, f"{name} brow")
     yield Object(Torus(width, 0.026), lip, Pose.at(0, -0.40, lips, tilt=90), "mouth")
     yield Object(Ball(width), inside, Pose.at(0, -0.37, lips), "inside")
     smile = Pose.at(0, -0.415, lips + 0.02 * now.smile) @ across
