@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -14,9 +15,12 @@ from lumigraph import kernels
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
+from lumigraph.capture.views import with_fewer_views
 from lumigraph.components.image_based.depth import completed, depth_camera
 from lumigraph.components.image_based.surface import consensus
 from lumigraph.components.image_based.warping import behind, soft_splat
+from lumigraph.datasets.images import ImageStore
+from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.export.light_field import grid_of, quilt, write_light_field
 from lumigraph.methods.lumigraph import Lumigraph
 from lumigraph.methods.view_interpolation import ViewInterpolation
@@ -184,3 +188,25 @@ def test_a_light_field_opens_as_a_scene(photographed, tmp_path):
     assert (steps[1] - steps[0]).norm() == pytest.approx(0.2) and (steps[2] - steps[0]).norm() == pytest.approx(0.2)
     sheet = quilt(photographed, camera, 2, 2, 0.1, 3.0)
     assert sheet.size == (2 * tiny.SIZE, 2 * tiny.SIZE)
+
+
+@pytest.mark.parametrize("fault", ["plain walls", "one place"])
+def test_photographs_without_depth_are_named(fault):
+    """A warning, and a plane instead: pictures are shown all the same."""
+    scene = tiny.scene()
+    if fault == "plain walls":
+        white = [np.full((tiny.SIZE, tiny.SIZE, 3), 200, np.uint8) for _ in scene.names]
+        scene = replace(scene, images=ImageStore.from_arrays(white), frame=replace(scene.frame, has_alpha=False))
+    else:
+        cameras = scene.cameras[torch.zeros(len(scene.names), dtype=torch.int64)]
+        scene = replace(scene, cameras=replace(cameras, image_index=torch.arange(len(cameras))))
+    method = Lumigraph(scene.frame, replace(Lumigraph.smallest(), geometry="stereo")).eval()
+    with pytest.warns(LumigraphWarning, match=r"no depth in .*; a plane stands for the scene"):
+        method.begin(scene)
+    assert method.render(scene.cameras[0]).rgb.isfinite().all()
+
+
+def test_a_single_photograph_needs_a_plane():
+    scene = with_fewer_views(tiny.scene(), 1)
+    with pytest.raises(LumigraphError, match="stereo needs two"):
+        Lumigraph(scene.frame, replace(Lumigraph.smallest(), geometry="stereo")).begin(scene)
