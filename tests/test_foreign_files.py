@@ -41,6 +41,11 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "render, a run's own name": ("render ball --frames 2 --size 16 --output ball.gif", ("ball.gif", "ball.json")),
     "export web": ("export web gs page.html", ("page.html",)),
+    "export lightfield": ("export lightfield ball grid --grid 2 --size 16", ("grid/",)),
+    "export lightfield, a quilt": (
+        "export lightfield ball q.png --quilt 2 2 --size 16",
+        ("q_qs2x2a1.00.png",),
+    ),
     "export octree": ("export octree octree o.npz", ("o.npz",)),
     "export points": ("export points ball p.ply", ("p.ply",)),
     "export splats": ("export splats gs s.spz", ("s.spz",)),
@@ -62,6 +67,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),
     "eval, pictures": ("eval ball --scene photographs --save-images", ("ball/eval/ball_4.png",)),
     "explain ray": ("explain ray ball --output ray.svg", ("ray.svg", "ray.json")),
+    "explain lightfield": (
+        "explain lightfield ball --size 32 --output told2",
+        ("told2/lightfield.png", "told2/lightfield.svg", "told2/lightfield.json"),
+    ),
     "explain activation": ("explain activation --steps 2 --output edge.png", ("edge.png",)),
     "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),

@@ -430,6 +430,21 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "laplacian_weight": 0.0,
         "normal_weight": 0.0,
     },
+    "deep-appearance": {  # Lombardi 2018, sections 4.2 and 4.3, from memory
+        "texture_log2": 10,
+        "code": 128,
+        "view_features": 8,
+        "mesh_width": 256,
+        "divergence_weight": 0.01,
+        "textures_per_step": 16,
+        "learning_rate": 1e-3,
+    },
+    "lumigraph": {  # Buehler 2001 gives no numbers; Gortler 1996, sec. 3.4: the four cameras around a ray
+        "blended_views": 4,
+    },
+    "view-interpolation": {  # Chen and Williams 1993: between two photographs
+        "warped_views": 2,
+    },
     "tsdf-fusion": {  # niessner/VoxelHashing's parameters, as in theNded/MeshHashing, include/hash_param.h
         "voxel_size": 0.004,
         "truncation": 5.0,  # 0.02 m

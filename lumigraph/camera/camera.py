@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -121,6 +122,15 @@ class Camera:
         position = self.position @ similarity[:3, :3].mT + similarity[:3, 3]
         pose = torch.cat([rotation, position[:, :, None]], -1)
         return replace(self, pose=pose, lens=self.lens.enlarged(float(scale)))
+
+    def sheared(self, right: float, down: float, focus: float) -> Camera:
+        """The cameras moved aside in their own planes, as on a two-plane light field's: pictures move along, so that
+        all at the depth `focus` (scene units, along the axis) stays at its pixels. For lenses with a focal length."""
+        lens: Any = self.lens
+        aside = torch.tensor([right, down], dtype=self.pose.dtype, device=self.pose.device)
+        position = self.position + (self.pose[:, :, :2] @ aside)
+        pose = torch.cat([self.pose[:, :, :3], position[:, :, None]], -1)
+        return replace(self, pose=pose, lens=replace(lens, centre=lens.centre + lens.focal * aside / focus))
 
     @staticmethod
     def cat(cameras: Sequence[Camera]) -> Camera:

@@ -132,6 +132,53 @@ class ExplainFitting:
 
 
 @dataclass(frozen=True)
+class ExplainLightField:
+    """Render a row of cameras: its epipolar-plane image, spectrum, and cameras needed against layers of depth.
+
+    Views are interpolated between fewer and fewer cameras, with depth in fewer and fewer layers. A chart shows the
+    cameras that were needed beside the bound of Chai et al. (2000).
+    """
+
+    run_folder: RunOption
+    output: Annotated[Path | None, option("FOLDER", "RUN/lightfield")] = None
+    """Folder of lightfield.png, lightfield.svg and lightfield.json."""
+    overwrite: Overwrite = False
+    view: Annotated[str, option("NAME_OR_NUMBER")] = "0"
+    """Photograph of the split test whose camera is in the middle of the row."""
+    span: Annotated[Annotated[float, between(0.001, 2)], option("SHARE")] = 0.2
+    """Length of the row, in distances of the focal plane; longer needs more cameras."""
+    size: Annotated[Annotated[int, between(32, 1024)], option("PIXELS")] = 192
+    """Longer side of each picture; larger needs more cameras, and takes longer."""
+    settings: Set = ()
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        from ..explain.light_field import draw, measure, seen_along
+        from ..export.light_field import focal_distance
+        from ..files import claim
+        from ..run import Run
+
+        run = Run(self.run_folder)
+        folder = self.output or run.folder / "lightfield"
+        for file in ("lightfield.png", "lightfield.svg", "lightfield.json"):
+            claim(folder / file, "figure", self.overwrite)
+        name, camera = find_view(run, "test", self.view)
+        method = controlled(run, run.method(choose_device(self.device)), self.settings)
+        camera = camera.resized(self.size / int(camera.size.max())).to(method.device)
+        focus = focal_distance(method, camera)
+        line = seen_along(method, camera, self.span * focus, focus)
+        found = measure(line)
+        about = draw(folder, f"{run.method_name}, {name}", line, found, int(camera.size[0, 1]) // 2)
+        rows = {
+            f"{n} layer{'s' * (n > 1)}": f"{'no number' if need is None else f'{need:.1f}'} of cameras, "
+            f"bound {bound:.1f}"
+            for n, need, bound in zip(found.layers, about["needed"], about["bound"], strict=True)
+        }
+        show({"quality": f"{found.target:.1f} dB", **rows, "files": str(folder)})
+        return 0
+
+
+@dataclass(frozen=True)
 class ExplainRay:
     """Draw density, transmittance, weights, samples and accumulated colour along the ray of a pixel.
 
@@ -214,6 +261,7 @@ What = (
     Annotated[ExplainActivation, subcommand("activation")]
     | Annotated[ExplainEncodings, subcommand("encodings")]
     | Annotated[ExplainFitting, subcommand("fitting")]
+    | Annotated[ExplainLightField, subcommand("lightfield")]
     | Annotated[ExplainRay, subcommand("ray")]
 )
 

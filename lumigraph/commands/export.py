@@ -326,6 +326,75 @@ class ExportPoints:
         return 0
 
 
+GridSide = Annotated[int, between(2, 64)]
+
+
+@dataclass(frozen=True)
+class ExportLightField:
+    """Render a two-plane light field: an n x n grid of pictures around a camera, sheared to a common focal plane.
+
+    A folder: pictures named as in the Stanford light field archive (out_ROW_COLUMN_Y_X.png) and transforms.json, by
+    which it opens as a scene. A name that ends in .png: one quilt of a row of cameras, as light-field displays read it.
+    """
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FOLDER_OR_FILE")]
+    """The new folder; or a name that ends in .png, to which the quilt's layout is added (name_qs8x6a0.75.png)."""
+    grid: Annotated[GridSide, option("N")] = 9
+    """Pictures along each side of the grid; more are smoother between them."""
+    quilt: Annotated[tuple[GridSide, GridSide], option("COLUMNS ROWS")] = (8, 6)
+    """Layout of a quilt, which has as many cameras."""
+    span: Annotated[Positive | None, option("LENGTH", "a tenth of the focal distance")] = None
+    """Width of the grid, in units of the photographs' frame; larger gives more parallax."""
+    focus: Annotated[Positive | None, option("LENGTH", "the median depth of the view")] = None
+    """Distance of the focal plane, which is at the same pixels in all pictures, in units of the photographs' frame."""
+    view: Annotated[str | None, option("NAME_OR_NUMBER", "the middle one")] = None
+    """Photograph whose camera is in the middle of the grid."""
+    size: Annotated[Pixels, option("PIXELS")] = 512
+    """Longer side of each picture."""
+    overwrite: Overwrite = False
+    settings: Set = ()
+    device: DeviceOption = "auto"
+
+    def run(self) -> int:
+        from ..export.light_field import SPAN, focal_distance, quilt, write_light_field
+        from ..figures import save_picture
+        from ..files import claim_folder
+        from ..paths import Surroundings
+
+        flat = self.output.suffix.lower() == ".png"
+        if not flat:
+            claim_folder(self.output, "light field")
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        unit, train = opened.frame.to_export.scale, cameras["train"]
+        number = Surroundings(train, opened.frame).middle if self.view is None else self._number(opened)
+        camera = train[number]
+        camera = camera.resized(self.size / int(camera.size.max())).to(method.device)
+        focus = self.focus / unit if self.focus else focal_distance(method, camera)
+        span = self.span / unit if self.span else SPAN * focus
+        rows = {"focal plane": f"{focus * unit:.4g} away", "span": f"{span * unit:.4g}"}
+        if flat:
+            columns, lines = self.quilt
+            width, height = camera.size[0].tolist()
+            output = self.output.with_name(f"{self.output.stem}_qs{columns}x{lines}a{width / height:.2f}.png")
+            claim(output, "quilt", self.overwrite, [self.source])
+            spacing = span / (columns * lines - 1)
+            save_picture(output, quilt(method, camera, columns, lines, spacing, focus), "quilt")
+            show({"quilt": str(output), "views": str(columns * lines), **rows})
+            return 0
+        write_light_field(self.output, method, camera, self.grid, span / (self.grid - 1), focus, opened.frame)
+        show({"light field": str(self.output), "pictures": f"{self.grid} x {self.grid}", **rows})
+        return 0
+
+    def _number(self, opened: Any) -> int:
+        """Row of the photograph of --view among those to learn from."""
+        from .explain import find_view
+
+        names = opened.view_names()["train"]
+        name, _ = find_view(opened, "train", self.view or "0")
+        return names.index(name)
+
+
 Place = Annotated[
     tuple[Coordinate, Coordinate, Coordinate] | None, option("X Y Z", "the position of the middle camera", name="from")
 ]
@@ -491,6 +560,7 @@ class ExportCollision(ExportMesh):
 
 What = (
     Annotated[ExportCollision, subcommand("collision")]
+    | Annotated[ExportLightField, subcommand("lightfield")]
     | Annotated[ExportMesh, subcommand("mesh")]
     | Annotated[ExportOctree, subcommand("octree")]
     | Annotated[ExportPanorama, subcommand("panorama")]

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -228,7 +228,7 @@ def warped(warp: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Tensor,
     return u / s, v / s, front
 
 
-def padded(maps: Sequence[Float[Tensor, "_ _ *channels"]]) -> Float[Tensor, "map height width *channels"]:
+def padded(maps: Sequence[Shaped[Tensor, "_ _ *channels"]]) -> Shaped[Tensor, "map height width *channels"]:
     """Maps of any sizes as one tensor, zero beyond each."""
     height, width = (max(one.shape[k] for one in maps) for k in (0, 1))
     out = maps[0].new_zeros(len(maps), height, width, *maps[0].shape[2:])

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ..camera import Camera
 from ..capture.transforms import OPENCV_FROM_OPENGL
 from ..datasets.scene import Scene
 from ..depth_maps import DepthMap
@@ -44,15 +45,16 @@ def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap]) -> None:
             levels = (seen.depth.nan_to_num(0, 0, 0) / unit).round().clamp(0, MAX_LEVEL).numpy()
             Image.fromarray(levels.astype(np.uint16)).save(partial / "depth" / name)
             to_image(seen.rgb).save(partial / "images" / name)
-            frames.append({"file_path": f"images/{name}", "depth_file_path": f"depth/{name}", **about(seen, to_source)})
+            frames.append(
+                {"file_path": f"images/{name}", "depth_file_path": f"depth/{name}", **about(seen.camera, to_source)}
+            )
         scale = {"depth_unit_scale_factor": unit * to_source.scale, "is_euclidean_depth": True}
         write_json(partial / "transforms.json", {"camera_model": "PINHOLE", **scale, "frames": frames}, ours=True)
         save_picture(partial / SHEET, depth_sheet(scene, maps), ours=True)
 
 
-def about(seen: DepthMap, to_source: Any) -> dict[str, Any]:
-    """Size, lens and pose of a depth map's camera, as transforms.json has them."""
-    camera = seen.camera
+def about(camera: Camera, to_source: Any) -> dict[str, Any]:
+    """Size, lens and pose of a pinhole camera, as transforms.json has them."""
     pose = np.eye(4)
     pose[:3, :3] = to_source.directions(camera.pose[0, :, :3].T.double()).T.numpy() * OPENCV_FROM_OPENGL
     pose[:3, 3] = to_source.points(camera.position.double())[0].numpy()

@@ -27,7 +27,8 @@ Sum = tuple[int, str]  # bytes, SHA-256
 Kind = Literal[
     "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
     "page", "splats", "octree", "atlas", "points", "mesh", "panorama", "comparison",
-    "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "canonical", "depth maps", "file",
+    "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "canonical", "depth maps",
+    "light field", "quilt", "file",
 ]  # fmt: skip
 
 

@@ -17,6 +17,7 @@ READERS = (
     "phones",
     "colmap",
     "llff",
+    "light_field",
 )
 NAMES = tuple(name.replace("_", "-") for name in READERS)  # what a user types
 LISTED = f"{', '.join(NAMES[:-1])} or {NAMES[-1]}"

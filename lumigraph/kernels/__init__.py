@@ -6,6 +6,7 @@ from ._operation import using as using
 from .antialias import antialias as antialias
 from .antialias import neighbours as neighbours
 from .band_blocks import band_blocks as band_blocks
+from .blend_views import blend_views as blend_views
 from .block_hash import block_hash as block_hash
 from .block_march import Blocks as Blocks
 from .block_march import block_march as block_march

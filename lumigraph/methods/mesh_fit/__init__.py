@@ -18,6 +18,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...components.fields.level_set import level_set
+from ...components.fields.mesh_picture import Picture, picture
 from ...components.sampling.occupancy import visual_hull
 from ...components.training.schedules import falling
 from ...datasets.mesh import Mesh
@@ -29,7 +30,6 @@ from ...method import Method
 from ...method.capabilities import HasMesh, can, needs
 from ...system.work import at_work
 from .optimizer import UniformAdam
-from .picture import Picture, picture
 from .surface import MeshSurface, face_normals, remeshed, vertex_normals
 
 

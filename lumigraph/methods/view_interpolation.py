@@ -1,0 +1,236 @@
+"""View interpolation: photographs warped forward by depth or flow (Chen and Williams 1993; Niklaus and Liu 2020)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import grid_sample, interpolate, normalize
+
+from ..camera import Camera
+from ..camera.rays import Rendering
+from ..components.image_based.depth import cosines, shape
+from ..components.image_based.kept_views import NOTHING, KeptViews, continued, focal_length
+from ..components.image_based.surface import consensus
+from ..components.image_based.warping import behind, pushed, soft_splat
+from ..datasets.scene import Frame, Photograph, Scene
+from ..files.ranges import NonNegative, Pixels, Positive, PositiveShare, Seed, between
+from ..geometry import to_matrix, to_quaternion
+from ..method import Descend, Method
+from ..system.work import at_work
+
+STEREO_SHARE = 0.8  # of a budget in seconds, for depth
+MIN_COVER = 0.2  # sum of splatting weights from which on a pixel is covered
+FLOW_DISAGREEMENT = 1.5  # pixels between a flow and the one back, at which a pixel's weight has fallen to 1 / e
+
+
+@dataclass(frozen=True)
+class Config:
+    """Numbers of softmax splatting, whose weight of occlusion is ours; the papers give none for depth."""
+
+    by: Literal["depth", "flow"] = "depth"  # what photographs are warped by
+    geometry: Literal["stereo", "measured"] = "stereo"  # source of depth: multi-view stereo, or a layer `depth`
+    depth_size: Pixels = 400  # longer side of the depth maps; larger: finer edges, slower
+    warped_views: Annotated[int, between(1, 16)] = 2  # photographs warped into a picture; more: fewer holes, slower
+    occlusion: Positive = 80.0  # alpha: sharpness of the choice of the nearer of two surfaces, per relative depth
+    agreement: PositiveShare = 0.04  # of distance, within which photographs show one surface
+    nearness: NonNegative = 2.0  # power of the inverse distance of a photograph in its weight
+    seed: Seed = 0
+
+
+class ViewInterpolation(Method):
+    """Photographs and their depth, or the flow between neighbours; a picture is made of the nearest ones."""
+
+    Config = Config
+    any_lens: ClassVar[bool] = True
+
+    def __init__(self, frame: Frame, config: Any = None):
+        super().__init__(frame, config or Config())
+        self.views = KeptViews(self.config.depth_size)
+        self._flows: dict[tuple[int, int], Tensor] = {}
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """Depth maps of 200 pixels."""
+        return Config(depth_size=200)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Measured depth of a few pixels."""
+        return Config(geometry="measured", depth_size=24)
+
+    # Learning: there is none
+
+    @property
+    def complete(self) -> bool:
+        """True once the photographs are kept."""
+        return bool(self.views)
+
+    def steps_for(self, quality: Any, data: Any) -> int:
+        """One, in which nothing happens."""
+        return 1
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        super().begin(data, seconds)
+        c = self.config
+        geometry: Any = "plane" if c.by == "flow" else c.geometry
+        self.views.keep(data, geometry, "", self.frame.background, STEREO_SHARE * seconds)
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:  # type: ignore[override]
+        """The first photograph, for the trainer to count."""
+        return data.photograph(int(data.splits["train"][0]))
+
+    def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
+        """Nothing is left to learn once `begin` has kept the photographs."""
+        return {}
+
+    # Rendering
+
+    @at_work()
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        camera = camera.to(self.device)
+        if not self.views:
+            height, width = shape(camera)
+            empty = torch.zeros(height, width, device=self.device)
+            return Rendering(self.background.expand(height, width, 3).clone(), empty + torch.inf, empty)
+        return self._by_flow(camera) if self.config.by == "flow" else self._by_depth(camera)
+
+    def _by_depth(self, camera: Camera) -> Rendering:
+        """Photographs warped by their depth, then blended where they show one surface, the nearest."""
+        c, tables = self.config, self.views.tables
+        chosen = tables.nearest(camera, c.warped_views)
+        layers = [self._splatted(i, camera) for i in chosen]
+        apart = (tables.cameras.position[chosen] - camera.position).norm(dim=-1) / tables.middle
+        near = ((1e-3 + apart.min()) / (1e-3 + apart)) ** c.nearness
+        rgb, depth, cover = (torch.stack(x) for x in zip(*layers, strict=True))
+        weight = near[:, None, None] * cover.clamp_max(1) * (cover > MIN_COVER)
+        agreed = consensus(depth, weight)
+        weight = weight * ((depth - agreed).abs() < c.agreement * agreed)
+        total = weight.sum(0)
+        seen = total > 0
+        found = (weight[..., None] * rgb).sum(0) / total.clamp_min(1e-12)[..., None]
+        away = (weight * depth).sum(0) / total.clamp_min(1e-12)
+        return self._closed(found, away, seen)
+
+    def _splatted(self, i: int, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+        """One photograph's colours (and alpha), distances and cover in a new camera."""
+        tables, own = self.views.tables, self.views.tables.cameras[i]
+        height, width = shape(own)
+        rows, columns = tables.sizes[i, [3, 2]].tolist()
+        depth = tables.depths[i, :rows, :columns]
+        depth = continued(torch.where(depth < NOTHING, depth, torch.inf))
+        away = enlarged(1 / depth.clamp_min(1e-6), (height, width)).reciprocal().flatten()
+        rays = own.rays(own.pixels())
+        usable = (away > 1e-5) & away.isfinite()
+        points = rays.at(away)[usable]
+        colours = tables.pictures[i, :height, :width].flatten(0, 1)[usable].float() / 255
+        places, valid = camera.project(points)
+        distance = (points - camera.position).norm(dim=-1)
+        footprint = away[usable] * focal_length(camera) / (distance * focal_length(own))
+        values = torch.cat([distance[:, None], colours], -1)[valid]
+        importance = -self.config.occlusion * distance[valid].log()
+        found, cover = soft_splat(places[valid], values, importance, shape(camera), float(footprint.median()))
+        return found[..., 1:], found[..., 0], cover
+
+    def _closed(self, rgb: Tensor, away: Tensor, seen: Tensor) -> Rendering:
+        """Fill holes with what is around them, the background first; an object's surroundings stay empty."""
+        if rgb.shape[-1] > 3:
+            opacity, rgb = (
+                torch.where(seen, rgb[..., 3], 0),
+                torch.where(seen[..., None], rgb[..., :3], self.background),
+            )
+            return Rendering(rgb, torch.where(opacity > 0, away, torch.inf), opacity)
+        if not seen.any():
+            return Rendering(self.background.expand(*seen.shape, 3).clone(), away + torch.inf, seen.float())
+        filled = behind(torch.cat([rgb, away[..., None]], -1), away, seen)
+        return Rendering(filled[..., :3].clamp(0, 1), filled[..., 3], torch.ones_like(away))
+
+    def _by_flow(self, camera: Camera) -> Rendering:
+        """Two photographs warped along their flow to the place between them that is nearest to the camera, then turned
+        by the homography of the plane at infinity."""
+        tables = self.views.tables
+        i, j, share = self._pair(camera)
+        first, second = tables.cameras[i], tables.cameras[j]
+        height, width = shape(first)
+        layers = []
+        for a, b, t in ((i, j, share), (j, i, 1 - share)):
+            flow, back = self._flow(a, b), self._flow(b, a)
+            pixels = tables.cameras[a].pixels().to(self.device)
+            there = pixels + flow
+            error = (flow + sampled(back.view(height, width, 2), there)).norm(dim=-1)
+            picture = tables.pictures[a, :height, :width, :3].reshape(-1, 3).float() / 255
+            importance = -error / FLOW_DISAGREEMENT
+            found, cover = soft_splat(pixels + t * flow, picture, importance, (height, width), 1.0)
+            layers.append(((1 - t) * cover.clamp_max(1), found))
+        total = layers[0][0] + layers[1][0]
+        found = sum(weight[..., None] * colours for weight, colours in layers) / total.clamp_min(1e-12)[..., None]
+        found = pushed(found, (total > 0.5 * MIN_COVER).float())
+        middle = replace(first, pose=between_poses(first.pose, second.pose, share))
+        turned = camera.rays(camera.pixels()).directions
+        places, valid = middle.project(middle.position + turned)
+        rgb = sampled(found, places).clamp(0, 1)
+        rgb = torch.where(valid[:, None], rgb, self.background).view(*shape(camera), 3)
+        depth = tables.middle / cosines(camera).clamp_min(1e-2)
+        return Rendering(rgb, depth, torch.ones_like(depth))
+
+    def _pair(self, camera: Camera) -> tuple[int, int, float]:
+        """Two photographs between which the camera is, nearly, and its share of the way from the first."""
+        tables = self.views.tables
+        near = tables.nearest(camera, 8)
+        best = (math.inf, near[0], near[0], 0.0)
+        for n, i in enumerate(near):
+            for j in near[n + 1 :]:
+                if tables.sizes[i, :2].tolist() != tables.sizes[j, :2].tolist():
+                    continue
+                a, b = tables.cameras.position[i], tables.cameras.position[j]
+                way, own = b - a, camera.position[0] - a
+                share = float(((own @ way) / (way @ way).clamp_min(1e-12)).clamp(0, 1))
+                off = float((own - share * way).norm() + 0.1 * way.norm())
+                best = min(best, (off, i, j, share))
+        return best[1], best[2], best[3]
+
+    def _flow(self, i: int, j: int) -> Float[Tensor, "pixel 2"]:
+        """Dense flow from one photograph to another by inverse search (Kroeger 2016), and kept."""
+        if (i, j) not in self._flows:
+            tables = self.views.tables
+            (width, height) = tables.sizes[i, :2].tolist()
+            colours = [tables.pictures[k, :height, :width, :3].contiguous().cpu().numpy() for k in (i, j)]
+            grey = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in colours]
+            if i == j or min(height, width) < 16:
+                flow = np.zeros((height, width, 2), np.float32)
+            else:
+                flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*grey, None)  # type: ignore[call-overload]
+            self._flows[i, j] = torch.from_numpy(flow).view(-1, 2).to(self.device)
+        return self._flows[i, j]
+
+
+def enlarged(values: Float[Tensor, "rows columns"], size: tuple[int, int]) -> Float[Tensor, "height width"]:
+    """Inverse depth between pixels of a depth map; across edges that of the nearest pixel."""
+    smooth = interpolate(values[None, None], size, mode="bilinear")[0, 0]
+    nearest = interpolate(values[None, None], size, mode="nearest-exact")[0, 0]
+    return torch.where((smooth - nearest).abs() < 0.02 * nearest, smooth, nearest)
+
+
+def sampled(
+    picture: Float[Tensor, "height width channel"], places: Float[Tensor, "point 2"]
+) -> Float[Tensor, "point channel"]:
+    """Values of a picture at places (x, y), between its pixels; beyond its border those of the border."""
+    height, width = picture.shape[:2]
+    at = 2 * places / torch.tensor([width, height], device=places.device) - 1
+    found = grid_sample(picture.movedim(-1, 0)[None], at[None, None], padding_mode="border", align_corners=False)
+    return found[0, :, 0].T
+
+
+def between_poses(a: Float[Tensor, "1 3 4"], b: Float[Tensor, "1 3 4"], share: float) -> Float[Tensor, "1 3 4"]:
+    """Positions and rotations (as quaternions) interpolated linearly."""
+    first, second = to_quaternion(a[:, :, :3]), to_quaternion(b[:, :, :3])
+    second = torch.where((first * second).sum(-1, keepdim=True) < 0, -second, second)
+    turn = to_matrix(normalize((1 - share) * first + share * second, dim=-1))
+    return torch.cat([turn.to(a), ((1 - share) * a + share * b)[:, :, 3:]], -1)
