@@ -1,7 +1,7 @@
 """Stereo: disparity of a rectified pair, by semi-global matching or by blocks from coarse to fine.
 
-A point at the left pixel (x, y) is at (x - d, y) on the right. With the baseline b, the focal length f and the offset d0
-between the columns of both principal points its distance along the axis is z = b f / (d + d0).
+A point at the left pixel (x, y) is at (x - d, y) on the right. With the baseline b, the focal length f and the offset
+d0 between the columns of both principal points, its distance along the axis is z = b f / (d + d0).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, normalize, pad
+from torch.nn.functional import avg_pool2d, max_pool2d, normalize, pad
 
 from .. import kernels
 from ..camera import Camera
@@ -28,6 +28,7 @@ JUMP_PENALTY, MIN_JUMP_PENALTY = 160, 32  # P2, for any other change; at the str
 JUMP_EDGE = 15.0  # grey levels: an edge over which P2 falls to 1 / e
 CONSISTENT = 1.0  # pixels between the disparities of both pictures
 MIN_MARGIN = 16.0  # sum of eight costs: of the next best disparity over the best, of pixels that are sure
+TEXTURE_WINDOW, MIN_CONTRAST = 9, 8  # pixels a side; grey levels in it, at least, of pixels that are sure
 FILL_DIRECTIONS = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 FILL_DIRECTIONS = np.concatenate([FILL_DIRECTIONS, -FILL_DIRECTIONS])
 FILL_PER_DIRECTION, FILL_REACH = 2, 100  # known pixels, and steps up to which they are looked for
@@ -90,8 +91,9 @@ class RectifiedPair:
 
     def match(self) -> Disparity:
         """Semi-global matching over the searched disparities."""
-        pictures = (as_bytes(view.rgb) for view in (self.left, self.right))
-        return semi_global(*pictures, *self.disparities, *(view.trust > 0.5 for view in (self.left, self.right)))
+        left, right = self.left, self.right
+        first, count = self.disparities
+        return semi_global(as_bytes(left.rgb), as_bytes(right.rgb), first, count, left.trust > 0.5, right.trust > 0.5)
 
 
 # Matching
@@ -115,18 +117,31 @@ def semi_global(
     everywhere = torch.ones(guide.shape, dtype=torch.bool)
     valid = everywhere if left_valid is None else left_valid
     if costs is None:
-        costs = kernels.census_cost(guide, other, valid, everywhere if right_valid is None else right_valid, first, count)
+        costs = kernels.census_cost(
+            guide, other, valid, everywhere if right_valid is None else right_valid, first, count
+        )
     found, its, margin = kernels.semi_global(costs, guide, jump_penalties(), SLOPE_PENALTY, first)
     state = agreement(found, its)
-    return Disparity(filled(found, its, state, left), (state == 0) & (margin >= MIN_MARGIN) & valid)
+    sure = (state == 0) & (margin >= MIN_MARGIN) & (contrast(guide) >= MIN_CONTRAST) & valid
+    return Disparity(filled(found, its, state, left), sure)
 
 
-def jump_penalties() -> UInt8[Tensor, "256"]:
+def contrast(guide: UInt8[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Levels between the darkest and the brightest pixel of the window around each."""
+    both = torch.stack([guide, 255 - guide]).float()[None]
+    for sides in ((TEXTURE_WINDOW, 1), (1, TEXTURE_WINDOW)):
+        both = max_pool2d(both, sides, 1, tuple(side // 2 for side in sides))
+    return both[0, 0] + both[0, 1] - 255
+
+
+def jump_penalties() -> UInt8[Tensor, 256]:
     """P2 for each difference of grey levels: less at edges, where depth may jump (Hirschmüller 2008, eq. 14)."""
     return (JUMP_PENALTY * torch.exp(-torch.arange(256) / JUMP_EDGE)).clamp_min(MIN_JUMP_PENALTY).to(torch.uint8)
 
 
-def agreement(found: Float[Tensor, "height width"], its: Float[Tensor, "height width"]) -> UInt8[Tensor, "height width"]:
+def agreement(
+    found: Float[Tensor, "height width"], its: Float[Tensor, "height width"]
+) -> UInt8[Tensor, "height width"]:
     """0 where the other picture has the same disparity, 1 where it has another, 2 outside it."""
     width = found.shape[1]
     there = torch.arange(width) - found.round().long()
@@ -237,15 +252,17 @@ def rectify(first: FlatView, second: FlatView, span: tuple[float, float], names:
     common = min(bounds[0][2] - far_shift, bounds[1][2]) - max(bounds[0][0] - near_shift, bounds[1][0])
     sides = first.trust.shape
     if bottom - top < MIN_OVERLAP * sides[0] or common < MIN_OVERLAP * sides[1]:
-        raise LumigraphError(f"{names} do not overlap: they show too little in common to be compared; choose neighbours")
+        raise LumigraphError(f"{names} do not overlap: too little of the scene is in both; choose neighbours")
     width = math.ceil(max(x[2] - x[0] for x in bounds))
     size = math.ceil(bottom - top), width
-    flat = [turned(view, rotation, focal, (-x[0], -top), size) for view, x in zip(views, bounds, strict=True)]
-    pair = RectifiedPair(*flat, baseline, bounds[0][0] - bounds[1][0], span)
+    left, its_right = (
+        turned(view, rotation, focal, (-x[0], -top), size) for view, x in zip(views, bounds, strict=True)
+    )
+    pair = RectifiedPair(left, its_right, baseline, bounds[0][0] - bounds[1][0], span)
     if pair.disparities[1] > MAX_DISPARITIES:
         raise LumigraphError(
-            f"{names} are too far apart for what lies near: {pair.disparities[1]} disparities, and {MAX_DISPARITIES} are "
-            "possible; choose neighbours, or a smaller --size"
+            f"{names} are too far apart for what lies near: {pair.disparities[1]} disparities, and at "
+            f"most {MAX_DISPARITIES} are possible; choose neighbours, or a smaller --size"
         )
     return pair
 
@@ -255,7 +272,7 @@ def turned_bounds(view: FlatView, rotation: Float[Tensor, "3 3"], focal: float) 
     height, width = view.trust.shape
     corners = torch.tensor([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]).float()
     rays = corners @ view.intrinsics.inverse().T @ view.pose[:, :3].T @ rotation
-    if bool((rays[:, 2] < 0.1).any()):
+    if bool((rays[:, 2] < 0.05).any()):
         raise LumigraphError("Photographs of a pair look in directions too different; choose neighbours")
     places = focal * rays[:, :2] / rays[:, 2:]
     return [*places.amin(0).tolist(), *places.amax(0).tolist()]

@@ -7,14 +7,16 @@ from torch.nn.functional import pad
 from . import NO_RIVAL, PATHS
 
 
-def run(costs, guide, penalties, slope_penalty, first):
-    C, guide, penalties = costs.int(), guide.int(), penalties.int()
+def run(volume, guide, penalties, slope_penalty, first):
+    C, guide, penalties = volume.int(), guide.int(), penalties.int()
     total = torch.zeros_like(C)
     for dx, dy in PATHS:
         turned = dy == 0  # along a row: columns take the place of rows
         step, aside = (dx, 0) if turned else (dy, dx)
-        ways = [x.transpose(0, 1) if turned else x for x in (C, guide, total)]
-        along(*(x.flip(0) if step < 0 else x for x in ways[:2]), penalties, slope_penalty, aside, ways[2], step < 0)
+        costs, picture, sums = (x.transpose(0, 1) if turned else x for x in (C, guide, total))
+        if step < 0:
+            costs, picture = costs.flip(0), picture.flip(0)
+        along(costs, picture, penalties, slope_penalty, aside, sums, step < 0)
     height, width, count = C.shape
     k = torch.arange(count, device=C.device)
     least, best = total.min(2)
