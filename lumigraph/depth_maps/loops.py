@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit, prange
 
 
@@ -99,3 +100,55 @@ def incidence(depth, directions, out):
             length = math.sqrt(nx * nx + ny * ny + nz * nz)
             if length > 0:
                 out[y, x] = abs(nx * dx + ny * dy + nz * dz) / length
+
+
+@njit(cache=True, error_model="numpy")
+def fill_disparity(found, its, state, rgb, directions, per_direction, reach, colour, distance, out):
+    """stereo.filled: disparities of pixels that the other picture does not show, from known pixels around them.
+
+    found, its: disparity of this picture and of the other, whose pixel is at x - found; state: 0 for known, 1 for
+    hidden, 2 for outside the other picture; rgb: bytes; out: at first `found`
+    """
+    height, width = found.shape
+    values = np.empty(len(directions) * per_direction, np.float32)
+    weights = np.empty_like(values)
+    for y in range(height):
+        for x in range(width):
+            if state[y, x] == 0:
+                continue
+            count, whole = 0, np.float32(0)
+            for k in range(len(directions) if state[y, x] == 1 else 0):
+                dx, dy = directions[k, 0], directions[k, 1]
+                i, j, got, step = x + dx, y + dy, 0, 1
+                while 0 <= i < width and 0 <= j < height and step < reach and got < per_direction:
+                    if state[j, i] == 0:
+                        got += 1
+                        u = x - int(round(found[j, i]))
+                        # In front of what the other picture shows, this pixel would have been shown as well.
+                        if u < 0 or u >= width or its[y, u] > found[j, i] - 1:
+                            apart = abs(float(rgb[y, x, 0]) - rgb[j, i, 0]) + abs(float(rgb[y, x, 1]) - rgb[j, i, 1])
+                            apart += abs(float(rgb[y, x, 2]) - rgb[j, i, 2])
+                            weight = np.float32(math.exp(-apart / colour - step / distance) + 1e-6)
+                            place = count
+                            while place > 0 and values[place - 1] > found[j, i]:
+                                values[place], weights[place] = values[place - 1], weights[place - 1]
+                                place -= 1
+                            values[place], weights[place] = found[j, i], weight
+                            count, whole = count + 1, whole + weight
+                    i, j, step = i + dx, j + dy, step + 1
+            if count > 0:
+                passed, k = weights[0], 0
+                while passed < whole / 2 and k < count - 1:
+                    k += 1
+                    passed += weights[k]
+                out[y, x] = values[k]
+                continue
+            nearest = math.inf  # the farther of the known pixels to the left and to the right
+            for towards in (-1, 1):
+                i = x + towards
+                while 0 <= i < width and state[y, i] != 0:
+                    i += towards
+                if 0 <= i < width:
+                    nearest = min(nearest, found[y, i])
+            if nearest < math.inf:
+                out[y, x] = nearest

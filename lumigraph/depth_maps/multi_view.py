@@ -20,6 +20,7 @@ from ..system.progress import track
 from .depth_map import DepthMap
 from .flat_view import FlatView, flat_view
 from .patch_match import FAR_AREAS, HYPOTHESES, NEAR_AREAS, PatchMatch, PlaneMap
+from .stereo import Disparity, RectifiedPair, rectify
 
 MAX_VIEWS, MIN_VIEWS = 48, 8  # photographs at most, and at least however short the time
 MIN_SIDE = 40  # pixels along the longer side at the coarsest level
@@ -79,6 +80,17 @@ def multi_view_depth(
         known = torch.cat([seen.positions() for seen in found])
     spans = [around(view, known) or everywhere(view, scene) for view in coarse]
     return match(chosen, pyramids, spans, "Matching photographs", seconds - (time.perf_counter() - begin))
+
+
+@torch.no_grad()
+def pair_depth(scene: Scene, first: int, second: int, size: int) -> tuple[RectifiedPair, Disparity]:
+    """Rectified pictures of two photographs, and the disparity of the left one. size: of their longer side, about"""
+    one, other = (flat_view(scene.photograph(number), size) for number in (first, second))
+    known = torch.empty(0, 3) if scene.points is None else scene.points
+    spans = [around(view, known) or everywhere(view, scene) for view in (one, other)]
+    span = min(near for near, _ in spans), max(far for _, far in spans)
+    pair = rectify(one, other, span, f"{scene.names[first]} and {scene.names[second]}")
+    return pair, pair.match()
 
 
 def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from ..camera import Camera
 from ..capture.transforms import OPENCV_FROM_OPENGL
 from ..datasets.scene import Scene
 from ..depth_maps import DepthMap
+from ..depth_maps.stereo import Disparity, RectifiedPair
 from ..errors import LumigraphError
 from ..figures import Row, colour_depth, contact_sheet, depth_range, save_picture, to_image
 from ..files import replacing_folder, write_json
@@ -22,11 +23,13 @@ MAX_LEVEL = 65534  # of 16 bits; 0 and 65535 stand for unknown depth
 SHEET = "depth.png"
 
 
-def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap]) -> None:
+def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap], sheet: Image.Image | None = None) -> None:
     """A folder that opens as a scene with a layer of depth: images, depth, transforms.json, and a contact sheet.
 
     Depth is 16-bit distance along rays in units of a MAX_LEVEL-th of the farthest; 0 where it is not sure. Poses and
     depth are in the capture's frame. Raises LumigraphError where nothing is sure.
+
+    sheet: in place of that of `depth_sheet`
     """
     sure = [seen.depth[seen.solid] for seen in maps]
     if not any(map(len, sure)):
@@ -50,7 +53,7 @@ def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap]) -> None:
             )
         scale = {"depth_unit_scale_factor": unit * to_source.scale, "is_euclidean_depth": True}
         write_json(partial / "transforms.json", {"camera_model": "PINHOLE", **scale, "frames": frames}, ours=True)
-        save_picture(partial / SHEET, depth_sheet(scene, maps), ours=True)
+        save_picture(partial / SHEET, sheet or depth_sheet(scene, maps), ours=True)
 
 
 def about(camera: Camera, to_source: Any) -> dict[str, Any]:
@@ -73,3 +76,14 @@ def depth_sheet(scene: Scene, maps: Sequence[DepthMap]) -> Image.Image:
         depth = colour_depth(seen.surface_depth.nan_to_num(torch.inf), seen.opacity, within)
         rows.append(Row(label, [seen.rgb, depth]))
     return contact_sheet(f"Depth of {scene.source}", ["photograph", "depth"], rows)
+
+
+def pair_sheet(source: str, names: tuple[str, str], pair: RectifiedPair, found: Disparity) -> Image.Image:
+    """Both rectified pictures, the disparity of the left one with holes filled, and where it is sure."""
+    z = pair.z(found.values)
+    trusted = (pair.left.trust > 0.5).float()
+    within = depth_range(z, trusted)
+    depth = [colour_depth(z, opacity, within) for opacity in (trusted, found.sure.float())]
+    titles = ["left, rectified", "right, rectified", "disparity, filled", "sure disparity"]
+    row = Row(f"{names[0]} and {names[1]}", [pair.left.rgb, pair.right.rgb, *depth])
+    return contact_sheet(f"Stereo of {source}", titles, [row])

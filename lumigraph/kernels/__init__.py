@@ -12,6 +12,7 @@ from .block_march import Blocks as Blocks
 from .block_march import block_march as block_march
 from .block_surface import block_surface as block_surface
 from .cast_blocks import cast_blocks as cast_blocks
+from .census_cost import census_cost as census_cost
 from .composite import composite as composite
 from .contract import contract as contract
 from .dense_grid import dense_grid as dense_grid
@@ -35,6 +36,7 @@ from .rasterize import rasterize as rasterize
 from .rasterize_mesh import rasterize_mesh as rasterize_mesh
 from .sample_proposals import Resampling as Resampling
 from .sample_proposals import sample_proposals as sample_proposals
+from .semi_global import semi_global as semi_global
 from .sparse_grid import Nodes as Nodes
 from .sparse_grid import sparse_grid as sparse_grid
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics
