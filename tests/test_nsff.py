@@ -214,4 +214,4 @@ def test_opencv_is_asked_for(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(LumigraphError, match="--flow-weight 0"):
-        NSFF(moving_scene().frame, NSFF.smallest())
+        NSFF(moving_scene().frame, NSFF.smallest()).begin(moving_scene())

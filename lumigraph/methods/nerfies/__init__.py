@@ -122,9 +122,11 @@ class Nerfies(FieldMethod):
         """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
         c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.4)
+        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
         d = replace(d, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True)
-        return replace(c, deformation=d, final_learning_rate=1e-3, decay_start=0.3, deformation_rate=0.3)
+        d = replace(d, deformation_frequencies=4, growth=0.5)
+        c = replace(c, deformation=d, table_annealing=0.5, deformation_rate=0.3)
+        return replace(c, final_learning_rate=1e-3, decay_start=0.5)
 
     @classmethod
     def smallest(cls) -> Any:

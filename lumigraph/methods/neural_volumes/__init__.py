@@ -21,7 +21,7 @@ from ...method import RayMethod
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
 from .cameras import Backgrounds, Rig
-from .networks import Decoder, Encoder, divergence, opacity_prior, opacity_roughness
+from .networks import Decoded, Decoder, Encoder, divergence, opacity_prior, opacity_roughness
 
 Side = Annotated[int, between(8, 1024)]
 
@@ -112,10 +112,11 @@ class NeuralVolumes(RayMethod):
         before = max(after - 1, 0)
         gap = float(times[after] - times[before])
         share = min(max((time - float(times[before])) / gap, 0.0), 1.0) if gap else 1.0
-        first, second = (self.encoded(i)[0] if weight else 0.0 for i, weight in ((before, 1 - share), (after, share)))
-        return (1 - share) * first + share * second
+        if share == 1:
+            return self.encoded(after)[0]
+        return torch.lerp(self.encoded(before)[0], self.encoded(after)[0], share)
 
-    def volume_at(self, time: float, toward: Float[Tensor, " 3"]) -> tuple[Any, ...]:
+    def volume_at(self, time: float, toward: Float[Tensor, " 3"]) -> Decoded:
         """Code, volume and warp of a moment as pictures show it; the last one is kept."""
         key = time, toward.tolist() if self.config.view_dependence else None, self.encoder.mean.weight._version
         if self.decoded[0] != key:
@@ -130,7 +131,7 @@ class NeuralVolumes(RayMethod):
     # Along rays
 
     def march(
-        self, rays: Rays, volume: tuple[Any, ...], generator: torch.Generator | None = None
+        self, rays: Rays, volume: Decoded, generator: torch.Generator | None = None
     ) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, " ray"], Float[Tensor, " ray"]]:
         """Light, opacity and mean distance of rays through a volume (eq. 3): opacity adds up along a ray, to 1 at most.
 
@@ -142,7 +143,7 @@ class NeuralVolumes(RayMethod):
         shares = stratified(len(rays), self.config.samples, generator, self.device)
         t = torch.lerp(near[:, None], far[:, None], shares)
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-        alpha, rgb = self.decoder.look_up(*volume, self.coordinates(points.flatten(0, 1)))
+        alpha, rgb = self.decoder.look_up(volume, self.coordinates(points.flatten(0, 1)))
         step = ((far - near) / self.config.samples)[:, None]
         total = (alpha.view(t.shape) * self.per_unit * step).cumsum(1).clamp(max=1)
         weights = torch.diff(total, dim=1, prepend=torch.zeros_like(total[:, :1]))
@@ -185,7 +186,7 @@ class NeuralVolumes(RayMethod):
         """Opacity per scene unit and colour, at the moment of the settings."""
         first, _ = self.frame.times or (0.0, 0.0)
         volume = self.volume_at(float(self.settings.get("time", first)), -directions.mean(0))
-        alpha, rgb = self.decoder.look_up(*volume, self.coordinates(points))
+        alpha, rgb = self.decoder.look_up(volume, self.coordinates(points))
         return self.per_unit * alpha, rgb
 
     def density(self, points: Points) -> Densities:

@@ -20,6 +20,7 @@ MIN_WEIGHT = 1e-3  # of all affine maps together at a place
 
 Code = Float[Tensor, "1 code"]
 Volume = Float[Tensor, "1 4 side side side"]  # colours and opacity per unit of coordinates; axes z, y, x
+Decoded = tuple[Tensor, Tensor, Tensor | None]  # a code, its volume and its warp
 Lattice = Float[Tensor, "1 cell cell cell 3"]  # places in the template; axes z, y, x
 
 
@@ -28,7 +29,7 @@ def dense(*widths: int) -> nn.Sequential:
     layers = [nn.Linear(a, b) for a, b in zip(widths, widths[1:], strict=False)]
     for layer in layers:
         scaled(layer, layer is layers[-1])
-    return nn.Sequential(*(x for layer in layers for x in (layer, nn.LeakyReLU(SLOPE))))[:-1]
+    return nn.Sequential(*(x for layer in layers[:-1] for x in (layer, nn.LeakyReLU(SLOPE))), layers[-1])
 
 
 def scaled(layer: nn.Module, last: bool = False) -> nn.Module:
@@ -155,10 +156,11 @@ class Decoder(nn.Module):
         return torch.cat([colour, softplus(raw[:, 3:])], 1), None if self.warp is None else self.warp(code)
 
     def look_up(
-        self, code: Code, volume: Volume, warp: Lattice | None, places: Float[Tensor, "point 3"]
+        self, decoded: Decoded, places: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Opacity per unit and colour at places: of the template where the whole's map and the warp lead; nothing
         outside of [-1, 1]^3."""
+        code, volume, warp = decoded
         there = self.whole(code, places)[0][None, None, None]
         if warp is not None:
             there = grid_sample(warp.permute(0, 4, 1, 2, 3), there, padding_mode="border", align_corners=True)
@@ -172,8 +174,8 @@ def opacity_roughness(volume: Volume) -> Float[Tensor, ""]:
     """Total variation of the logarithm of a volume's opacity (section 5.4)."""
     log = (1e-5 + volume[0, 3]).log()
     corner = log[:-1, :-1, :-1]
-    steps = log[1:, :-1, :-1] - corner, log[:-1, 1:, :-1] - corner, log[:-1, :-1, 1:] - corner
-    return (1e-5 + sum(step.square() for step in steps)).sqrt().mean()
+    steps = torch.stack([log[1:, :-1, :-1] - corner, log[:-1, 1:, :-1] - corner, log[:-1, :-1, 1:] - corner])
+    return (1e-5 + steps.square().sum(0)).sqrt().mean()
 
 
 def opacity_prior(opacity: Float[Tensor, " ray"]) -> Float[Tensor, ""]:

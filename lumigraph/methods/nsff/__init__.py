@@ -26,12 +26,13 @@ from ...method.field import Densities, Directions, Points
 from ...method.sampler import Density
 from ...volume import composite
 from .fields import BlendedField, NetworkField, StaticHash, TimeHash
-from .priors import DepthSource, MotionPriors, need_opencv, seen
+from .priors import DepthSource, MotionPriors, seen
 from .sampler import EvenSampler
 
 ROWS = 288  # of the pictures in whose pixels the release measures errors of flow
 PRIOR_FALL = 10.0  # factor by which the weights of flow and depth fall each time (the authors' release)
 LAST_SCALE = 0.005  # of those weights, below which they are 0
+MIN_OPACITY = 0.5  # of rays whose optical flow counts
 NEIGHBOURS = 2.0  # falloff of smoothness with distance between samples, per unit of coordinates (eq. in section 3.2)
 
 
@@ -114,11 +115,10 @@ class NSFF(FieldMethod):
             for parameter in (dynamic.motion if c.field == "hash" else dynamic.heads).parameters():
                 parameter.requires_grad_(False)
         flows = self.warps and c.flow.flow_weight > 0
-        if flows:
-            need_opencv()
         source = c.flow.depth_source if self.warps and c.flow.depth_weight else None
         self.priors = MotionPriors(frame.image_count, flows, source)
-        self.register_buffer("known_moments", torch.full((max(frame.image_count, 2),), math.inf))
+        rows = max(frame.image_count, 2)
+        self.register_buffer("known_moments", torch.linspace(*(frame.times or (0.0, 1.0)), rows))
         self.prior_scale, self.chains = 1.0, False
 
     @classmethod
@@ -177,6 +177,7 @@ class NSFF(FieldMethod):
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         if data.cameras.time is not None:
             found = data.cameras.time[data.splits["train"]].unique()
+            self.known_moments.fill_(math.inf)
             self.known_moments[: len(found)] = found.to(self.device)
         super().begin(data, seconds)
 
@@ -222,10 +223,10 @@ class NSFF(FieldMethod):
         forward, back = self.flows(motion)
         between = packed.ray_index.diff() == 0
         near = torch.exp(-NEIGHBOURS * points.diff(dim=0).norm(dim=-1))
-        unlike = sum(near * flow.diff(dim=0).abs().sum(-1) for flow in (forward, back))
+        unlike = near * (forward.diff(dim=0).abs() + back.diff(dim=0).abs()).sum(-1)
         terms["smooth"] = c.smooth_weight * (seen(between, unlike) + (forward + back).square().sum(-1).mean() / 2)
         terms["least"] = c.min_weight * (forward.abs().mean() + back.abs().mean())
-        if c.depth_weight and self.prior_scale > LAST_SCALE:
+        if len(self.priors.depth.rows) and self.prior_scale > LAST_SCALE:
             terms["depth"] = c.depth_weight * self.prior_scale * self.depth_error(batch, packed, density, moving)
         return terms
 
@@ -281,7 +282,7 @@ class NSFF(FieldMethod):
                 "occlusion": c.occlusion_weight * seen(known[ray], 1 - weight[:, 0]),
                 "cycle": c.cycle_weight * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
             }
-            if not hop and self.priors.flows and self.prior_scale > LAST_SCALE:
+            if not hop and len(self.priors.flow.rows) and self.prior_scale > LAST_SCALE:
                 own = composite(packed, at.density, at.rgb, None, place=there.places)
                 error = self.flow_error(batch, way, known, own)
                 values["flow"] = c.flow_weight * self.prior_scale * error
@@ -296,11 +297,11 @@ class NSFF(FieldMethod):
         own: of the dynamic field at the rays' moment; its extra `place` is where its samples go
         """
         goal, image = self.priors.flow_targets(batch, way)
-        place = own.extra["place"] / own.opacity.clamp_min(1e-3)[:, None]
-        found, visible = self.priors.cameras.project(place, image.clamp_min(0))
-        sure = known & visible & (own.opacity > 0.5) & goal.isfinite().all(-1) & (image >= 0)
-        error = (torch.where(sure[:, None], found - goal, 0.0)).abs().mean(-1)
-        return seen(sure, error * ROWS / self.priors.cameras.size[image.clamp_min(0), 1])
+        sure = (known & (own.opacity > MIN_OPACITY) & goal.isfinite().all(-1) & (image >= 0)).nonzero()[:, 0]
+        image = image[sure]
+        found, visible = self.priors.cameras.project(own.extra["place"][sure] / own.opacity[sure, None], image)
+        error = (found - goal[sure]).abs().mean(-1) * ROWS / self.priors.cameras.size[image, 1]
+        return seen(visible, error)
 
     def depth_error(
         self, batch: Batch, packed: Samples, density: Densities, rgb: Float[Tensor, "sample 3"]
@@ -309,7 +310,7 @@ class NSFF(FieldMethod):
         known = self.priors.depth_targets(batch)
         depth = composite(packed, density, rgb).depth
         sure = known.isfinite() & (known > 0) & depth.isfinite()
-        return seen(sure, torch.where(sure, depth / known - 1, 0.0).abs())
+        return seen(sure, (torch.where(sure, depth, 1.0) / torch.where(sure, known, 1.0) - 1).abs())
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         fields = [x for x in (self.network.static, self.network.dynamic) if x is not None]

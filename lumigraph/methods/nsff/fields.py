@@ -23,6 +23,7 @@ from ...method.field import Codes, Colours, Densities, Directions, Points
 
 FIRST_FLOW = 1e-3  # largest weight of the last layer of a motion network at first
 MOTION_BANDS, MOTION_SHAPE = 4, (4, 64, 2)  # octaves of the motion network's input; depth, width and skip layer
+MOTION_RATE = 0.2  # of the table's learning rate, for that network
 TIME_LEVELS = 4  # of each table of space and time
 PLANES = (0, 1), (0, 2), (1, 2)  # axes of space beside time in those tables
 
@@ -126,18 +127,16 @@ class TimeHash(HashField):
         assert code is not None
         return self.motion(torch.cat([self.space.warp(points), 2 * code[:, :1] - 1], 1))
 
-    def optimizers_at(self, learning_rate: float, *arguments: Any, **named: Any) -> list[torch.optim.Optimizer]:
+    def optimizers_at(
+        self, learning_rate: float, weight_decay: float = 0.0, scale: float | None = None, groups: Any = ()
+    ) -> list[torch.optim.Optimizer]:
         motion = {"params": list(self.motion.parameters()), "scale": MOTION_RATE}
-        common: dict[str, Any] = {"lr": learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
-        tables = LazyAdam(list(self.time_tables), **common)
-        return [*super().optimizers_at(learning_rate, *arguments, groups=[motion], **named), tables]
+        tables = LazyAdam(list(self.time_tables), lr=learning_rate, betas=(0.9, 0.99), eps=1e-15)
+        return [*super().optimizers_at(learning_rate, weight_decay, scale, [motion, *groups]), tables]
 
     def storage(self) -> dict[str, Stored]:
         planes = {f"time_tables.{i}": Stored("scaled") for i in range(len(PLANES))}
         return super().storage() | planes
-
-
-MOTION_RATE = 0.2  # of the table's learning rate, for the motion network
 
 
 class BlendedField(Field):

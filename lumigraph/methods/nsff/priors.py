@@ -70,17 +70,19 @@ class MotionPriors(Part):
         said = {"pose": cameras.pose.tolist(), "lens": cameras.lens.to_json(), "size": cameras.size.tolist()}
         self.taken.rows = torch.frombuffer(bytearray(json.dumps(said).encode()), dtype=torch.uint8).to(device)
         if self.flows and cameras.time is not None:
-            self.partner[train] = (found := partners(cameras, train)).to(device)
+            need_opencv()
+            others_of = partners(cameras, train)
+            self.partner[train] = others_of.to(device)
             flow = torch.full((len(train), 2, height, width, 2), math.nan, dtype=torch.half)
-            for i, (photograph, others) in enumerate(zip(train.tolist(), found.tolist(), strict=True)):
+            for i, (photograph, others) in enumerate(zip(train.tolist(), others_of.tolist(), strict=True)):
                 for way, other in enumerate(others):
                     if other != UNKNOWN:
                         offsets = checked_flow(bytes_of(pictures[photograph]), bytes_of(pictures[other]))
                         flow[i, way, : offsets.shape[0], : offsets.shape[1]] = torch.from_numpy(offsets).half()
             self.flow.rows = flow.view(-1, 2).to(device)
         if self.source is not None:
-            found = self.known_depth(data, train.tolist(), smaller, (height, width), seconds)
-            self.depth.rows = found.flatten().to(device)
+            depth = self.known_depth(data, train.tolist(), smaller, (height, width), seconds)
+            self.depth.rows = depth.flatten().to(device)
 
     def known_depth(
         self, data: Scene, train: list[int], smaller: int, size: tuple[int, int], seconds: float
@@ -171,7 +173,7 @@ def checked_flow(
 
     if first.shape != second.shape:
         second = cv2.resize(second, first.shape[::-1], interpolation=cv2.INTER_AREA)
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     forward, back = dis.calc(first, second, None), dis.calc(second, first, None)
     y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
     there = np.stack([x, y], -1) + forward
