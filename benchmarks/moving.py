@@ -4,10 +4,11 @@
 
 Trains each method, its seconds counted in those of processors, because a machine may be busy. Compares views of
 held-out cameras at training moments, and between them.
-`time-input` is the hash table of nerfies without its motion: the code of the moment is a further input of density.
+`time-input` is the dynamic field of nsff alone, without any warp: hash tables with time as a fourth input.
 PCK is the share of surface points of what moves whose place at another moment is predicted to within 5 % of the
-longest side of the box around what moves; of a method without motion it is the share of points that stay. Each method's
-strip, OUTPUT/SCENE.png, has the held-out cameras at six moments, below the truth.
+longest side of the box around what moves; of a method without motion it is the share of points that stay. Flow error is
+the median end-point error of scene flow to the next training moment, beside the median length of the true flow, scene
+units. Each method's strip, OUTPUT/SCENE.png, has the held-out cameras at six moments, below the truth.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 import tyro
 from PIL import Image
+from torch import Tensor
 
 from lumigraph import methods
 from lumigraph import synthetic as procedural
@@ -45,7 +47,7 @@ TIME_INPUT = "time-input"
 @dataclass(frozen=True)
 class Options:
     scene: str = "procedural:jelly"
-    methods: tuple[str, ...] = ("instant-ngp", TIME_INPUT, "nerfies", "deformable-splatting")
+    methods: tuple[str, ...] = ("instant-ngp", TIME_INPUT, "nerfies", "nsff", "deformable-splatting")
     size: int = 100  # pixels a side
     views: int = 60  # photographs of the moving camera
     seed: int = 0  # of the cameras
@@ -73,7 +75,7 @@ def main(options: Options) -> None:
         found = evaluate(method, scene, views=options.compared).to_json()
         rows[method_name] = {
             **{kind: {k: v for k, v in part.items() if v is not None} for kind, part in found["by_held_out"].items()},
-            "PCK": correct_points(method, stage, scene),
+            **motion_scores(method, stage, scene),
             "steps": outcome.state.step,
             "processor seconds": time.process_time() - begin,
         }
@@ -85,38 +87,49 @@ def main(options: Options) -> None:
 
 def made(name: str, scene: Scene) -> Method:
     """A method with its numbers for a plain CPU."""
-    kind = methods.find("nerfies" if name == TIME_INPUT else name)
+    kind = methods.find("nsff" if name == TIME_INPUT else name)
     config = kind.cpu_preset()
     if name == TIME_INPUT:
-        config = replace(config, deformation=replace(config.deformation, motion="none", slice_dimensions=8))
+        config = replace(config, static_field=False, flow=replace(config.flow, neighbours=0))
     return build(kind, scene.frame, config, torch.device("cpu"), 0, learning=True)
 
 
 @torch.no_grad()
-def correct_points(method: Method, stage: SyntheticStage, scene: Scene) -> float:
-    """PCK over pairs of training moments, of points that a training camera sees."""
+def motion_scores(method: Method, stage: SyntheticStage, scene: Scene) -> dict[str, float]:
+    """PCK over pairs of training moments, and errors of flow to next ones, of points that a training camera sees."""
+    random, cameras = np.random.default_rng(0), stage.cameras["train"]
+    count = len(cameras)
+    pairs = [random.choice(count, 2, replace=False).tolist() for _ in range(PAIRS)]
+    times = sorted(set(cameras.time.tolist()))
+    steps = [(i, times[times.index(float(cameras.time[i])) + 1]) for i, _ in pairs if cameras.time[i] < times[-1]]
+    far = [displacements(method, stage, scene, i, float(cameras.time[j]), random) for i, j in pairs]
+    next_ones = [displacements(method, stage, scene, i, end, random) for i, end in steps]
+    near = [(found - goal).norm(dim=-1) < NEAR * size for _, found, goal, size in far]
+    errors = torch.cat([(found - goal).norm(dim=-1) for _, found, goal, _ in next_ones])
+    lengths = torch.cat([(goal - start).norm(dim=-1) for start, _, goal, _ in next_ones])
+    return {
+        "PCK": float(torch.cat(near).float().mean()),
+        "flow_error": float(errors.median()),
+        "flow_length": float(lengths.median()),
+    }
+
+
+def displacements(
+    method: Method, stage: SyntheticStage, scene: Scene, image: int, end: float, random: np.random.Generator
+) -> tuple[Tensor, Tensor, Tensor, float]:
+    """Points of what moves that a camera of training sees, where a method has them at another moment, where they are
+    then, and the longest side of the box around them; scene units."""
     assert stage.moving is not None
-    random = np.random.default_rng(0)
-    cameras, to_scene = stage.cameras["train"], np.linalg.inv(np.array(scene.frame.source_from_scene))
-    correct, count = 0, 0
-    for _ in range(PAIRS):
-        first, second = random.choice(len(cameras), 2, replace=False).tolist()
-        camera, end = cameras[first], float(cameras.time[second])
-        now, rays = stage.world_of(camera), camera.rays(camera.pixels())
-        seen = procedural.trace(now, rays, shaded=False)
-        there = np.flatnonzero(np.isin(seen.identity, stage.moving_things))
-        there = random.choice(there, min(POINTS, len(there)), replace=False)
-        points = (
-            rays.origins.double().numpy()[there] + seen.depth[there, None] * rays.directions.double().numpy()[there]
-        )
-        expected = now.carried(points, seen.identity[there], stage.moving(end))
-        size = (points.max(0) - points.min(0)).max()
-        start, goal = (torch.from_numpy(x @ to_scene[:3, :3].T + to_scene[:3, 3]).float() for x in (points, expected))
-        found = method.follow(start, float(camera.time), end) if can(method, HasMotion) else start
-        near = NEAR * size * np.cbrt(np.linalg.det(to_scene[:3, :3]))
-        correct += int(((found - goal).norm(dim=-1) < near).sum())
-        count += len(there)
-    return correct / count
+    camera, to_scene = stage.cameras["train"][image], np.linalg.inv(np.array(scene.frame.source_from_scene))
+    now, rays = stage.world_of(camera), camera.rays(camera.pixels())
+    seen = procedural.trace(now, rays, shaded=False)
+    there = np.flatnonzero(np.isin(seen.identity, stage.moving_things))
+    there = random.choice(there, min(POINTS, len(there)), replace=False)
+    points = rays.origins.double().numpy()[there] + seen.depth[there, None] * rays.directions.double().numpy()[there]
+    expected = now.carried(points, seen.identity[there], stage.moving(end))
+    start, goal = (torch.from_numpy(x @ to_scene[:3, :3].T + to_scene[:3, 3]).float() for x in (points, expected))
+    found = method.follow(start, float(camera.time), end) if can(method, HasMotion) else start
+    return start, found, goal, float((start.amax(0) - start.amin(0)).max())
 
 
 def truth(scene: Scene) -> Callable:

@@ -169,6 +169,22 @@ def test_both_canonical_scenes_deform_and_are_sliced(field):
         torch.testing.assert_close(method.render(moment).rgb, pictures[1])
 
 
+def test_later_moments_and_levels_join_while_the_budget_is_spent():
+    scene = tiny.scene()
+    scene = replace(scene, cameras=replace(scene.cameras, time=torch.arange(12).float()))
+    scene = replace(scene, frame=replace(scene.frame, times=(0.0, 11.0)))
+    base = Nerfies.smallest()
+    config = replace(base, table_annealing=0.5, deformation=replace(base.deformation, growth=0.5))
+    method, points = Nerfies(scene.frame, config), 2 * torch.rand(20, 3) - 1
+    last = []
+    for progress in (0.0, 0.25, 0.5):
+        method.before_step(0, progress)
+        last.append(float(method.batch(scene, torch.Generator().manual_seed(0)).rays.time.max()))
+        encoded = method.network.canonical.encode(points).view(20, base.table.levels, -1)
+        assert bool(encoded[:, -1].any()) == (progress == 0.5) and encoded[:, 0].any()
+    assert last == [1.0, 6.0, 11.0]  # a tenth of the capture, 0.55 of it, and all
+
+
 def test_background_points_that_move_cost():
     method = Nerfies(FRAME, Nerfies.smallest())
     method.background_points = random(50, 3).float()

@@ -181,7 +181,7 @@ LACKING = {
     HasLevels: "has no levels of detail; nglod has",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     RefinesPoses: "learns no poses of photographs; give --refine-cameras to a method that can",
-    HasMotion: "does not know where points of a surface go; nerfies and deformable-splatting do",
+    HasMotion: "does not know where points of a surface go; nerfies, nsff and deformable-splatting do",
     HasVisibility: "does not know which places its photographs saw; block-nerf does",
     HasExposure: "knows no exposures of its photographs",
     HasAppearance: "learns no appearance of its photographs; block-nerf does",

@@ -20,7 +20,7 @@ from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbe
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import held_decay
+from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between
 from ...method import FieldMethod, Pass
@@ -32,6 +32,7 @@ from .elastic import elastic_loss, geman_mcclure
 from .warp import MomentCodes, Motion, MotionField, SliceField
 
 Code = Annotated[int, between(0, 1024)]  # numbers of a code; 0 for none
+FIRST_MOMENTS = 0.1  # share of the capture that is learnt from at first, where moments join
 BACKGROUND_SCALE = 0.001  # c of the background's robust loss, in scene units (the authors' release)
 
 
@@ -53,6 +54,7 @@ class DeformationNumbers:
     elastic_samples: Annotated[int, between(1, 1 << 20)] = 8192  # samples of a step where it is measured
     background_weight: NonNegative = 1.0  # weight of background points that must not move, section 3.4
     background_points: Annotated[int, between(1, 1 << 20)] = 16384  # of them in a step
+    growth: Share = 0.0  # share of the budget in which later moments join the first (Pumarola 2021); 0: at once
     slice_dimensions: Annotated[int, between(0, 16)] = 0  # ambient dimensions of HyperNeRF's slice; 0: none
     slice_width: Width = 64  # channels of the slice's network (Park 2021b, section 5.1)
 
@@ -68,6 +70,7 @@ class Config:
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     deformation: DeformationNumbers = DeformationNumbers()
+    table_annealing: Share = 0.0  # share of the budget in which levels of the hash table join; 0: at once
     field: Literal["hash", "network"] = "network"  # canonical scene: the paper's networks, or a faster hash table
     appearance_code: Code = 8  # numbers of a photograph's appearance, section 3.1; 0: all have the same
     hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
@@ -95,9 +98,9 @@ class Nerfies(FieldMethod):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             if c.field == "hash":
-                canonical: Any = SlicedHash(
-                    c.table, c.hidden_width, space, frame.reach, c.appearance_code, ambient=ambient
-                )
+                self.levels = BandSchedule(c.table_annealing) if c.table_annealing else None
+                hash_of = partial(SlicedHash, c.table, c.hidden_width, space, frame.reach, c.appearance_code)
+                canonical: Any = hash_of(joining=joining_of(self.levels), ambient=ambient)
                 self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
             else:
                 build = partial(SlicedNetwork, c.network, c.hidden_width, space, code=c.appearance_code)
@@ -112,16 +115,18 @@ class Nerfies(FieldMethod):
         self.network = WarpedField(canonical, motion, slices, c.appearance_code, first)
         self.appearance = AppearanceCodes(frame.image_count, c.appearance_code) if c.appearance_code else None
         self.register_buffer("background_points", torch.zeros(0, 3))
-        self.elastic = 0.0  # weight of the elastic loss now
+        self.elastic, self.progress = 0.0, 0.0  # weight of the elastic loss now; share of the budget that is spent
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
         c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.4)
+        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
         d = replace(d, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True)
-        return replace(c, deformation=d, final_learning_rate=1e-3, decay_start=0.3, deformation_rate=0.3)
+        d = replace(d, deformation_frequencies=4, growth=0.5)
+        c = replace(c, deformation=d, table_annealing=0.5, deformation_rate=0.3)
+        return replace(c, final_learning_rate=1e-3, decay_start=0.5)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -174,9 +179,19 @@ class Nerfies(FieldMethod):
             self.background_points = data.points.to(self.device)
         super().begin(data, seconds)
 
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        """Rays of the moments that have joined: at first those of a tenth of the capture."""
+        d, time = self.config.deformation, data.cameras.time
+        if self.progress < d.growth and time is not None and self.frame.times is not None:
+            first, last = self.frame.times
+            until = first + (last - first) * (FIRST_MOMENTS + (1 - FIRST_MOMENTS) * self.progress / d.growth)
+            train = data.splits["train"]
+            data = replace(data, splits={"train": train[time[train] <= until]})
+        return super().batch(data, generator)
+
     def before_step(self, step: int, progress: float) -> None:
         """The elastic weight is constant, then falls by half a cosine over twice that time (the authors' release)."""
-        d = self.config.deformation
+        d, self.progress = self.config.deformation, progress
         fallen = min(max(progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
         self.elastic = d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
         super().before_step(step, progress)

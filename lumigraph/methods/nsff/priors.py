@@ -1,0 +1,197 @@
+"""Priors of NSFF from the photographs: optical flow to neighbouring moments (DIS), and depth of what stands still."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from ...camera import Camera
+from ...camera.lens import Lens
+from ...components.clouds.dense_points import compile_sweep, seen_points
+from ...components.fields.kept_photographs import WHERE, Kept, Taken
+from ...datasets.scene import Batch, Photograph, Scene
+from ...errors import LumigraphError
+from ...exchange.packing import Stored
+from ...files import from_json
+from ...files.ranges import typed
+from ...method import Part
+from ...method.depth import DEPTH_LAYER
+
+MAX_ROUND_TRIP = 1.0  # pixels, up to which flow forward and back must return
+MAX_SIDE = 256  # pixels along the longer side of pictures in which flow and depth are found
+SWEEP_SHARE = 0.1  # of a budget of seconds that plane sweeps may take
+UNKNOWN = -1  # in the place of a photograph
+
+DepthSource = Literal["sweeps", "files"]
+
+
+class MotionPriors(Part):
+    """Optical flow from each training photograph to those before and after it, and its depth, in small pictures.
+
+    size:    height and width of all small pictures
+    row:     of each photograph among them; -1 for one that is not learnt from
+    partner: photographs at the moment before and after that flow leads to; -1 for none
+    flow:    pixels (x, y) of small pictures, of each row, way and pixel; NaN where it is not sure
+    depth:   along rays, scene units, of each row and pixel; NaN where it is not known
+    taken:   the cameras, as JSON
+    """
+
+    size: Tensor
+    row: Tensor
+    partner: Tensor
+
+    def __init__(self, photographs: int, flows: bool, depth: DepthSource | None):
+        super().__init__()
+        self.flows, self.source = flows, depth
+        self.register_buffer("size", torch.zeros(2, dtype=torch.long))
+        self.register_buffer("row", torch.full((max(photographs, 1),), UNKNOWN))
+        self.register_buffer("partner", torch.full((max(photographs, 1), 2), UNKNOWN))
+        self.flow, self.depth = Kept(torch.zeros(0, 2, dtype=torch.half)), Kept(torch.zeros(0, dtype=torch.half))
+        self.taken = Kept(torch.zeros(0, dtype=torch.uint8))
+
+    def compile_begin(self) -> None:
+        if self.source == "sweeps":
+            compile_sweep()
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        train, cameras, device = data.splits["train"], data.cameras, self.row.device
+        smaller = math.ceil(int(cameras.size.max()) / MAX_SIDE)
+        pictures = {i: data.photograph(i).reduced(smaller) for i in train.tolist()}
+        height, width = (max(p.rgb.shape[axis] for p in pictures.values()) for axis in (0, 1))
+        self.size.copy_(torch.tensor([height, width]))
+        self.row[train] = torch.arange(len(train), device=device)
+        said = {"pose": cameras.pose.tolist(), "lens": cameras.lens.to_json(), "size": cameras.size.tolist()}
+        self.taken.rows = torch.frombuffer(bytearray(json.dumps(said).encode()), dtype=torch.uint8).to(device)
+        if self.flows and cameras.time is not None:
+            need_opencv()
+            others_of = partners(cameras, train)
+            self.partner[train] = others_of.to(device)
+            flow = torch.full((len(train), 2, height, width, 2), math.nan, dtype=torch.half)
+            for i, (photograph, others) in enumerate(zip(train.tolist(), others_of.tolist(), strict=True)):
+                for way, other in enumerate(others):
+                    if other != UNKNOWN:
+                        offsets = checked_flow(bytes_of(pictures[photograph]), bytes_of(pictures[other]))
+                        flow[i, way, : offsets.shape[0], : offsets.shape[1]] = torch.from_numpy(offsets).half()
+            self.flow.rows = flow.view(-1, 2).to(device)
+        if self.source is not None:
+            depth = self.known_depth(data, train.tolist(), smaller, (height, width), seconds)
+            self.depth.rows = depth.flatten().to(device)
+
+    def known_depth(
+        self, data: Scene, train: list[int], smaller: int, size: tuple[int, int], seconds: float
+    ) -> Float[Tensor, "photograph height width"]:
+        """Depth from the capture's layer, or by plane sweeps, which match what stands still alone."""
+        depth = torch.full((len(train), *size), math.nan, dtype=torch.half)
+        if self.source == "files":
+            for i, number in enumerate(train):
+                known = data.photograph(number, [DEPTH_LAYER]).reduced(smaller).extra[DEPTH_LAYER]
+                depth[i, : known.shape[0], : known.shape[1]] = known.half()
+            return depth
+        found = seen_points(data, SWEEP_SHARE * seconds)
+        cameras, chosen = data.cameras, torch.tensor(train)
+        if len(found.positions):
+            distance = torch.cdist(found.origins, cameras.position[chosen])
+            i = distance.argmin(1)
+            pixels, visible = cameras.project(found.positions, chosen[i])
+            x, y = (pixels / smaller).long().unbind(-1)
+            inside = visible & (x >= 0) & (y >= 0) & (x < size[1]) & (y < size[0])
+            away = (found.positions - found.origins).norm(dim=-1)
+            depth[i[inside], y[inside], x[inside]] = away[inside].half()
+        return depth
+
+    @cached_property
+    def cameras(self) -> Camera:
+        """Cameras of all photographs."""
+        said = typed(Taken, from_json(self.taken.rows.cpu().numpy().tobytes(), WHERE), WHERE)
+        lens, pose, size = Lens.from_json(said.lens, WHERE), torch.tensor(said.pose), torch.tensor(said.size)
+        return Camera(pose, lens, size).to(self.row.device)
+
+    def flow_targets(self, batch: Batch, way: Int[Tensor, " ray"]) -> tuple[Float[Tensor, "ray 2"], Tensor]:
+        """Pixels at which other photographs show what rays see, NaN where that is not known, and their numbers.
+
+        way: 0 for the moment before, 1 for the one after
+        """
+        image, sizes = batch.rays.image_index, self.cameras.size[batch.rays.image_index]
+        row, within = self.cells(batch)
+        moved = self.flow.rows[(2 * row + way) * int(self.size.prod()) + within].float()
+        return batch.extra["place"] * sizes + moved * (sizes / self.small(sizes)), self.partner[image, way]
+
+    def depth_targets(self, batch: Batch) -> Float[Tensor, " ray"]:
+        """Depth of rays; NaN where it is not known."""
+        row, within = self.cells(batch)
+        return self.depth.rows[row * int(self.size.prod()) + within].float()
+
+    def small(self, sizes: Int[Tensor, "ray 2"]) -> Int[Tensor, "ray 2"]:
+        """Width and height of the small pictures of photographs."""
+        return (sizes // math.ceil(int(self.cameras.size.max()) / MAX_SIDE)).clamp_min(1)
+
+    def cells(self, batch: Batch) -> tuple[Int[Tensor, " ray"], Int[Tensor, " ray"]]:
+        """Row of each ray's photograph, and the pixel's number in its small picture."""
+        assert batch.rays.image_index is not None
+        small = self.small(self.cameras.size[batch.rays.image_index])
+        x, y = torch.minimum((batch.extra["place"] * small).long(), small - 1).unbind(-1)
+        return self.row[batch.rays.image_index], y * self.size[1] + x
+
+    def storage(self) -> dict[str, Stored]:
+        """Rendering needs none of it."""
+        return {f"{name}.rows": Stored("nothing") for name in ("flow", "depth", "taken")}
+
+
+def partners(cameras: Camera, train: Int[Tensor, " photograph"]) -> Int[Tensor, "photograph 2"]:
+    """For each training photograph the one at the moment before, and after, whose camera is nearest to its own."""
+    assert cameras.time is not None
+    times, position = cameras.time[train], cameras.position[train]
+    moments = times.unique()
+    found = torch.full((len(train), 2), UNKNOWN)
+    for i, moment in enumerate(torch.searchsorted(moments, times).tolist()):
+        for way, other in ((0, moment - 1), (1, moment + 1)):
+            if 0 <= other < len(moments):
+                there = (times == moments[other]).nonzero()[:, 0]
+                found[i, way] = train[there[(position[there] - position[i]).norm(dim=-1).argmin()]]
+    return found
+
+
+def bytes_of(photograph: Photograph) -> UInt8[np.ndarray, "height width"]:
+    """Its grey values, before black."""
+    import cv2
+
+    return cv2.cvtColor((photograph.before((0.0, 0.0, 0.0)) * 255).byte().numpy(), cv2.COLOR_RGB2GRAY)
+
+
+def checked_flow(
+    first: UInt8[np.ndarray, "height width"], second: UInt8[np.ndarray, "rows columns"]
+) -> Float[np.ndarray, "height width 2"]:
+    """Flow from one picture to another by DIS (Kroeger 2016), NaN where the way back leads elsewhere."""
+    import cv2
+
+    if first.shape != second.shape:
+        second = cv2.resize(second, first.shape[::-1], interpolation=cv2.INTER_AREA)
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    forward, back = dis.calc(first, second, None), dis.calc(second, first, None)
+    y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
+    there = np.stack([x, y], -1) + forward
+    returned = cv2.remap(back, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderValue=(np.nan, np.nan))
+    sure = np.linalg.norm(forward + returned, axis=-1) < MAX_ROUND_TRIP
+    return np.where(sure[..., None], forward, np.nan).astype(np.float32)
+
+
+def need_opencv() -> None:
+    """Raises LumigraphError where OpenCV is missing."""
+    try:
+        import cv2  # noqa: F401
+    except ImportError:
+        raise LumigraphError(
+            "nsff finds optical flow by OpenCV, which is missing; pip install 'lumigraph[flow]', or --flow-weight 0"
+        ) from None
+
+
+def seen(mask: Bool[Tensor, " ray"], values: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
+    """Mean of values where a mask says so; 0 without any."""
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp_min(1)
