@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Annotated, Any, ClassVar
@@ -100,8 +99,7 @@ class SpaceTimePlanes(nn.Module):
 def spread(points: Float[Tensor, "point 3"], count: int) -> Int[Tensor, " chosen"]:
     """Indices of points that are spread evenly: one in each cell of a grid, of which at most `count` hold points."""
     low, size = points.amin(0), float((points.amax(0) - points.amin(0)).max().clamp_min(MIN_DISTANCE))
-    cells = math.ceil(count ** (1 / 3))
-    best = torch.zeros(1, dtype=torch.long)
+    best, cells = torch.zeros(1, dtype=torch.long), 1
     while True:
         key = ((points - low) / size * cells).floor().long()
         _, place = (key * torch.tensor([1, cells + 1, (cells + 1) ** 2])).sum(1).unique(return_inverse=True)
@@ -232,7 +230,7 @@ class PlaneMotion(Addition):
         self.carriers, self.shares = (x.new_zeros(count, CARRIERS) for x in (self.neighbours, means))
         if self.numbers.nodes:
             self.place_nodes(means, rows)
-        elif len(rows) > NEIGHBOURS:
+        if not self.node_count and len(rows) > NEIGHBOURS:
             points = means[rows].cpu().numpy()
             _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
             self.neighbours[rows] = rows[torch.from_numpy(nearest[:, 1:]).to(device)]
