@@ -269,7 +269,8 @@ def _read(path: Path, data: bytes) -> MovingGaussians:
     cursor.take(len(MAGIC))
     header: dict[str, Any] = {}
     grid: dict[str, float] = {}
-    table, chunk, bands = np.zeros((1, 2)), None, {}
+    table, chunk = np.zeros((1, 2)), None
+    bands: dict[int, np.ndarray] = {}
     parts: list[tuple[dict[int, np.ndarray], dict[int, np.ndarray]]] = []
     while len(data) - cursor.at > len(MAGIC):
         opcode, size = cursor.unpack("<BQ")
@@ -385,4 +386,4 @@ def _dequantized(header: dict[str, Any], grid: dict[str, float], table: Any, par
     spans = np.maximum(spans[:, 0], middles - seen), np.minimum(spans[:, 1], middles + seen)
     rows = bins[MOTION] * velocity_step[:, None], middles, *spans, deviation
     tensors = [torch.from_numpy(np.array(x, np.float32, order="C")) for x in rows]
-    return MovingGaussians(found, *tensors, header["duration"])
+    return MovingGaussians(found, header["duration"], *tensors)

@@ -24,20 +24,20 @@ class MovingGaussians:
     """Gaussians of spans of time: shown for begin <= t < end, with centres at mean + velocity (t - middle).
 
     cloud:       as it is at `middles`
+    duration:    seconds
     velocities:  in the frame's units per second
     middles:     seconds of the clock, which starts at 0
     begins, ends: of the spans, seconds
     fades:       deviation in seconds, by which opacity falls off from the middle; infinite for none
-    duration:    seconds
     """
 
     cloud: Gaussians
+    duration: float
     velocities: Float[Tensor, "gaussian 3"]
     middles: Float[Tensor, " gaussian"]
     begins: Float[Tensor, " gaussian"]
     ends: Float[Tensor, " gaussian"]
     fades: Float[Tensor, " gaussian"]
-    duration: float
 
     def __len__(self) -> int:
         return len(self.cloud)
@@ -45,7 +45,7 @@ class MovingGaussians:
     def __getitem__(self, index: slice | Tensor) -> MovingGaussians:
         """The Gaussians that a slice, mask or index tensor picks."""
         tensors = self.velocities, self.middles, self.begins, self.ends, self.fades
-        return MovingGaussians(self.cloud[index], *(x[index] for x in tensors), self.duration)
+        return MovingGaussians(self.cloud[index], self.duration, *(x[index] for x in tensors))
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> MovingGaussians:
         """The same in another frame, x' = M x."""
@@ -126,7 +126,7 @@ def fitted(
     stops = torch.cat([torch.full((len(still),), duration, device=rows.device), end * unit])
     velocities = torch.cat([torch.zeros_like(still.means), (ends[1] - ends[0]) / ((end - begin) * unit)[:, None]])
     fades = torch.full_like(begins, torch.inf)
-    return MovingGaussians(joined([still, moving]), velocities, (begins + stops) / 2, begins, stops, fades, duration)
+    return MovingGaussians(joined([still, moving]), duration, velocities, (begins + stops) / 2, begins, stops, fades)
 
 
 def spans(
@@ -147,7 +147,8 @@ def spans(
                 halves += [(left, begin, middle), (left, middle, end)]
         pending = halves
     source = torch.cat([some for some, _, _ in found])
-    begin, end = (torch.cat([torch.full_like(part[0], part[k]) for part in found]) for k in (1, 2))
+    begin = torch.cat([torch.full_like(some, first) for some, first, _ in found])
+    end = torch.cat([torch.full_like(some, last) for some, _, last in found])
     order = torch.argsort(source * (count + 1) + begin)
     return source[order], begin[order], end[order]
 
