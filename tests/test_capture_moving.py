@@ -15,7 +15,7 @@ from budgets import budget
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.motion import capture_rig, is_rig
-from lumigraph.capture.motion.moving import Moving, check_still, check_times, leave_out_moving
+from lumigraph.capture.motion.moving import MovingFeatures, check_still, check_times, leave_out_moving
 from lumigraph.capture.motion.reconstruction import MotionOptions, nothing_fits
 from lumigraph.capture.motion.rig import CLOCKS_FILE, common_moments, films_of
 from lumigraph.capture.photos import Intake, Photo
@@ -70,13 +70,13 @@ def test_features_that_move_are_left_out(database):
     assert len(geometries) == 6 and STILL * 6 * 0.98 <= (left < STILL).sum() <= before
     assert (left >= STILL).sum() < 0.1 * 6 * MOVING
     assert all(len(x) == STILL + MOVING for x in raw)  # what was found is kept
-    assert "80 of" in Moving(80, 320).say() and "nothing was found to move" in Moving(0, 320).say()
+    assert "80 of" in MovingFeatures(80, 320).say() and "nothing was found to move" in MovingFeatures(0, 320).say()
 
 
 def test_what_cannot_be_captured_is_refused_in_a_sentence():
-    check_still("film.mp4", Moving(100, 300))
+    check_still("film.mp4", MovingFeatures(100, 300))
     with pytest.raises(LumigraphError, match=r"film.mp4: 80 % of what is seen again moves"):
-        check_still("film.mp4", Moving(240, 300))
+        check_still("film.mp4", MovingFeatures(240, 300))
     photos = [Photo("a.jpg", Path("a.jpg"), (9, 9), time=1.0), Photo("b.jpg", Path("b.jpg"), (9, 9))]
     with pytest.raises(LumigraphError, match=r"1 photograph.* no time of exposure, b.jpg first"):
         check_times("folder", photos)

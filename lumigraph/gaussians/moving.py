@@ -147,10 +147,10 @@ def spans(
                 halves += [(left, begin, middle), (left, middle, end)]
         pending = halves
     source = torch.cat([some for some, _, _ in found])
-    begin = torch.cat([torch.full_like(some, first) for some, first, _ in found])
-    end = torch.cat([torch.full_like(some, last) for some, _, last in found])
-    order = torch.argsort(source * (count + 1) + begin)
-    return source[order], begin[order], end[order]
+    firsts = torch.cat([torch.full_like(some, first) for some, first, _ in found])
+    lasts = torch.cat([torch.full_like(some, last) for some, _, last in found])
+    order = torch.argsort(source * (count + 1) + firsts)
+    return source[order], firsts[order], lasts[order]
 
 
 def span_errors(

@@ -21,7 +21,7 @@ MAX_MOVING_SHARE = 0.6  # of the features; above it nothing is still enough to f
 
 
 @dataclass(frozen=True)
-class Moving:
+class MovingFeatures:
     """Features found to move, of those that could be judged."""
 
     moving: int
@@ -34,7 +34,7 @@ class Moving:
         return f"{self.moving:,} of {self.judged:,} features move, and were left out of matching"
 
 
-def leave_out_moving(database: Path) -> Moving:
+def leave_out_moving(database: Path) -> MovingFeatures:
     """Delete matches of features that move from the verified pairs of a database.
 
     A match is an inlier of its pair where both features lie within COLMAP's error of each other's epipolar line. The
@@ -65,10 +65,10 @@ def leave_out_moving(database: Path) -> Moving:
             if len(still) >= MIN_MATCHES:
                 geometry.inlier_matches = still
                 opened.write_two_view_geometry(a, b, geometry)
-    return Moving(*(int(sum(x.sum() for x in found.values())) for found in (moves, judged)))
+    return MovingFeatures(*(int(sum(x.sum() for x in found.values())) for found in (moves, judged)))
 
 
-def check_still(source: str, found: Moving) -> None:
+def check_still(source: str, found: MovingFeatures) -> None:
     """Raise LumigraphError where so much moves that no camera can be found by the rest."""
     if found.moving > MAX_MOVING_SHARE * found.judged:
         raise LumigraphError(

@@ -55,7 +55,7 @@ from .folder import (
 )
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens, prior, write_database
-from .moving import Moving, check_still, check_times, leave_out_moving
+from .moving import MovingFeatures, check_still, check_times, leave_out_moving
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .sphere import flat_views
 from .stages import Stages, key_of
@@ -312,7 +312,9 @@ class Reconstruction:
         if not self.stages.is_done("moving", key):
             with self.stages.working("moving", key), counting("Looking for what moves"):
                 write_json(self.work / MOVING_FILE, asdict(leave_out_moving(self.database)), ours=True)
-        check_still(self.intake.source, typed(Moving, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE))
+        check_still(
+            self.intake.source, typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
+        )
 
     def match(self, database: Path, among: Container[str] | None = None) -> None:
         """Match the chosen pairs; with `among`, those that have one of these photographs."""
@@ -480,7 +482,7 @@ class Reconstruction:
         diagnosis = diagnose(self.intake, self.photos, model, [names for names in others if len(names) > 1], matches)
         known = place is not None and place.new_from_old is not None
         if self.options.moving:
-            told.append(typed(Moving, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE).say())
+            told.append(typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE).say())
         if place is not None and not known:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])

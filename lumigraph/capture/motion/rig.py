@@ -24,7 +24,7 @@ SAME_RATE, SAME_LENGTH = 0.01, 0.05  # relative, and seconds: differences that a
 
 
 @dataclass(frozen=True)
-class Film:
+class RigVideo:
     """A video of a rig. begin: seconds at which it begins, on the clock of all;  rate: frames per second"""
 
     path: Path
@@ -51,7 +51,7 @@ def list_videos(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if is_video(path))
 
 
-def films_of(folder: Path) -> list[Film]:
+def films_of(folder: Path) -> list[RigVideo]:
     """The videos of a folder, with their clocks. Raises LumigraphError for clocks that name none of them."""
     clocks: dict[str, float] = {}
     if is_file(folder / CLOCKS_FILE):
@@ -62,11 +62,11 @@ def films_of(folder: Path) -> list[Film]:
     found = []
     for path in videos:
         with opened(path) as film:
-            found.append(Film(path, clocks.get(path.name, 0.0), duration(film), speed(film)))
+            found.append(RigVideo(path, clocks.get(path.name, 0.0), duration(film), speed(film)))
     return found
 
 
-def common_moments(films: Sequence[Film], count: int | None) -> tuple[list[float], list[str]]:
+def common_moments(films: Sequence[RigVideo], count: int | None) -> tuple[list[float], list[str]]:
     """Moments that all videos show, evenly spread, and what was done about lengths and rates that differ.
 
     Raises LumigraphError where there are none.
@@ -114,7 +114,8 @@ def capture_rig(
     with replacing_folder(folder / "images", "capture") as partial:
         for film in track(films, "Taking frames", len(films)):
             take(film, moments, partial / film.path.stem)
-    poses, lens, found = given_poses(source, films), {}, ""
+    lens: dict[str, Any] = {}
+    poses, found = given_poses(source, films), ""
     if poses is None:
         poses, lens = found_poses(films, folder, options, track)
         found = " found"
@@ -135,7 +136,7 @@ def step_of(moments: Sequence[float]) -> str:
     return f"{1000 * (moments[1] - moments[0]):.0f} ms apart" if len(moments) > 1 else "of one frame"
 
 
-def take(film: Film, moments: Sequence[float], folder: Path) -> None:
+def take(film: RigVideo, moments: Sequence[float], folder: Path) -> None:
     """Write the frame of each moment. Raises LumigraphError where the video ends before its last one."""
     folder.mkdir(parents=True)
     numbers = film.numbers(moments)
@@ -146,7 +147,7 @@ def take(film: Film, moments: Sequence[float], folder: Path) -> None:
         save(pictures[number], folder / f"{i:04}.jpg", ".jpg")
 
 
-def given_poses(source: Path, films: Sequence[Film]) -> dict[str, dict[str, Any]] | None:
+def given_poses(source: Path, films: Sequence[RigVideo]) -> dict[str, dict[str, Any]] | None:
     """Frames of the transforms.json beside videos, by the videos' names without endings, each with the lens that the
     file gives for all; None without one. Raises LumigraphError where a video has no pose."""
     path = source / "transforms.json"
@@ -161,7 +162,7 @@ def given_poses(source: Path, films: Sequence[Film]) -> dict[str, dict[str, Any]
 
 
 def found_poses(
-    films: Sequence[Film], folder: Path, options: MotionOptions, track: Track
+    films: Sequence[RigVideo], folder: Path, options: MotionOptions, track: Track
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     """Poses by the pictures of the first moment, and the lens that all share."""
     if len(films) < MIN_VIEWS:
