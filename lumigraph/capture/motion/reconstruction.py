@@ -482,7 +482,7 @@ class Reconstruction:
         diagnosis = diagnose(self.intake, self.photos, model, [names for names in others if len(names) > 1], matches)
         known = place is not None and place.new_from_old is not None
         if self.options.moving:
-            told.append(typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE).say())
+            told.append(self.found_to_move().say())
         if place is not None and not known:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
