@@ -10,9 +10,9 @@ import torch
 from budgets import budget
 
 from lumigraph.components.clouds.addition import Step
-from lumigraph.geometry import rotated
+from lumigraph.geometry import multiply, rotated
 from lumigraph.methods.deformable_splatting import DeformableSplatting
-from lumigraph.methods.deformable_splatting.planes import PAIRS, PlaneMotion, SpaceTimePlanes
+from lumigraph.methods.deformable_splatting.planes import PAIRS, PlaneMotion, SpaceTimePlanes, spread
 
 pytestmark = budget("methods", 5)
 FRAME = replace(tiny.scene().frame, times=(1.0, 3.0))
@@ -89,8 +89,10 @@ def test_gaussians_that_hardly_move_stand_still():
 def test_a_rigid_motion_does_not_bend():
     """A motion field that turns all as one, in place of the planes: no bending; one that stretches: its square."""
     cloud = DeformableSplatting(FRAME, DeformableSplatting.smallest()).filtered()
-    motion, generator = PlaneMotion(FRAME, DeformableSplatting.smallest().motion, 50), torch.Generator().manual_seed(0)
-    motion.follow_cloud(cloud.means.detach())
+    numbers, generator = DeformableSplatting.smallest().motion, torch.Generator().manual_seed(0)
+    motion, noded = PlaneMotion(FRAME, replace(numbers, nodes=0), 50), PlaneMotion(FRAME, numbers, 50)
+    for each in (motion, noded):
+        each.follow_cloud(cloud.means.detach())
     angle = torch.tensor([0.0, 0.0, 0.7])
     turn = torch.tensor([torch.cos(angle[2] / 2), 0, 0, torch.sin(angle[2] / 2)])
 
@@ -101,16 +103,56 @@ def test_a_rigid_motion_does_not_bend():
     def stretching(means, time):
         return 0.1 * means, torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4), torch.zeros_like(means)
 
-    motion.offsets = turning
-    assert float(motion.bending(cloud, 2.0, generator)) < 1e-8
-    motion.offsets = stretching
-    assert float(motion.bending(cloud, 2.0, generator)) == pytest.approx(0.01, rel=1e-3)
+    for each in (motion, noded):
+        each.offsets = turning
+        assert float(each.bending(cloud, 2.0, generator)) < 1e-8
+        each.offsets = stretching
+        assert float(each.bending(cloud, 2.0, generator)) == pytest.approx(0.01, rel=1e-3)
     keep = torch.arange(len(cloud)) % 3 > 0
     places = cloud.means.detach()
     before = places[motion.neighbours]
     motion.prune(keep)
     found, own = places[keep][motion.neighbours], places[keep][:, None]
     assert ((found == before[keep]) | (found == own)).all() and (found != own).any()
+
+
+def test_nodes_carry_gaussians_rigidly():
+    """Under a motion that turns all as one, Gaussians that nodes carry are turned exactly."""
+    method = moving()
+    motion, cloud = method.motion, method.filtered()
+    motion.follow_cloud(cloud.means.detach())
+    assert 6 < int(motion.node_count) <= 20
+    angle = torch.tensor([0.1, -0.3, 0.5])
+    turn = torch.cat([(angle.norm() / 2).cos()[None], (angle.norm() / 2).sin() * angle / angle.norm()])
+
+    def turning(means, time):
+        there = rotated(means, angle.expand(len(means), 3)) + 0.3
+        return there - means, turn.expand(len(means), 4), torch.full_like(means, 0.2)
+
+    motion.offsets = turning
+    there = motion.at(cloud, 2.0)
+    torch.testing.assert_close(there.means, rotated(cloud.means, angle.expand(len(cloud), 3)) + 0.3, atol=1e-5, rtol=0)
+    torch.testing.assert_close(there.quaternions, multiply(turn[None], cloud.quaternions), atol=1e-5, rtol=0)
+    torch.testing.assert_close(there.log_scales, cloud.log_scales + 0.2)
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0))
+    chosen = spread(points, 40)
+    assert 20 < len(chosen) <= 40 and len(set(chosen.tolist())) == len(chosen)
+    assert torch.cdist(points, points[chosen]).amin(1).max() < 0.5
+    assert len(spread(points[:3], 40)) == 3
+
+
+def test_moments_join_from_the_middle_on():
+    scene = tiny.scene()
+    times = torch.linspace(1, 3, len(scene.cameras))
+    timed = replace(scene, cameras=replace(scene.cameras, time=times))
+    method, train = moving(), scene.splits["train"]
+    spans = []
+    for progress in (0.0, 0.15, 0.3):
+        method.progress = progress
+        joined = method.joined_photographs(timed)
+        spans.append(float((times[joined] - 2).abs().max()))
+        assert set(joined.tolist()) <= set(train.tolist())
+    assert spans[0] < 0.25 < spans[1] < 0.6 and len(joined) == len(train)
 
 
 def test_points_are_followed_with_the_gaussians_around_them():

@@ -191,6 +191,8 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "motion.plane_scales": 2,
         "motion.plane_features": 32,
         "motion.motion_width": 64,
+        "motion.nodes": 0,
+        "motion.all_moments_from": 0.0,
         "motion.still_until": 3000 / 23_000,
         "motion.plane_smoothness": 1e-4,
         "motion.time_smoothness": 0.01,

@@ -42,18 +42,28 @@ class CaptureCommand:
     max_size: Annotated[int, between(200, 65_536), option("PIXELS")] = 1600
     """Longer side of photographs for feature detection; larger finds more features and is slower."""
 
+    moving: bool = False
+    """Things move: leave them out of matching, and give each photograph its time, so that methods of moving scenes
+    train on it. A folder of videos is a rig: one standing camera each, filmed at once."""
     mask_object: bool = False
     """Mask one object in front of a backdrop, so that training learns it alone. Writes object_masks/ and object.png
     into the scene; check that picture before you train."""
 
     def run(self) -> int:
-        from ..capture.motion import MotionOptions
+        from ..capture.motion import MotionOptions, capture_rig, is_rig
+        from ..system.progress import track
 
         if not self.what:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
-        options = MotionOptions(self.frames, self.mapper, self.matching, self.camera, self.max_size)
+        options = MotionOptions(self.frames, self.mapper, self.matching, self.camera, self.max_size, self.moving)
         folder = self.output or scene_folder(self.what)
-        onward = typed("train", "gaussian-splatting", folder)
+        if self.moving and len(self.what) == 1 and is_rig(self.what[0].expanduser()):
+            rows, said = capture_rig(self.what[0].expanduser(), folder, options, track)
+            show(rows | {"scene": str(folder), "next": typed("train", "deformable-splatting", folder)})
+            for sentence in said:
+                say(f"warning: {sentence}")
+            return 0
+        onward = typed("train", "deformable-splatting" if self.moving else "gaussian-splatting", folder)
         show_result(folder, find_cameras(self.what, folder, options), None if self.mask_object else onward)
         if self.mask_object:
             show_masks(folder, onward)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, 
 
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import claim
-from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Share, SphereSize, between
+from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, Share, SphereSize, between
 from .common import show
 from .export_web import ExportWeb
 from .options import (
@@ -22,6 +22,7 @@ from .options import (
     Scaling,
     Set,
     SourceOption,
+    at_one_moment,
     controlled,
     needed,
     open_method,
@@ -80,6 +81,8 @@ class ExportMesh:
     """Longer side of the pictures for colours and depth, at most that of the photographs; larger is finer, slower."""
     views: Annotated[Count, option("N")] = 64
     """Largest number of these pictures, and of photographs for a texture."""
+    moments: Annotated[Annotated[int, between(2, 1000)] | None, option("N", "one, as --set time says")] = None
+    """Number of moments of a scene that moves, evenly spread: a mesh each, FILE-000 and on."""
     scene: PhotographsOption = None
     overwrite: Overwrite = False
     scaling: OmitArgPrefixes[Scaling] = Scaling()
@@ -90,6 +93,8 @@ class ExportMesh:
     def run(self) -> int:
         from ..export.mesh_file import files_of, write_mesh
 
+        if self.moments is not None:
+            return self._sequence(self.moments)
         for path in files_of(self.output, self.texture):
             claim(path, "mesh", self.overwrite, [self.source])
         opened, mesh, why = self.extracted()
@@ -98,12 +103,26 @@ class ExportMesh:
         show(self.rows(opened, mesh, written, why))
         return 0
 
+    def _sequence(self, count: int) -> int:
+        """Write a mesh of each of some moments."""
+        from ..run import open_any
+
+        times = open_any(self.source).frame.times
+        if times is None:
+            raise LumigraphError(f"{self.source} does not move, so it has one mesh; leave out --moments")
+        for i in range(count):
+            time = times[0] + (times[1] - times[0]) * i / (count - 1)
+            output = self.output.with_stem(f"{self.output.stem}-{i:03}")
+            replace(self, output=output, moments=None, settings=(*self.settings, f"time={time:.9g}")).run()
+        return 0
+
     def extracted(self) -> tuple[Any, Any, str]:
         """The opened source, its mesh in the frame of exports, and the source of the surface as text."""
         from ..export.mesh import best_way, extract_mesh
 
         for_phones = self.output.suffix.lower() == ".usdz" and not self.texture
         opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
+        method = at_one_moment(method)
         way, why = best_way(method) if self.way == "auto" else (self.way, f"{self.way}, as --from says")
         mesh = extract_mesh(
             self.part.without_floaters(method, opened),
@@ -195,19 +214,57 @@ class ExportSplats:
 
     The ending chooses the format: .ply (lossless), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no view-dependent
     colour); NEW/meta.json is a folder of SOG, NEW/lod-meta.json (or NEW with --lod) one of streamed SOG. The export of
-    a run is in the frame of its photographs.
+    a run is in the frame of its photographs. Of a scene that moves, .4dgs holds every moment, the others one
+    (--set time=0.3).
     """
 
     source: SourceOption
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
     detail: OmitArgPrefixes[Levels] = Levels()
+    duration: Annotated[Seconds, option("SECONDS")] = 3.0
+    """With .4dgs: time that the whole capture takes when it is played; longer is slower."""
     overwrite: Overwrite = False
     scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
 
     def run(self) -> int:
+        from ..exchange.fourdgs import is_moving_file
+
+        return self._moving() if is_moving_file(self.output) else self._one_moment()
+
+    def _moving(self) -> int:
+        """Write every moment of a run or file that moves."""
+        from ..exchange.fourdgs import write_moving
+        from ..method.capabilities import HasMovingGaussians, needs
+        from ..run import open_any
+
+        if self.detail.given or self.detail.lod:
+            raise LumigraphError("A .4dgs has no levels of detail; leave out --lod and its options")
+        claim(self.output, "splats", self.overwrite, [self.source])
+        opened = open_any(self.source)
+        self.scaling.remember(opened)
+        method = controlled(opened, opened.method(), self.settings)
+        if "time" in method.settings:
+            raise LumigraphError("A .4dgs holds every moment; leave out --set time, or name a .spz for one of them")
+        moving = needs(method, HasMovingGaussians).moving(self.duration)
+        crop = self.part.crop(method.frame)
+        kept = self.part.kept(moving.cloud, crop, method.frame, photographers(opened, method))
+        moving = moving[kept]
+        write_moving(self.output, moving.transformed(opened.frame.to_export.matrix))
+        size, still = self.output.stat().st_size, len(moving) - moving.moving
+        rows = {
+            "file": str(self.output),
+            "Gaussians": f"{still:,} that stand still, {moving.moving:,} spans of those that move",
+            "duration": f"{moving.duration:g} s",
+            "size": f"{size / 1e6:.1f} MB, {size / max(len(moving), 1):.1f} bytes each",
+        }
+        show(rows)
+        return 0
+
+    def _one_moment(self) -> int:
+        """Write a cloud as it is at one moment."""
         from ..exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ..exchange.streamed_sog import Detail
         from ..method.capabilities import HasGaussians, needs
@@ -313,7 +370,7 @@ class ExportPoints:
         from ..export.points import extract_points, write_points
 
         opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
-        seers = opened.survey(cameras["train"])
+        seers, method = opened.survey(cameras["train"]), at_one_moment(method)
         method, crop = self.part.without_floaters(method, opened), self.part.crop(opened.frame)
         points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
         write_points(self.output, points, opened.frame.origin)

@@ -15,7 +15,18 @@ from ..errors import LumigraphError
 from ..files import claim
 from ..files.ranges import Seconds, between
 from .common import choose_device, show
-from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, needed, open_method, option, photographers
+from .options import (
+    DeviceOption,
+    Keeping,
+    Overwrite,
+    Set,
+    SourceOption,
+    at_one_moment,
+    needed,
+    open_method,
+    option,
+    photographers,
+)
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "volume", "mesh", "views"]
@@ -25,9 +36,9 @@ Kind = Literal["auto", "splats", "volume", "mesh", "views"]
 class ExportWeb:
     """Export one HTML file that opens from disk, in any browser, without a server or a network.
 
-    Gaussians are drawn as splats, octrees and atlases by ray marching. Other fields of objects are converted to an
-    octree first; `lumigraph convert` keeps one. --as views and --as mesh need no conversion: pictures rendered from all
-    around, or a coloured mesh.
+    Gaussians are drawn as splats, with a slider of the moment where they move; octrees and atlases by ray marching.
+    Other fields of objects are converted to an octree first; `lumigraph convert` keeps one. --as views and --as mesh
+    need no conversion: pictures rendered from all around, or a coloured mesh.
     """
 
     source: SourceOption
@@ -55,6 +66,8 @@ class ExportWeb:
     """Highest degree of an octree's harmonics; a lower one makes a smaller page, with weaker reflections."""
     seconds: Annotated[Seconds, option("S")] = 30.0
     """Training time of the octree that a field is converted to, in seconds."""
+    duration: Annotated[Seconds, option("SECONDS")] = 3.0
+    """Of splats that move: time that the whole capture takes when it is played; longer is slower."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
@@ -70,13 +83,14 @@ class ExportWeb:
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
         kind = self._kind(opened, method)
+        still = at_one_moment(method)
         rows: dict[str, str] = {}
         if kind == "volume":
             method, rows = self._baked(opened, method)
-        behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
+        behind = backdrop(still, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
-        held = self._write(kind, method, opened, cameras["train"], opening)
+        held = self._write(kind, method if kind == "splats" else still, opened, cameras["train"], opening)
         size = f"{self.output.stat().st_size / 1e6:.1f} MB"
         show(rows | {"page": str(self.output), "holds": held, "size": size})
         return 0
@@ -84,11 +98,17 @@ class ExportWeb:
     def _write(self, kind: str, method: Any, opened: Any, cameras: Any, opening: Any) -> str:
         """Write the page. Returns its contents in words."""
         from ..export.mesh import extract_mesh
-        from ..export.page import mesh_page, splats_page, views_page, volume_page
-        from ..method.capabilities import HasGaussians, needs
+        from ..export.page import mesh_page, moving_page, splats_page, views_page, volume_page
+        from ..method.capabilities import HasGaussians, HasMovingGaussians, can, needs
 
         if kind == "splats":
             seers, crop = photographers(opened, method), self.part.crop(method.frame)
+            if can(method, HasMovingGaussians) and "time" not in method.settings and method.frame.times:
+                moving = method.moving(self.duration)
+                moving = moving[self.part.kept(moving.cloud, crop, method.frame, seers)]
+                moving_page(self.output, moving, opening)
+                still = len(moving) - moving.moving
+                return f"{still:,} Gaussians that stand still, {moving.moving:,} spans of those that move"
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, crop, method.frame, seers)
             splats_page(self.output, gaussians, opening)

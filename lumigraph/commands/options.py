@@ -81,6 +81,12 @@ def controlled(opened: Any, method: Any, settings: Iterable[str]) -> Any:
     return method.given(**{name: by_number(opened, method, name, value) for name, value in values.items()})
 
 
+def at_one_moment(method: Any) -> Any:
+    """A method that moves, at the moment of --set or at its first one, for all cameras; any other as it is."""
+    control = next((one for one in method.controls if one.name == "time"), None)
+    return method if control is None else method.given(time=method.control("time"))
+
+
 def animate(opened: Any, method: Any, settings: Iterable[str], frames: int) -> Any:
     """The method of each frame of a film by --animate; the method itself without --animate."""
     from ..export.film import animated
@@ -202,7 +208,11 @@ class Keeping(Cropping):
         return self.clean or bool(self.strength) or self.max_scale is not None
 
     def of_gaussians(self, gaussians: Any, crop: Any, frame: Any, cameras: Any) -> Any:
-        """Gaussians to keep. Raises LumigraphError if that is none.
+        """Gaussians to keep. Raises LumigraphError if that is none."""
+        return gaussians[self.kept(gaussians, crop, frame, cameras)]
+
+    def kept(self, gaussians: Any, crop: Any, frame: Any, cameras: Any) -> Any:
+        """Mask of the Gaussians to keep. Raises LumigraphError if that is none.
 
         cameras: of the photographs, in the cloud's frame; None without photographs
         """
@@ -216,18 +226,23 @@ class Keeping(Cropping):
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
                 "or clean less"
             )
-        return gaussians[~lost]
+        return ~lost
 
     def of_method(self, method: Any, opened: Any) -> Any:
         """The cropped method without floaters, ready to render. Raises LumigraphError where it can have no floaters.
 
         opened: the run or file that the method is of
         """
-        from ..composition import PickedCloud, cropped
+        from ..composition import FilteredCloud, PickedCloud, cropped
         from ..method.capabilities import HasGaussians, can, needs
 
         crop = self.crop(method.frame)
-        if self.removes or (crop is not None and can(method, HasGaussians)):
+        moves = any(control.name == "time" for control in method.controls)
+        if self.removes and moves:
+            gaussians = needs(method, HasGaussians).gaussians()
+            method = FilteredCloud(method, self.kept(gaussians, None, method.frame, photographers(opened, method)))
+            return method if crop is None else cropped(method, crop)
+        if self.removes or (crop is not None and can(method, HasGaussians) and not moves):
             gaussians = needs(method, HasGaussians).gaussians()
             kept = self.of_gaussians(gaussians, crop, method.frame, photographers(opened, method))
             return PickedCloud(method.frame, kept)

@@ -7,3 +7,5 @@ from .composed import cropped as cropped
 from .placed import Placed as Placed
 from .placed import frame_around as frame_around
 from .placed import standing as standing
+from .played import FilteredCloud as FilteredCloud
+from .played import PlayedCloud as PlayedCloud

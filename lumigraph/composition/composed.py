@@ -125,8 +125,8 @@ class ComposedCloud(Composed):
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
-        near = NEAR_PLANE_SCALE * self.frame.near
-        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
+        near, cloud = NEAR_PLANE_SCALE * self.frame.near, at_moment_of(self, camera).gaussians()
+        return splatting.render(cloud, camera.to(self.device), self.frame.background, near)
 
 
 class ComposedMixture(Composed):
@@ -205,6 +205,15 @@ class PickedCloud(Method):
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("Gaussians that were picked from a cloud do not learn; resume the run they came from")
+
+
+def at_moment_of(method: Any, camera: Camera) -> Any:
+    """The method at the moment of a camera, if both have one and --set does not say another."""
+    control = next((one for one in method.controls if one.name == "time"), None)
+    if control is None or control.range is None or camera.time is None or "time" in method.settings:
+        return method
+    low, high = control.range
+    return method.given(time=min(max(float(camera.time[0]), low), high))
 
 
 def union(looks: Sequence[Look]) -> Look:

@@ -31,9 +31,11 @@ from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..exchange import spz
 from ..exchange.baked import Browsable
+from ..exchange.codes import TURN_MEAN
 from ..figures import to_bytes
 from ..files import write_bytes
 from ..gaussians import Gaussians
+from ..gaussians.moving import MovingGaussians
 from ..geometry import evenly
 from ..method import Method
 from ..paths import Surroundings, camera_path, film_size
@@ -116,6 +118,20 @@ def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
     with counting(f"Packing {len(gaussians):,} Gaussians"):
         packed = spz.gzipped(gaussians, steps=HARMONICS_STEPS)
     write_bytes(path, page_bytes("splats", settings, packed), "page")
+
+
+def moving_page(path: Path, moving: MovingGaussians, opening: Opening) -> None:
+    """Write a page that plays a moving cloud in the scene's frame: its spans as .spz, and the times and velocities of
+    each, the latter in 16 bits. Gaussians of one source lie beside each other, so that what they share is packed away.
+    """
+    with counting(f"Packing {len(moving):,} Gaussians"):
+        packed = spz.gzipped(moving.cloud, steps=HARMONICS_STEPS)
+        times = torch.stack([moving.middles, moving.begins, moving.ends, 1 / moving.fades])
+        velocities = (moving.velocities.cpu().numpy() * TURN_MEAN).T.astype("<f2")
+        rest = times.cpu().numpy().astype("<f4").tobytes() + np.ascontiguousarray(velocities).tobytes()
+    settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": moving.cloud.antialiased}
+    settings |= {"splats": len(packed), "duration": moving.duration}
+    write_bytes(path, page_bytes("splats", settings, packed + gzip.compress(rest, 9, mtime=0)), "page")
 
 
 def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:

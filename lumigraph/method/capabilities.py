@@ -17,6 +17,7 @@ from ..errors import LumigraphError
 from ..exchange.baked import Atlas, Octree
 from ..exchange.packing import Stored
 from ..gaussians import Gaussians
+from ..gaussians.moving import MovingGaussians
 from .field import Colours, Densities, Directions, Points
 
 
@@ -100,6 +101,13 @@ class HasMotion(Protocol):
 
     def follow(self, points: Points, start: float, end: float) -> Points:
         """Positions at one moment of surface points of another, moments in the unit of `Frame.times`."""
+
+
+class HasMovingGaussians(Protocol):
+    """Is a cloud of Gaussians that moves."""
+
+    def moving(self, duration: float) -> MovingGaussians:
+        """The scene as a moving cloud, in the scene's frame, played in so many seconds."""
 
 
 class HasVisibility(Protocol):

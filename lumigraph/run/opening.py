@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import methods
+from ..composition import PlayedCloud
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..exchange import is_splat_file, place_of, read_gaussians, snerg
+from ..exchange import fourdgs, is_splat_file, place_of, read_gaussians, snerg
 from ..exchange.baked import Atlas
 from ..files import is_file, read_json
 from ..files.ranges import changed
@@ -33,13 +34,15 @@ WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
 
 def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
-    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a folder of
-    SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
+    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
+    one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
 
     within: what it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
     """
     path = Path(path)
+    if fourdgs.is_moving_file(path):
+        return MovingFile(path)
     if is_splat_file(path):
         return SplatFile(place_of(path))
     if path.suffix.lower() == ".json" and not path.is_dir():
@@ -81,6 +84,19 @@ class SplatFile(Opened):
 
     def source_gaussians(self) -> Gaussians:
         return self.gaussians
+
+
+class MovingFile(Opened):
+    """A moving cloud in a file, with a ring of cameras around it."""
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        self.moving = fourdgs.read_moving(self.path)
+        self.frame = replace(frame_of(self.moving.at(0.0)), times=(0.0, self.moving.duration))
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The moving cloud, ready to render."""
+        return PlayedCloud(self.frame, self.moving.transformed(self.frame.to_source.inverse.matrix)).to(device)
 
 
 def frame_of(gaussians: Gaussians) -> Frame:

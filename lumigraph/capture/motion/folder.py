@@ -122,10 +122,13 @@ def stamp(path: Path) -> tuple[int, int]:
     return about.st_mtime_ns, about.st_size
 
 
-def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo], z_up: bool) -> None:
+def write_model(
+    folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo], z_up: bool, moving: bool = False
+) -> None:
     """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`.
 
-    z_up: whether +z is known to be up, by more than how cameras were held
+    z_up:   whether +z is known to be up, by more than how cameras were held
+    moving: whether frames get the times of their photographs, in seconds from the first on
     """
     with replacing_folder(folder / "sparse", "capture") as partial:
         (partial / "0").mkdir(parents=True)
@@ -133,8 +136,13 @@ def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[P
     write_points(folder / POINTS_FILE, model)
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     up = {"up": [0.0, 0.0, 1.0]} if z_up else {}
-    images = [by_name[p.name] for p in photos if p.name in by_name]
-    write_json(folder / "transforms.json", up | transforms(model, images), "capture")
+    placed = [p for p in photos if p.name in by_name]
+    made = up | transforms(model, [by_name[p.name] for p in placed])
+    if moving:
+        first = min(p.time or 0.0 for p in placed)
+        for frame, photo in zip(made["frames"], placed, strict=True):
+            frame["time"] = (photo.time or 0.0) - first
+    write_json(folder / "transforms.json", made, "capture")
 
 
 def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> dict[str, Any]:

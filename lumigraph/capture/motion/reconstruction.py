@@ -55,6 +55,7 @@ from .folder import (
 )
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens, prior, write_database
+from .moving import MovingFeatures, check_still, check_times, leave_out_moving
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .sphere import flat_views
 from .stages import Stages, key_of
@@ -73,6 +74,7 @@ SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
 MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
 FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
+MOVING_FILE = "moving.json"  # among the work: features that move
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
 OUTPUT_VERSION = 4  # another number makes all outputs be written again
 
@@ -86,6 +88,7 @@ class MotionOptions:
     matching: which photographs are compared; auto: neighbours for a video, all up to 80 photographs, else those alike
     camera:   which photographs share a lens; spherical: they are panoramas of 360 by 180 degrees
     max_size: longer side in pixels to which photographs are reduced when details are looked for
+    moving:   whether things move: they are left out of matching, and each photograph gets its time
     """
 
     frames: int | None = None
@@ -93,6 +96,7 @@ class MotionOptions:
     matching: Matching = "auto"
     camera: Sharing = "auto"
     max_size: int = MAX_SIDE
+    moving: bool = False
 
 
 def reconstruct(
@@ -120,6 +124,8 @@ def reconstruct(
             if fresh:  # it holds nothing to keep or to go on from
                 shutil.rmtree(folder, ignore_errors=True)
             raise
+        if options.moving:
+            check_times(intake.source, photos)
         work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
         if (known := finished(folder, work_to_do.keys["result"])) is not None:
             return known
@@ -235,7 +241,7 @@ class Reconstruction:
             self.features,
         )
         places = [p.gps for p in self.photos] if self.matching == "retrieval" else None
-        matching = key_of(features, self.matching, places)
+        matching = key_of(features, self.matching, places, *(["moving"] if self.options.moving else []))
         mapping = key_of(matching, self.options.mapper)
         result = key_of(OUTPUT_VERSION, mapping, intake_identity(self.intake))
         return {"features": features, "matching": matching, "mapping": mapping, "result": result}
@@ -247,6 +253,7 @@ class Reconstruction:
         with closing(self.stages):
             self.find_features(self.keys["features"])
             self.compare(self.keys["matching"])
+            self.leave_out(self.keys["matching"])
             self.place(self.keys["mapping"])
             self.unfold(self.keys["mapping"])
             self.complete(self.keys["mapping"])
@@ -297,6 +304,17 @@ class Reconstruction:
                 opened.clear_two_view_geometries()
         with self.stages.working("matching", key):
             self.match(self.database)
+
+    def leave_out(self, key: str) -> None:
+        """Leave what moves out of the matches, if the capture is of a moving scene."""
+        if not self.options.moving:
+            return
+        if not self.stages.is_done("moving", key):
+            with self.stages.working("moving", key), counting("Looking for what moves"):
+                write_json(self.work / MOVING_FILE, asdict(leave_out_moving(self.database)), ours=True)
+        check_still(
+            self.intake.source, typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
+        )
 
     def match(self, database: Path, among: Container[str] | None = None) -> None:
         """Match the chosen pairs; with `among`, those that have one of these photographs."""
@@ -381,6 +399,8 @@ class Reconstruction:
         side = max(MAX_SECOND_SIDE, self.max_size)
         self.detect("Finding more details", self.second, sorted(left), side, MAX_FEATURES, SECOND_CONTRAST)
         self.match(self.second, left)
+        if self.options.moving:
+            leave_out_moving(self.second)
 
     def refine(self, key: str) -> None:
         """The lens with all its coefficients, where photographs left out of its adjustment agree better."""
@@ -461,13 +481,15 @@ class Reconstruction:
         others = [sorted(poses_of(other).keys() - poses_of(model).keys(), key=natural) for other in found[1:]]
         diagnosis = diagnose(self.intake, self.photos, model, [names for names in others if len(names) > 1], matches)
         known = place is not None and place.new_from_old is not None
+        if self.options.moving:
+            told.append(self.found_to_move().say())
         if place is not None and not known:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
         written, photos = model, self.photos
         if self.spherical:
             written, photos = flat_views(model, photos, self.folder, self.masks, self.track)
-        write_model(self.folder, written, photos, z_up=known)
+        write_model(self.folder, written, photos, known, self.options.moving)
         if self.intake.raw:
             write_json(self.folder / RAW_FILE, asdict(Remembered(self.intake.raw)), "capture")
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)

@@ -9,7 +9,7 @@ from functools import cache, partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ... import kernels
@@ -131,15 +131,19 @@ class CloudMethod(Method, ABC):
 
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
         """The next photograph: each once in a random order, then in another."""
-        train = data.splits["train"]
         if self.cameras is None:  # in a run that was resumed
-            self.cameras = data.cameras[train]
+            self.cameras = data.cameras[data.splits["train"]]
+        train = self.joined_photographs(data)
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
         photograph = data.photograph(int(train[order[place]]), depth_layers(self.config, data))
         self.figures["reduction"] = times = self.reduction(min(photograph.rgb.shape[:2]))
         return photograph.reduced(times).to(self.device)
+
+    def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
+        """Photographs that are learnt from now; all of training by default."""
+        return data.splits["train"]
 
     def reduction(self, shorter: int) -> int:
         """Factor by which photographs are smaller now. shorter: pixels along the shorter side"""

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -20,14 +20,16 @@ from ...components.clouds.cloud_method import BLACK, CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
-from ...datasets.scene import Frame
+from ...datasets.scene import Frame, Scene
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
 from ...gaussians import Gaussians
+from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
 from ...geometry import to_matrix
 from ...method.controls import Control, moment
 from .planes import MotionNumbers, PlaneMotion
 
+MIN_SPAN = 0.1  # share of the time with which training begins, where moments join
 FOLLOWED = 4  # Gaussians that a point of a surface moves with
 MIN_FOLLOWED_OPACITY = 0.1  # of these Gaussians
 
@@ -72,7 +74,8 @@ class DeformableSplatting(CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense, coarser planes, and higher rates for few steps."""
-        motion = MotionNumbers(plane_resolution=32, plane_features=8, plane_moments=32, still_until=0.08)
+        motion = MotionNumbers(plane_resolution=32, plane_features=8, plane_moments=32, still_until=0.05)
+        motion = replace(motion, nodes=400, rigidity=0.1)
         motion = replace(motion, planes_lr=4e-3, motion_lr=1e-3, final_rate=0.1)
         c = Config(initialization="dense", initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, motion=motion)
         c = replace(c, refine=RefineNumbers(40_000, cap_ramp=True), tidying=ALL_RULES)
@@ -81,11 +84,22 @@ class DeformableSplatting(CloudMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that move, are refined and told apart within some twenty quick steps."""
-        motion = MotionNumbers(4, 4, 1, 4, 8, still_until=0.0, told_apart=0.6, rigid_samples=32)
+        motion = MotionNumbers(4, 4, 1, 4, 8, nodes=20, all_moments_from=0.3, still_until=0.0, told_apart=0.6)
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
         adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
         c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, ssim_weight=0.2, motion=motion)
         return replace(c, refine=refine, adaptive=adaptive, tidying=ALL_RULES)
+
+    def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
+        """Photographs around the middle moment at first, and more and more of the others (`all_moments_from`)."""
+        train, until = super().joined_photographs(data), self.config.motion.all_moments_from
+        times, share = data.cameras.time, self.progress / until if until else 1.0
+        if times is None or self.frame.times is None or share >= 1:
+            return train
+        first, last = self.frame.times
+        away = (times[train] - (first + last) / 2).abs()
+        reach = (MIN_SPAN + (1 - MIN_SPAN) * share) * (last - first) / 2
+        return train[away <= torch.maximum(away.new_tensor(reach), away.min())]
 
     @property
     def controls(self) -> tuple[Control, ...]:
@@ -100,6 +114,13 @@ class DeformableSplatting(CloudMethod):
 
     def gaussians(self) -> Gaussians:
         return self.motion.at(super().gaussians(), self.moment_of())
+
+    @torch.no_grad()
+    def moving(self, duration: float) -> MovingGaussians:
+        """The cloud with its motion, in the colours of the settings, played in so many seconds."""
+        first, last = self.frame.times or (0.0, 1.0)
+        cloud = super().gaussians()
+        return fitted(lambda share: self.motion.at(cloud, first + share * (last - first)), duration)
 
     def rasterized(self, camera: Camera) -> Rendering:
         cloud = self.motion.at(self.filtered(), self.moment_of(camera))

@@ -23,7 +23,8 @@ from ...geometry import multiply, to_matrix
 PAIRS = tuple(combinations(range(4), 2))  # axes of the six planes; 3 is time
 TIME = 3
 FIRST_MOTION = 1e-4  # largest weight of the last layer at first
-NEIGHBOURS = 6  # of a Gaussian, that move rigidly with it
+NEIGHBOURS = 6  # of a Gaussian or node, that move rigidly with it
+CARRIERS = 4  # nodes that carry a Gaussian
 PROBED_MOMENTS = 12  # at which one sees whether a Gaussian moves
 MIN_DISTANCE = 1e-6  # between neighbours, scene units
 
@@ -39,8 +40,10 @@ class MotionNumbers:
     plane_scales: Annotated[int, between(1, 6)] = 2  # planes of each pair of axes, each twice as fine in space
     plane_features: Annotated[int, between(1, 128)] = 32  # features of a cell; more hold more motion, and cost time
     motion_width: Width = 64  # channels of the network's hidden layer
+    nodes: Annotated[int, between(0, 65_536)] = 0  # places that move and carry Gaussians; 0: each moves by itself
     max_offset: PositiveShare = 0.5  # largest offset of a Gaussian, as a share of the box's diagonal
     still_until: Share = 3000 / 23_000  # share of the budget in which nothing moves, 3000 steps; later: a better start
+    all_moments_from: Share = 0.0  # share of the budget until which moments join, from the middle one on
     told_apart: Share = 0.4  # share of the budget from which Gaussians that hardly move stand still; 1: never
     still_offset: PositiveShare = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
     plane_smoothness: NonNegative = 1e-4  # weight of total variation of planes in space
@@ -93,19 +96,42 @@ class SpaceTimePlanes(nn.Module):
         return torch.stack(space).sum(), torch.stack(calm).sum(), torch.stack(moving).sum()
 
 
+def spread(points: Float[Tensor, "point 3"], count: int) -> Int[Tensor, " chosen"]:
+    """Indices of points that are spread evenly: one in each cell of a grid, of which at most `count` hold points."""
+    low, size = points.amin(0), float((points.amax(0) - points.amin(0)).max().clamp_min(MIN_DISTANCE))
+    best, cells = torch.zeros(1, dtype=torch.long), 1
+    while True:
+        key = ((points - low) / size * cells).floor().long()
+        _, place = (key * torch.tensor([1, cells + 1, (cells + 1) ** 2])).sum(1).unique(return_inverse=True)
+        if (found := int(place.max()) + 1) > count:
+            return best
+        first = torch.full((found,), len(points)).scatter_reduce(0, place, torch.arange(len(points)), "amin")
+        if found == len(points) or cells > len(points):
+            return first
+        best, cells = first, cells + max(1, cells // 8)
+
+
 class PlaneMotion(Addition):
     """Positions, rotations and sizes of Gaussians at a moment, as offsets from the canonical cloud (Wu 2024, eq. 7).
 
     moves:      which Gaussians move; the others cost nothing
-    neighbours: of each Gaussian among those that move, for rigidity
+    neighbours: of each Gaussian among those that move, for rigidity; without nodes
+    nodes:      places of the nodes, of which the first `node_count` are in use
+    links:      of each node to the nodes around it
+    carriers:   nodes of each Gaussian, and `shares` of them in its motion
     active:     whether anything moves yet
     extent:     of the cameras, in scene units
     """
 
-    grows: ClassVar[tuple[str, ...]] = ("moves", "neighbours")
+    grows: ClassVar[tuple[str, ...]] = ("moves", "neighbours", "carriers", "shares")
     box: Tensor
     moves: Tensor
     neighbours: Tensor
+    nodes: Tensor
+    links: Tensor
+    node_count: Tensor
+    carriers: Tensor
+    shares: Tensor
     active: Tensor
     extent: Tensor
 
@@ -122,6 +148,11 @@ class PlaneMotion(Addition):
         nn.init.zeros_(self.heads.bias)
         self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
         self.register_buffer("neighbours", torch.arange(count)[:, None].repeat(1, NEIGHBOURS))
+        self.register_buffer("nodes", torch.zeros(numbers.nodes, 3))
+        self.register_buffer("links", torch.zeros(numbers.nodes, NEIGHBOURS, dtype=torch.long))
+        self.register_buffer("node_count", torch.tensor(0))
+        self.register_buffer("carriers", torch.zeros(count, CARRIERS, dtype=torch.long))
+        self.register_buffer("shares", torch.zeros(count, CARRIERS))
         self.register_buffer("active", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(1.0))
         self.progress = 0.0
@@ -149,12 +180,34 @@ class PlaneMotion(Addition):
         rows = self.moves.nonzero()[:, 0]
         every = len(rows) == len(cloud)
         some = cloud if every else cloud[rows]
-        offset, turn, size = self.offsets(some.means, time)
-        moved = some.means + offset, multiply(turn, some.quaternions), some.log_scales + size
+        if self.node_count:
+            moved = self.carried(some, self.carriers[rows], self.shares[rows], time)
+        else:
+            offset, turn, size = self.offsets(some.means, time)
+            moved = some.means + offset, multiply(turn, some.quaternions), some.log_scales + size
         if not every:
             still = cloud.means, cloud.quaternions, cloud.log_scales
             moved = tuple(x.index_copy(0, rows, y) for x, y in zip(still, moved, strict=True))  # type: ignore[assignment]
         return replace(cloud, means=moved[0], quaternions=moved[1], log_scales=moved[2])
+
+    def carried(
+        self,
+        some: Gaussians,
+        carriers: Int[Tensor, "gaussian carrier"],
+        shares: Float[Tensor, "gaussian carrier"],
+        time: float,
+    ) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"], Float[Tensor, "gaussian 3"]]:
+        """Means, quaternions and log scales of Gaussians that the nodes carry along, each rigidly (Huang 2024, eqs. 5
+        and 6): m' = sum_k w_k (R_k (m - p_k) + p_k + x_k), q' = (sum_k w_k r_k) q."""
+        nodes = self.nodes[: int(self.node_count)]
+        offset, turn, size = self.offsets(nodes, time)
+        rotation = to_matrix(turn)
+        shift = nodes + offset - (rotation @ nodes[..., None])[..., 0]
+        motions = torch.cat([rotation.flatten(1), shift, turn, size], 1)
+        mixed = F.embedding_bag(carriers, motions, per_sample_weights=shares, mode="sum")
+        rotation, shift, turn, size = mixed.split((9, 3, 4, 3), 1)
+        means = (rotation.view(-1, 3, 3) @ some.means[..., None])[..., 0] + shift
+        return means, multiply(normalize(turn, dim=1), some.quaternions), some.log_scales + size
 
     # Learning
 
@@ -174,10 +227,31 @@ class PlaneMotion(Addition):
             self.moves = farthest > self.numbers.still_offset * self.diagonal
         self.neighbours = torch.arange(count, device=device)[:, None].repeat(1, NEIGHBOURS)
         rows = self.moves.nonzero()[:, 0]
-        if len(rows) > NEIGHBOURS:
+        self.carriers, self.shares = (x.new_zeros(count, CARRIERS) for x in (self.neighbours, means))
+        if self.numbers.nodes:
+            self.place_nodes(means, rows)
+        if not self.node_count and len(rows) > NEIGHBOURS:
             points = means[rows].cpu().numpy()
             _, nearest = cKDTree(points).query(points, NEIGHBOURS + 1)
             self.neighbours[rows] = rows[torch.from_numpy(nearest[:, 1:]).to(device)]
+
+    def place_nodes(self, means: Float[Tensor, "gaussian 3"], rows: Int[Tensor, " moving"]) -> None:
+        """Spread nodes among Gaussians that move, and find the nodes that carry each: the nearest, weighted by a normal
+        distribution as wide as their distance."""
+        points = means[rows].cpu()
+        chosen = spread(points, self.numbers.nodes) if len(points) else rows.cpu()
+        count = len(chosen)
+        self.node_count.fill_(count if count > max(NEIGHBOURS, CARRIERS) else 0)
+        if not self.node_count:
+            return
+        self.nodes[:count] = points[chosen].to(means.device)
+        tree = cKDTree(points[chosen].numpy())
+        _, near = tree.query(points[chosen].numpy(), NEIGHBOURS + 1)
+        self.links[:count] = torch.from_numpy(near[:, 1:]).to(means.device)
+        away, near = tree.query(points.numpy(), CARRIERS)
+        away, near = (torch.from_numpy(x).to(means.device) for x in (away, near))
+        weight = torch.exp(-2 * (away / away[:, -1:].clamp_min(MIN_DISTANCE)).square()).float()
+        self.carriers[rows], self.shares[rows] = near, weight / weight.sum(1, keepdim=True)
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
         """A neighbour that is pruned becomes the Gaussian itself, which costs nothing."""
@@ -186,6 +260,7 @@ class PlaneMotion(Addition):
         place = torch.full_like(self.moves, -1, dtype=torch.long).index_copy(0, kept, own)
         left = place[self.neighbours[kept]]
         self.moves, self.neighbours = self.moves[kept], torch.where(left < 0, own[:, None], left)
+        self.carriers, self.shares = self.carriers[kept], self.shares[kept]
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
         self.progress = progress
@@ -206,16 +281,21 @@ class PlaneMotion(Addition):
 
     def bending(self, cloud: Gaussians, time: float, chance: torch.Generator) -> Float[Tensor, ""]:
         """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
-        distance; of some, at random."""
-        rows = self.moves.nonzero()[:, 0]
-        if not len(rows):
-            return cloud.means.sum() * 0
-        drawn = rows[torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)]
-        both = torch.cat([drawn[:, None], self.neighbours[drawn]], 1)
-        there = cloud.means.detach()[both.flatten()]
-        offset, turn, _ = self.offsets(there, time)
-        before, after = (x.view(*both.shape, 3) for x in (there, there + offset))
-        frame = to_matrix(turn.view(*both.shape, 4)[:, 0])
+        distance; of some, at random, or of all nodes."""
+        if self.node_count:
+            places, links = (x[: int(self.node_count)] for x in (self.nodes, self.links))
+            drawn = torch.arange(len(places), device=places.device)
+        else:
+            rows, places = self.moves.nonzero()[:, 0], cloud.means.detach()
+            if not len(rows):
+                return cloud.means.sum() * 0
+            drawn = rows[torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)]
+            links = self.neighbours[drawn]
+        both = torch.cat([drawn[:, None], links], 1)
+        used, both = both.unique(return_inverse=True)
+        offset, turn, _ = self.offsets(places[used], time)
+        before, after = (x[both] for x in (places[used], places[used] + offset))
+        frame = to_matrix(turn[both[:, 0]])
         apart = before[:, 1:] - before[:, :1]
         change = after[:, 1:] - after[:, :1] - apart @ frame.mT
         near = apart.square().sum(-1).clamp_min(MIN_DISTANCE**2)

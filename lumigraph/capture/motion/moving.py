@@ -1,0 +1,86 @@
+"""Left out of matching: what moves, by the residuals of its matches against epipolar geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import LumigraphError
+from ...files.names import counted
+from ...system.library import pycolmap
+from ..photos import Photo
+from .diagnosis import MIN_MATCHES
+
+MIN_PAIRS = 2  # pairs in which a feature is matched before it can be found to move
+MAX_STILL_SHARE = 0.5  # share of these pairs that agree with the camera's motion; what has less moves
+MAX_MOVING_SHARE = 0.6  # of the features; above it nothing is still enough to find a camera by
+
+
+@dataclass(frozen=True)
+class MovingFeatures:
+    """Features found to move, of those that could be judged."""
+
+    moving: int
+    judged: int
+
+    def say(self) -> str:
+        """A sentence for the user."""
+        if not self.moving:
+            return f"nothing was found to move, by {self.judged:,} features; the capture is as without --moving"
+        return f"{self.moving:,} of {self.judged:,} features move, and were left out of matching"
+
+
+def leave_out_moving(database: Path) -> MovingFeatures:
+    """Delete matches of features that move from the verified pairs of a database.
+
+    A match is an inlier of its pair where both features lie within COLMAP's error of each other's epipolar line. The
+    pair's geometry is that of most matches, of what stands still. A feature that is matched in MIN_PAIRS pairs or more,
+    and an inlier of fewer than half of them, moves.
+    """
+    with closing(pycolmap.Database.open(database)) as opened:
+        count = {image.image_id: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
+        tried, fitting = ({number: np.zeros(n, int) for number, n in count.items()} for _ in range(2))
+        pairs = []
+        for identity, matches in zip(*opened.read_all_matches(), strict=True):
+            pair = pycolmap.pair_id_to_image_pair(identity)
+            if not opened.exists_two_view_geometry(*pair):
+                continue
+            geometry = opened.read_two_view_geometry(*pair)
+            if len(geometry.inlier_matches) < MIN_MATCHES:
+                continue
+            pairs.append((pair, geometry))
+            for column, number in enumerate(pair):
+                np.add.at(tried[number], matches[:, column], 1)
+                np.add.at(fitting[number], geometry.inlier_matches[:, column], 1)
+        judged = {number: tried[number] >= MIN_PAIRS for number in count}
+        moves = {number: judged[number] & (fitting[number] < MAX_STILL_SHARE * tried[number]) for number in count}
+        for (a, b), geometry in pairs:
+            inliers = geometry.inlier_matches
+            still = inliers[~(moves[a][inliers[:, 0]] | moves[b][inliers[:, 1]])]
+            opened.delete_two_view_geometry(a, b)
+            if len(still) >= MIN_MATCHES:
+                geometry.inlier_matches = still
+                opened.write_two_view_geometry(a, b, geometry)
+    return MovingFeatures(*(int(sum(x.sum() for x in found.values())) for found in (moves, judged)))
+
+
+def check_still(source: str, found: MovingFeatures) -> None:
+    """Raise LumigraphError where so much moves that no camera can be found by the rest."""
+    if found.moving > MAX_MOVING_SHARE * found.judged:
+        raise LumigraphError(
+            f"{source}: {100 * found.moving / found.judged:.0f} % of what is seen again moves, so nothing is still "
+            "enough to find the camera by; film so that things that stand still fill most of the picture"
+        )
+
+
+def check_times(source: str, photos: Sequence[Photo]) -> None:
+    """Raise LumigraphError where photographs lack the time that a moving scene needs."""
+    if without := [photo.name for photo in photos if photo.time is None]:
+        raise LumigraphError(
+            f"{source}: {counted(len(without), 'photograph')} have no time of exposure, {without[0]} first; name a "
+            "video, or leave out --moving"
+        )
