@@ -14,6 +14,7 @@ from test_gaussians import cloud
 from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
+from lumigraph.commands.cli import parse
 from lumigraph.datasets.scene import Photograph
 from lumigraph.gaussians import Gaussians, joined
 from lumigraph.gaussians.splatting import splat, view_of
@@ -196,3 +197,9 @@ def test_a_step_compares_a_photograph_with_one_beside_it():
 
 def test_surface_is_a_word_for_the_default_method():
     assert methods.check("surface") == "planar-splatting" and "surface" not in methods.available()
+    bounded = tiny.scene()
+    in_the_open = replace(bounded, frame=replace(bounded.frame, reach=4.0))
+    plain = parse(["train", "surface", "SCENE"])
+    assert (plain.chosen(bounded), plain.chosen(in_the_open)) == ("neus", "planar-splatting")
+    assert parse(["train", "surface", "SCENE", "--flatness-weight", "3"]).chosen(bounded) == "planar-splatting"
+    assert parse(["train", "planar-splatting", "SCENE"]).chosen(bounded) == "planar-splatting"

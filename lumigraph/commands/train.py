@@ -209,7 +209,8 @@ class Train:
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
-    """Method to train, for example instant-ngp, or `surface` for the default method for meshes."""
+    """Method to train, for example instant-ngp, or `surface` for the default method for meshes: neus for objects and
+    bounded scenes, planar-splatting in the open."""
     scene: Annotated[Positional[str], needed("SCENE")]
     """Photographs, a video, or other data to train on."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
@@ -261,13 +262,15 @@ class Train:
             confirm(self.scene)  # a missing path has no kind
         check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from)
         source = posed(self.scene)
-        output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
-        check_new(output)
         options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
         if self.depth_from is not None:
             options["depth_from"] = str(Path(self.depth_from).resolve())
         data = open_dataset(source, kind.learns_from, **options)
-        config = method_config(self, self.method)
+        name = self.chosen(data)
+        kind = methods.find(name)
+        output = self.output or next_free(f"runs/{scene_name(source)}-{name}")
+        check_new(output)
+        config = method_config(self, name)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, data.frame, config, device, seed, learning=True)
         if budget is None:
@@ -281,6 +284,17 @@ class Train:
             show_outcome(run, outcome, method, data)
             keep_showing(viewer, outcome.signal)
         return exit_code(outcome.signal)
+
+    def chosen(self, data: Any) -> str:
+        """Name of the method. The word `surface`, without options of the method, depends on the scene."""
+        name = methods.check(self.method)
+        if self.method not in methods.BOUNDED or data.frame.is_open:
+            return name
+        asked, device = getattr(self, option_group(name), None), preset_device(self.device, self.preset)
+        if asked not in (None, default_config(type(self), methods.find(name), device)):
+            return name
+        say(f"{self.method}: {methods.BOUNDED[self.method]}, for the scene is bounded; {name} is for open ones")
+        return methods.BOUNDED[self.method]
 
 
 def with_options_of(name: str, arguments: Sequence[str], command: type = Train) -> type[Any]:

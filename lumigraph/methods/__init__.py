@@ -36,6 +36,7 @@ ALIASES = {  # words for the default method of a purpose
     "surface": "planar-splatting",
     "splats": "gaussian-splatting",
 }
+BOUNDED = {"surface": "neus"}  # instead of ALIASES, for scenes that are bounded
 
 _registered: dict[str, type[Any]] = {}  # methods from elsewhere, by name
 METHOD_FILE = "--method-file"  # an option of every command
