@@ -114,7 +114,7 @@ class SplatSlam(Method):
         """Frames of half the size, aligned with the rendered surface first; few descents."""
         tracking = TrackingNumbers(first_estimate="surface")
         mapping = MappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
-        rates = replace(Config().rates, sh_lr=2e-2, scales_lr=5e-3)
+        rates = replace(Config().rates, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3)
         return Config(tracking, PoseNumbers(tracking_iterations=5), mapping, rates, reduction=2)
 
     @classmethod
