@@ -139,7 +139,7 @@ class SplatSlam(Method):
                 f"{data.source} has no depth, from which Gaussians are made; train gaussian-splatting, which needs none"
             )
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Moment:  # type: ignore[override]
+    def batch(self, data: Scene, generator: torch.Generator) -> Moment:
         """The frame that is next, and the scene."""
         return self.tracker.moment(data)
 
@@ -149,9 +149,7 @@ class SplatSlam(Method):
         self.figures, first = {}, int(tracker.turn) == 0
         iterations = 1 if self.rehearses else max(c.first_iterations if first else c.mapping_iterations, 1)
         if frame is not None:
-            share = tracker.follow(
-                frame, batch, lambda pose: self.tracked(frame, pose, chance), lambda pose: self.explained(frame, pose)
-            )
+            share = tracker.follow(frame, batch, lambda seen, pose: self.tracked(seen, pose, chance), self.explained)
             if share is None or not (batch.scene.splits["train"] == frame.index).any():
                 frame = None
             else:

@@ -165,8 +165,8 @@ class IMap(FieldMethod):
             share = self.tracker.follow(
                 frame,
                 batch,
-                lambda pose: self.tracked(frame, pose, chance),
-                lambda pose: self.explained(self.network, frame, pose, chance),
+                lambda seen, pose: self.tracked(seen, pose, chance),
+                lambda seen, pose: self.explained(self.network, seen, pose, chance),
             )
             learns = share is not None and bool((batch.scene.splits["train"] == frame.index).any())
             if share is not None:
