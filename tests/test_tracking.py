@@ -14,7 +14,7 @@ from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import Unposed, without_poses
 from lumigraph.capture.capture import Capture, PixelPlane, Shot
 from lumigraph.components.tracking.alignment import aligned
-from lumigraph.components.tracking.loops import Loops, KeyframePlace, motion, motion_between
+from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion, motion_between
 from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
 from lumigraph.components.training.shared_points import Seen
 from lumigraph.errors import LumigraphError
