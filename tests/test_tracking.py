@@ -14,7 +14,7 @@ from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import Unposed, without_poses
 from lumigraph.capture.capture import Capture, PixelPlane, Shot
 from lumigraph.components.tracking.alignment import aligned
-from lumigraph.components.tracking.loops import Loops, Place, motion, motion_between
+from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion, motion_between
 from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
 from lumigraph.components.training.shared_points import Seen
 from lumigraph.errors import LumigraphError
@@ -132,11 +132,11 @@ def corner(count: int, seed: int) -> torch.Tensor:
     return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) + torch.tensor([-0.5, -0.5, 1.5])
 
 
-def place(points: torch.Tensor, pose: torch.Tensor, descriptors: torch.Tensor) -> Place:
+def place(points: torch.Tensor, pose: torch.Tensor, descriptors: torch.Tensor) -> KeyframePlace:
     """Points of the world as features of a camera at a pose."""
     local = (points - pose[:, 3]) @ pose[:, :3]
     bearings = torch.nn.functional.normalize(local, dim=-1)
-    return Place(Seen(bearings, descriptors), local, torch.zeros(4))
+    return KeyframePlace(Seen(bearings, descriptors), local, torch.zeros(4))
 
 
 def test_a_place_is_recognised_by_a_motion_that_its_points_agree_on():

@@ -134,6 +134,7 @@ def read_scannet(folder: Path) -> Capture:
 def differ(depth: Pinhole, depth_size: tuple[int, int], colour: Pinhole, size: tuple[int, int]) -> bool:
     """True if the two cameras see different parts, by more than a pixel of the depth."""
     as_depth = colour.resized(torch.tensor([depth_size]) / torch.tensor([size]))
+    assert isinstance(as_depth, Pinhole)
     edges = torch.tensor([[0.0, 0.0], list(map(float, depth_size))])
     seen = [(edges - lens.centre) / lens.focal * depth.focal for lens in (depth, as_depth)]
     return bool((seen[0] - seen[1]).abs().max() > 1)

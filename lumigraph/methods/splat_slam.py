@@ -46,7 +46,7 @@ NORMAL_STEP = 2  # pixels between the points that a rendered normal is made of
 
 
 @dataclass(frozen=True)
-class PoseNumbers:
+class SplatPoseNumbers:
     """A Config's numbers of a frame's pose (section 3.2)."""
 
     tracking_iterations: Iterations = 40  # descents on a frame's pose; more follow faster motion, slower
@@ -56,7 +56,7 @@ class PoseNumbers:
 
 
 @dataclass(frozen=True)
-class MappingNumbers:
+class SplatMappingNumbers:
     """A Config's numbers of densification and mapping (sections 3.3 and 3.4)."""
 
     mapping_iterations: Iterations = 60  # descents on the map for each frame; more learn more, slower
@@ -73,8 +73,8 @@ class Config:
     """The numbers of the paper and of its release for Replica."""
 
     tracking: TrackingNumbers = TrackingNumbers()
-    descent: PoseNumbers = PoseNumbers()
-    mapping: MappingNumbers = MappingNumbers()
+    descent: SplatPoseNumbers = SplatPoseNumbers()
+    mapping: SplatMappingNumbers = SplatMappingNumbers()
     rates: RateNumbers = RateNumbers(
         means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, opacities_lr=0.05, scales_lr=1e-3
     )
@@ -113,15 +113,15 @@ class SplatSlam(Method):
     def cpu_preset(cls) -> Any:
         """Frames of half the size, aligned with the rendered surface first; few descents."""
         tracking = TrackingNumbers(first_estimate="surface")
-        mapping = MappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
-        rates = replace(Config().rates, sh_lr=2e-2, scales_lr=5e-3)
-        return Config(tracking, PoseNumbers(tracking_iterations=5), mapping, rates, reduction=2)
+        mapping = SplatMappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
+        rates = replace(Config().rates, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3)
+        return Config(tracking, SplatPoseNumbers(tracking_iterations=5), mapping, rates, reduction=2)
 
     @classmethod
     def smallest(cls) -> Any:
         """Few descents a frame."""
-        mapping = MappingNumbers(2, 2, window=4, keyframe_every=2)
-        return Config(descent=PoseNumbers(tracking_iterations=4), mapping=mapping)
+        mapping = SplatMappingNumbers(2, 2, window=4, keyframe_every=2)
+        return Config(descent=SplatPoseNumbers(tracking_iterations=4), mapping=mapping)
 
     # The sequence
 
@@ -139,7 +139,7 @@ class SplatSlam(Method):
                 f"{data.source} has no depth, from which Gaussians are made; train gaussian-splatting, which needs none"
             )
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Moment:  # type: ignore[override]
+    def batch(self, data: Scene, generator: torch.Generator) -> Moment:
         """The frame that is next, and the scene."""
         return self.tracker.moment(data)
 
@@ -149,9 +149,7 @@ class SplatSlam(Method):
         self.figures, first = {}, int(tracker.turn) == 0
         iterations = 1 if self.rehearses else max(c.first_iterations if first else c.mapping_iterations, 1)
         if frame is not None:
-            share = tracker.follow(
-                frame, batch, lambda pose: self.tracked(frame, pose, chance), lambda pose: self.explained(frame, pose)
-            )
+            share = tracker.follow(frame, batch, lambda seen, pose: self.tracked(seen, pose, chance), self.explained)
             if share is None or not (batch.scene.splits["train"] == frame.index).any():
                 frame = None
             else:

@@ -37,7 +37,7 @@ DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to
 
 
 @dataclass(frozen=True)
-class Place:
+class KeyframePlace:
     """A keyframe as it is recognised. points: of its features, camera's frame, NaN where nothing was measured"""
 
     seen: Seen
@@ -46,7 +46,7 @@ class Place:
 
     @staticmethod
     @torch.no_grad()
-    def of(frame: DepthFrame) -> Place:
+    def of(frame: DepthFrame) -> KeyframePlace:
         width, height = frame.size
         picture = frame.rgb.view(height, width, 3)
         seen = features(Photograph(frame.camera, picture))
@@ -54,7 +54,7 @@ class Place:
         places, inside = frame.camera.locate(seen.bearings)
         along = torch.where(inside, depth[places[:, 0], places[:, 1]], torch.nan)
         small = adaptive_avg_pool2d(picture.mean(-1)[None, None], THUMBNAIL).flatten()
-        return Place(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
+        return KeyframePlace(seen, seen.bearings * along[:, None], normalize(small - small.mean(), dim=0))
 
 
 class Loops(Part):
@@ -69,11 +69,11 @@ class Loops(Part):
         self.unit = unit
         self.register_buffer("pairs", torch.zeros(0, 2, dtype=torch.int64))
         self.register_buffer("motions", torch.zeros(0, 3, 4))
-        self._places: dict[int, Place] = {}
+        self._places: dict[int, KeyframePlace] = {}
 
-    def place(self, frame: DepthFrame) -> Place:
+    def place(self, frame: DepthFrame) -> KeyframePlace:
         if frame.index not in self._places:
-            self._places[frame.index] = Place.of(frame)
+            self._places[frame.index] = KeyframePlace.of(frame)
         return self._places[frame.index]
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
@@ -110,7 +110,9 @@ def motion(first: Pose, second: Pose) -> Pose:
     return torch.cat([turn, shift[:, None]], -1)
 
 
-def motion_between(first: Place, second: Place, tolerance: float, chance: torch.Generator) -> Pose | None:
+def motion_between(
+    first: KeyframePlace, second: KeyframePlace, tolerance: float, chance: torch.Generator
+) -> Pose | None:
     """Pose of the second place's camera in the frame of the first, if enough matched points agree on one."""
     pairs = matched(first.seen, second.seen)
     a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]

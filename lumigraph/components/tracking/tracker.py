@@ -110,13 +110,13 @@ class Tracker(Part):
         self,
         frame: DepthFrame,
         moment: Moment,
-        find: Callable[[Pose], Pose],
-        explained: Callable[[Pose], float],
+        find: Callable[[DepthFrame, Pose], Pose],
+        explained: Callable[[DepthFrame, Pose], float],
     ) -> float | None:
         """Find the pose of the next frame, from constant velocity, then from the last known pose. Gives the share of
         its pixels that the map explains, or None if tracking is lost: the last known pose is kept for it then.
 
-        find: pose from a first estimate; explained: share of explained pixels at a pose
+        find: a frame's pose from a first estimate; explained: its share of explained pixels at a pose
         """
         trajectory = self.trajectory
         self.turn += 1
@@ -128,8 +128,8 @@ class Tracker(Part):
         last = trajectory.poses[known[0]]
         steady = moment.before[-1:] == known[:1]
         for start in [trajectory.predicted(known[:2]), last] if steady else [last]:
-            pose = find(start)
-            share = explained(pose)
+            pose = find(frame, start)
+            share = explained(frame, pose)
             if share > self.numbers.lost_share and self.plausible(last, pose):
                 trajectory.know(frame.index, pose, anchor)
                 return share

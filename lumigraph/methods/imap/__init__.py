@@ -41,7 +41,7 @@ EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
 
 
 @dataclass(frozen=True)
-class PoseNumbers:
+class FramePoseNumbers:
     """A Config's numbers of a frame's pose (section 3.3)."""
 
     tracking_iterations: Iterations = 50  # descents on a frame's pose; more follow faster motion, slower
@@ -50,7 +50,7 @@ class PoseNumbers:
 
 
 @dataclass(frozen=True)
-class MappingNumbers:
+class FieldMappingNumbers:
     """A Config's numbers of joint mapping (sections 3.3 and 3.4)."""
 
     mapping_iterations: Iterations = 10  # descents on map and keyframes' poses for each frame; more learn more, slower
@@ -81,8 +81,8 @@ class Config:
     table: HashNumbers = HashNumbers(sh_bands=1)
     rays: SampleNumbers = SampleNumbers()
     tracking: TrackingNumbers = TrackingNumbers()
-    descent: PoseNumbers = PoseNumbers()
-    mapping: MappingNumbers = MappingNumbers()
+    descent: FramePoseNumbers = FramePoseNumbers()
+    mapping: FieldMappingNumbers = FieldMappingNumbers()
     terms: LossNumbers = LossNumbers()
     field: Literal["network", "hash"] = "network"  # map: the paper's network, or a faster hash table of a distance
     layers: Annotated[int, between(1, 16)] = 4  # hidden layers of the network, section 3.1
@@ -129,8 +129,8 @@ class IMap(FieldMethod):
     def cpu_preset(cls) -> Any:
         """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
         table = HashNumbers(8, 2, 16, 16, 512, geometry_features=16, colour_layers=1, sh_bands=1)
-        tracking, descent = TrackingNumbers(first_estimate="surface"), PoseNumbers(tracking_iterations=0)
-        mapping = MappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
+        tracking, descent = TrackingNumbers(first_estimate="surface"), FramePoseNumbers(tracking_iterations=0)
+        mapping = FieldMappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
         mapping = replace(mapping, keyframe_pose_rate=2e-4)
         terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3)
         c = Config(table, SampleNumbers(16, 10), tracking, descent, mapping, terms, "hash")
@@ -139,7 +139,7 @@ class IMap(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """A tiny hash table and few descents a frame."""
-        mapping = MappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
+        mapping = FieldMappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
         terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-4)
         c = Config(replace(TINY_TABLE, sh_bands=1), SampleNumbers(12, 8), mapping=mapping, terms=terms, field="hash")
         return replace(c, hidden_width=16, truncation=0.2, sharpness=4.0, learning_rate=2e-2)
@@ -165,8 +165,8 @@ class IMap(FieldMethod):
             share = self.tracker.follow(
                 frame,
                 batch,
-                lambda pose: self.tracked(frame, pose, chance),
-                lambda pose: self.explained(self.network, frame, pose, chance),
+                lambda seen, pose: self.tracked(seen, pose, chance),
+                lambda seen, pose: self.explained(self.network, seen, pose, chance),
             )
             learns = share is not None and bool((batch.scene.splits["train"] == frame.index).any())
             if share is not None:
