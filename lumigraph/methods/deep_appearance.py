@@ -172,6 +172,7 @@ class DeepAppearance(Method):
         return Config(
             texture_log2=7, code=16, channels=16, max_channels=64, mesh_rows=49, mesh_columns=65, mesh_width=64,
             textures_per_step=8,
+            learning_rate=2e-3,
         )  # fmt: skip
 
     @classmethod

@@ -33,6 +33,7 @@ SWEEPS = 40  # of relaxation at the full size
 COLOUR_DEVIATION = 0.06  # of grey, across which depth is less likely to go on
 MIN_LINK = 1e-3  # of two neighbouring pixels, whatever their colours
 MIN_SURE = 0.002  # share of a photograph's pixels from which on its own depth counts
+MIN_PARALLAX = 0.005  # between the farthest two photographs, as a share of the depth, for stereo to mean anything
 TRUSTED_SHARE = 0.1  # of all pixels, below which the user is warned
 FILLED_CONFIDENCE = 0.1  # of depth that was filled in, where that of sure depth is 1
 OPAQUE = 0.5  # alpha above which a pixel shows a surface
@@ -109,6 +110,10 @@ def _stereo(scene: Scene, grids: Sequence[Camera], size: int, seconds: float) ->
     for number, grid in _numbered(scene, grids):
         seen = by_number.get(number)
         found.append(torch.full(shape(grid), math.nan) if seen is None else resampled(seen, grid))
+    known = torch.cat([x[x.isfinite()] for x in found])
+    position = torch.cat([grid.position for grid in grids])
+    if len(known) and torch.cdist(position, position).max() < MIN_PARALLAX * known.median():
+        found = [torch.full_like(x, math.nan) for x in found]  # without a baseline every depth agrees
     share = float(torch.cat([x.isfinite().flatten() for x in found]).float().mean())
     if share == 0:
         warnings.warn(
