@@ -40,7 +40,7 @@ class Config:
     candidate_views: Count = 16  # photographs near a camera among which each pixel chooses
     surface_views: Count = 6  # photographs whose depth maps make the surface before a camera
     resolution_weight: NonNegative = 0.05  # beside the angle in radians: of photographs coarser than the new picture
-    hidden_weight: NonNegative = 40.0  # times the angle: of photographs that see another surface there
+    hidden_weight: NonNegative = 10.0  # times the angle: of photographs that see another surface there
     depth_tolerance: Annotated[float, between(0, 1)] = 0.015  # of distance, within which they see the same
     border: PositiveShare = 0.08  # of a photograph's side, over which its weight falls to its edge
     seed: Seed = 0
