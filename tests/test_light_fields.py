@@ -210,3 +210,17 @@ def test_a_single_photograph_needs_a_plane():
     scene = with_fewer_views(tiny.scene(), 1)
     with pytest.raises(LumigraphError, match="stereo needs two"):
         Lumigraph(scene.frame, replace(Lumigraph.smallest(), geometry="stereo")).begin(scene)
+
+
+def test_silhouettes_give_depth():
+    """The visual hull of the ball, which needs no matching, holds the ball, and little else at its middle."""
+    scene = tiny.scene()
+    method = Lumigraph(scene.frame, replace(Lumigraph.smallest(), geometry="hull")).eval()
+    method.begin(scene)
+    shown, truth = method.render(scene.cameras[4]).depth, tiny.ball(scene.cameras[4].pose[0])[0]
+    both = truth.isfinite() & shown.isfinite()
+    assert float(((shown - truth)[both] < 0.05).float().mean()) > 0.95
+    assert both[truth.isfinite()].float().mean() > 0.95 and float((shown - truth)[12, 12].abs()) < 0.4
+    with pytest.raises(LumigraphError, match="no visual hull"):
+        bare = replace(scene, frame=replace(scene.frame, has_alpha=False))
+        Lumigraph(bare.frame, replace(Lumigraph.smallest(), geometry="hull")).begin(bare)

@@ -63,8 +63,9 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
         psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
         rows["held-out photographs"] = f"{other:.1f} dB, training photographs {psnr:.1f} dB ({ABOUT_RESIDUALS})"
         gap = psnr - other
-    rows["advice"] = advice(trend, enough, more, photographed(run, data))
-    if enough and gap > MEMORISED_DB:
+    if not method.complete:
+        rows["advice"] = advice(trend, enough, more, photographed(run, data))
+    if enough and not method.complete and gap > MEMORISED_DB:
         rows["advice"] = memorised(gap, run, method, [one.photograph for one in checked.of("test")])
     show(rows | finding_rows(checked.findings, str(run.folder / RESULT_FILE)) | next_commands(run))
 

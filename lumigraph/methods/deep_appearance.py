@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
@@ -149,6 +148,9 @@ class DeepAppearance(Method):
     mean_texture: Tensor
     mean_mesh: Tensor
     deviations: Tensor  # of textures and of meshes
+    faces: Tensor
+    beside: Tensor
+    networks: Networks
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -160,7 +162,8 @@ class DeepAppearance(Method):
         self.times, self.meshes = Kept(torch.empty(0)), Kept(torch.empty(0, vertices, 3))
         self.textures = Kept(torch.empty(0, 3, side, side, dtype=torch.uint8))
         self.networks = Networks(c, 3 * vertices)
-        faces, self.uv = grid_faces(c.mesh_rows, c.mesh_columns)
+        faces, uv = grid_faces(c.mesh_rows, c.mesh_columns)
+        self.uv = uv
         self.register_buffer("faces", faces, persistent=False)
         self.register_buffer("beside", kernels.neighbours(faces), persistent=False)
         self._unwrapped: Unwrapped | None = None
@@ -172,6 +175,7 @@ class DeepAppearance(Method):
         return Config(
             texture_log2=7, code=16, channels=16, max_channels=64, mesh_rows=49, mesh_columns=65, mesh_width=64,
             textures_per_step=8,
+            learning_rate=2e-3,
         )  # fmt: skip
 
     @classmethod
@@ -222,7 +226,7 @@ class DeepAppearance(Method):
             self._unwrapped = Unwrapped(rgb, shown, view, number)
         return self._unwrapped
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Unwrapped:  # type: ignore[override]
+    def batch(self, data: Scene, generator: torch.Generator) -> Unwrapped:
         seen = self._unwrap(data)
         chosen = torch.randperm(len(seen.moment), generator=generator)[: self.config.textures_per_step]
         return seen[chosen].to(self.device)
@@ -304,9 +308,9 @@ class DeepAppearance(Method):
         """The mesh of the first moment, with its mean texture."""
         first = self.meshes.rows[0].cpu()
         texture = self.mean_texture.cpu().movedim(0, -1)
-        colours = (sampled(self.mean_texture.cpu(), self.uv).clamp(0, 1) * 255).round().byte()
+        colours = sampled(self.mean_texture.cpu(), self.uv).clamp(0, 1).mul(255).round().byte()
         picture = MeshTexture(self.uv.numpy(), (texture.clamp(0, 1) * 255).round().byte().numpy())
-        faces = self.faces.cpu().numpy().astype(np.int64)
+        faces = self.faces.cpu().long().numpy()
         return Mesh(first.double().numpy(), faces, colours.numpy(), picture)
 
 

@@ -40,7 +40,7 @@ class Config:
     candidate_views: Count = 16  # photographs near a camera among which each pixel chooses
     surface_views: Count = 6  # photographs whose depth maps make the surface before a camera
     resolution_weight: NonNegative = 0.05  # beside the angle in radians: of photographs coarser than the new picture
-    hidden_weight: NonNegative = 40.0  # times the angle: of photographs that see another surface there
+    hidden_weight: NonNegative = 10.0  # times the angle: of photographs that see another surface there
     depth_tolerance: Annotated[float, between(0, 1)] = 0.015  # of distance, within which they see the same
     border: PositiveShare = 0.08  # of a photograph's side, over which its weight falls to its edge
     seed: Seed = 0
@@ -85,7 +85,7 @@ class Lumigraph(Method):
         self.views.keep(data, c.geometry, c.mesh_file, self.frame.background, STEREO_SHARE * seconds)
         self.plane.fill_(float(1 / self.views.tables.middle))
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:  # type: ignore[override]
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
         """The first photograph, for the trainer to count."""
         return data.photograph(int(data.splits["train"][0]))
 
@@ -143,12 +143,13 @@ class Lumigraph(Method):
             depth, solid = surface_seen(self.views, chosen[: c.surface_views], camera, not self.frame.has_alpha)
         rays = camera.rays(camera.pixels())
         points = rays.at(torch.where(solid, depth, 1.0).flatten())[solid.flatten()]
-        given = tables.pictures, tables.depths, tables.sizes, tables.poses, tables.lenses
+        named = (tables.pictures, tables.depths, tables.sizes, tables.poses, tables.lenses)
+        pictures, depths, sizes, poses, lenses = (x[chosen] for x in named)
         hidden = 0.0 if c.geometry == "plane" else c.hidden_weight
         weights = c.resolution_weight, hidden, c.depth_tolerance, c.border
         eyes = rays.origins[solid.flatten()].contiguous()
         found, share = kernels.blend_views(
-            points, eyes, focal_length(camera), *(x[chosen] for x in given), c.blended_views, *weights
+            points, eyes, focal_length(camera), pictures, depths, sizes, poses, lenses, c.blended_views, *weights
         )
         alpha = found[:, 3] if found.shape[1] > 3 else torch.ones_like(share)
         rgb, opacity = self.background.repeat(height * width, 1), torch.zeros(height * width, device=self.device)

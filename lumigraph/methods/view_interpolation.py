@@ -82,7 +82,7 @@ class ViewInterpolation(Method):
         geometry: Any = "plane" if c.by == "flow" else c.geometry
         self.views.keep(data, geometry, "", self.frame.background, STEREO_SHARE * seconds)
 
-    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:  # type: ignore[override]
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
         """The first photograph, for the trainer to count."""
         return data.photograph(int(data.splits["train"][0]))
 

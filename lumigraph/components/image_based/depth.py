@@ -1,4 +1,4 @@
-"""A depth map of every photograph, without gaps: by multi-view stereo, as measured, from a mesh, or a plane."""
+"""A depth map of every photograph, without gaps: by multi-view stereo, as measured, from a hull, a mesh, or a plane."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float
 from scipy import sparse
+from scipy.ndimage import gaussian_filter
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 from torch.nn.functional import interpolate
@@ -26,13 +27,17 @@ from ...depth_maps import DepthMap
 from ...depth_maps.flat_view import GREY, flat_view
 from ...depth_maps.multi_view import multi_view_depth
 from ...errors import LumigraphError, LumigraphWarning
+from ..fields.level_set import level_set
+from ..sampling.occupancy import visual_hull
 
-Geometry = Literal["stereo", "measured", "mesh", "plane"]
+Geometry = Literal["stereo", "measured", "hull", "mesh", "plane"]
+HULL_CELLS = 64  # of a visual hull, along each side of the box
 FILL_SIDE = 100  # pixels along the longer side of the grid on which gaps are first filled
 SWEEPS = 40  # of relaxation at the full size
 COLOUR_DEVIATION = 0.06  # of grey, across which depth is less likely to go on
 MIN_LINK = 1e-3  # of two neighbouring pixels, whatever their colours
 MIN_SURE = 0.002  # share of a photograph's pixels from which on its own depth counts
+MIN_PARALLAX = 0.005  # between the farthest two photographs, as a share of the depth, for stereo to mean anything
 TRUSTED_SHARE = 0.1  # of all pixels, below which the user is warned
 FILLED_CONFIDENCE = 0.1  # of depth that was filled in, where that of sure depth is 1
 OPAQUE = 0.5  # alpha above which a pixel shows a surface
@@ -61,9 +66,13 @@ def complete_depths(
     elif geometry == "measured":
         scene.layer("depth")
         found = [_measured(scene.photograph(int(i), ("depth",)), grid) for i, grid in _numbered(scene, grids)]
-    elif geometry == "mesh":
-        vertices, faces = proxy_mesh(mesh_file, scene.frame)
-        found = [mesh_distance(vertices, faces, grid) for grid in grids]
+    elif geometry in ("mesh", "hull"):
+        surface = proxy_mesh(mesh_file, scene.frame) if geometry == "mesh" else hull_surface(scene)
+        if surface is None:
+            raise LumigraphError(
+                f"{scene.source} shows no object cut out by alpha, so it has no visual hull; give --geometry stereo"
+            )
+        found = [mesh_distance(*surface, grid) for grid in grids]
     else:
         found = [torch.full(shape(grid), math.nan) for grid in grids]
     alone = typical_inverse_depth(scene, grids, found)
@@ -109,7 +118,17 @@ def _stereo(scene: Scene, grids: Sequence[Camera], size: int, seconds: float) ->
     for number, grid in _numbered(scene, grids):
         seen = by_number.get(number)
         found.append(torch.full(shape(grid), math.nan) if seen is None else resampled(seen, grid))
+    known = torch.cat([x[x.isfinite()] for x in found])
+    position = torch.cat([grid.position for grid in grids])
+    span = float(torch.cdist(position, position).max())
+    one_place = span < MIN_PARALLAX * (float(known.median()) if len(known) else scene.frame.near)
+    if one_place:
+        found = [torch.full_like(x, math.nan) for x in found]  # without a baseline every depth agrees
     share = float(torch.cat([x.isfinite().flatten() for x in found]).float().mean())
+    hull = None if one_place or share >= TRUSTED_SHARE else hull_surface(scene)
+    if hull is not None:  # photographs too far apart to match have silhouettes
+        hulls = (mesh_distance(*hull, grid).nan_to_num(posinf=math.nan) for grid in grids)
+        return [torch.where(x.isfinite(), x, own) for x, own in zip(found, hulls, strict=True)]
     if share == 0:
         warnings.warn(
             f"Stereo finds no depth in {scene.source}: its photographs were taken from one place, do not overlap or "
@@ -138,6 +157,16 @@ def _measured(photograph: Photograph, grid: Camera) -> Float[Tensor, "height wid
     """A photograph's layer of depth at the pixels of its depth map, each the nearest one's."""
     depth = photograph.extra["depth"]
     return interpolate(depth[None, None], shape(grid), mode="nearest-exact")[0, 0]
+
+
+def hull_surface(scene: Scene) -> tuple[Float[Tensor, "vertex 3"], Tensor] | None:
+    """Vertices and faces of the visual hull of photographs with alpha (Gortler 1996, sec. 3.2.1); None without one."""
+    solid = visual_hull(scene, HULL_CELLS).numpy()
+    if not scene.frame.has_alpha or solid.all() or not solid.any():
+        return None
+    smooth = gaussian_filter(solid.astype(np.float32), 1.0) - 0.5
+    mesh = level_set(smooth, np.full(3, 1 / HULL_CELLS - 1), 2 / HULL_CELLS)
+    return torch.from_numpy(mesh.vertices).float(), torch.from_numpy(mesh.faces).int()
 
 
 def proxy_mesh(file: str, frame: Frame) -> tuple[Float[Tensor, "vertex 3"], Tensor]:

@@ -115,9 +115,10 @@ class KeptViews(nn.Module):
         sizes = torch.cat([cameras.size, torch.cat([grid.size for grid in grids])], 1)
         middle = torch.stack([x[x.isfinite()].median() for x in distances if x.isfinite().any()]).median()
         lenses = torch.stack([lens_row(cameras[i]) for i in range(len(cameras))])
-        stacked = padded(shaped), padded(usable)
-        tables = (x.to(device).contiguous() for x in (*stacked, sizes, poses, lenses, middle))
-        return ViewTables(cameras.to(device), *tables)
+        pixels, depths, sizes, poses, lenses, middle = (
+            x.to(device).contiguous() for x in (padded(shaped), padded(usable), sizes, poses, lenses, middle)
+        )
+        return ViewTables(cameras.to(device), pixels, depths, sizes, poses, lenses, middle)
 
     def grid(self, i: int) -> DepthGrid:
         """The surface that one photograph sees."""

@@ -18,7 +18,7 @@ from .kept_views import DepthGrid, KeptViews
 from .warping import behind
 
 AGREEMENT = 0.03  # of distance, within which two depth maps show one surface
-MIN_SUPPORT = 0.35  # of the best supported surface's, that a nearer one needs to hide it
+MIN_SUPPORT = 0.5  # of the best supported surface's, that a nearer one needs to hide it
 MAX_SPAN = 0.5  # of a picture's width: triangles that are longer go around a sphere the other way
 EDGE_REACH = 0.5  # pixels of a depth map, by which a surface is continued beyond its edge
 

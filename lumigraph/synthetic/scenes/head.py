@@ -27,8 +27,8 @@ from ..world import Lamp, Material, Object, Pose, Sky, World
 
 ROWS, COLUMNS = 97, 129  # of the mesh; the last column is the first one again
 FRONT = -90.0  # azimuth of the face, degrees; that of -y
-WIDEST, LOWEST, HIGHEST = 100.0, -12.0, 45.0  # degrees of the dome: to either side of the face, and elevations
-RADIUS, FIELD_OF_VIEW = 3.4, 26.0  # of the dome, scene units; degrees
+WIDEST, LOWEST, HIGHEST = 60.0, -15.0, 35.0  # degrees of the dome: to either side of the face, and elevations
+RADIUS, FIELD_OF_VIEW = 3.4, 23.0  # of the dome, scene units; degrees
 OUTSIDE = 2.0  # distance from which the mesh is traced inwards, scene units
 SKIN, BLUSH = (0.86, 0.64, 0.52), (0.76, 0.47, 0.40)
 HAIR, DARK_HAIR = (0.30, 0.18, 0.11), (0.14, 0.08, 0.06)
@@ -60,12 +60,12 @@ def expression(time: float) -> Expression:
 
 def face(now: Expression):
     """Parts of the head, its middle at the origin, the face towards -y."""
-    skin = Material(Mottle(SKIN, BLUSH, size=0.5, contrast=1.6, seed=2.0), gloss=1.0, roughness=0.36)
+    skin = Material(Mottle(SKIN, BLUSH, size=0.5, contrast=1.6, seed=2.0), gloss=1.0, roughness=0.3)
     hair = Material(Mottle(HAIR, DARK_HAIR, size=0.12, contrast=2.5, seed=5.0), gloss=0.8, roughness=0.4)
     lip = Material(Plain(LIP), gloss=1.0, roughness=0.3)
     inside = Material(Plain(MOUTH), gloss=1.0, roughness=0.3)
     white, iris = (Material(Plain(colour), gloss=1.0, roughness=0.15) for colour in (WHITE, IRIS))
-    across, drop = Pose.about((0, 1, 0), 90), 0.10 * now.mouth
+    across, drop = Pose.about((0, 1, 0), 90), 0.14 * now.mouth
     lips, width = -0.215 - 0.5 * drop, 0.055 + 0.02 * now.mouth
     yield Object(Ball(0.42), skin, Pose.at(0, 0.02, 0.12), "skin")
     cheeks = SoftCapsule(0.31, 0.13, 0.0, 1.0 + 0.2 * now.mouth)
