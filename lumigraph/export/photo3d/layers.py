@@ -25,9 +25,9 @@ MIN_BEHIND = 1.1  # factor of distance from which on another photograph's surfac
 def background(front: Layer, layers: list[Layer]) -> Layer:
     """Surfaces behind the edges of the first layer.
 
-    A pixel is foreground if it lies well in front of what is around it, and hides something if it is near an edge. There the
-    nearest surface behind it that any photograph shows is taken, and for the rest a smooth continuation of both and of
-    what is no foreground.
+    A pixel is foreground if it lies well in front of what is around it, and hides something if it is near an edge.
+    There the nearest surface behind it that any photograph shows is taken, and for the rest a smooth continuation of
+    both and of what is no foreground.
     """
     height, width = front.depth.shape
     band = max(round(BAND * width), 3)
