@@ -11,10 +11,10 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 from .. import kernels
 from .flat_view import GREY
 
-PATCH, STRIDE, SEARCHES = 8, 4, 12  # pixels a side and apart; iterations of a patch
+PATCH, STRIDE, SEARCHES = 8, 4, 20  # pixels a side and apart; iterations of a patch
 MIN_SIDE = 12  # pixels along the shorter side of the coarsest pictures
-OUTER, INNER, RELAXATION = 4, 4, 1.6  # linearisations of a level, steps of each, and their relaxation
-SMOOTHNESS, GRADIENT_WEIGHT = 0.12, 0.25  # against brightness; of constant gradients
+OUTER, INNER, RELAXATION = 6, 6, 1.6  # linearisations of a level, steps of each, and their relaxation
+SMOOTHNESS, GRADIENT_WEIGHT = 0.3, 0.25  # against brightness; of constant gradients
 EDGE = 0.08  # of grey, over which smoothness falls to 1 / e
 ROBUST = 1e-3  # of the square root that stands for an absolute value
 

@@ -1,7 +1,7 @@
 """Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
-    "a neighbour twice": ("cpu", "_half_step", "flow[y, x - 1, 0]", "flow[y, x + 1, 0]"),
+    "a neighbour twice": ("cpu", "_half_step", "flow[y, x - 1, 0]", "flow[y, x, 0]"),
     "another weight": ("cpu", "_half_step", "w = below[y - 1, x]", "w = below[y, x]"),
     "one colour only": ("cpu", "_half_step", "(y + odd) % 2", "y % 2"),
     "no relaxation": ("cpu", "_half_step", "+= relaxation * (u", "+= (u"),
