@@ -58,11 +58,11 @@ def test_the_depth_of_a_rectified_pair_is_that_of_the_ball():
     scene = ball()
     positions = scene.cameras.position
     other = int((positions - positions[0]).norm(dim=-1).argsort()[1])
-    pair, found = pair_depth(scene, 0, other, 120)
+    pair, found = pair_depth(scene, 0, other, 160)
     seen = pair.depth_map(found, 0)
-    assert seen.solid[pair.left.trust > 0.5].float().mean() > 0.3
+    assert seen.solid[pair.left.trust > 0.5].float().mean() > 0.15
     off = (seen.positions().norm(dim=-1) - RADIUS / scene.frame.to_source.scale).abs()
-    assert off.median() < 0.02
+    assert off.median() < 0.03
     rows = [view.project(seen.positions())[0][:, 1] for view in (pair.left, pair.right)]
     torch.testing.assert_close(*rows, rtol=0, atol=1e-2)
 

@@ -47,6 +47,7 @@ from .export import Export
 from .infer import Infer
 from .info import Info
 from .methods import Methods
+from .photo3d import Photo3DCommand
 from .render import Render
 from .report import Report
 from .resume import Resume
@@ -110,6 +111,7 @@ COMMANDS: dict[str, type] = {
     "demo": Demo,
     "capture": CaptureCommand,
     "depth": Depth,
+    "photo3d": Photo3DCommand,
     "train": Train,
     "track": Track,
     "resume": Resume,

@@ -110,6 +110,7 @@ MAX_PAGE_BYTES = 100e6  # bytes of a page with a volume
 # How to move, with a mouse and with fingers.
 ORBIT_HELP = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
 LOOK_HELP = "Drag to look around", "Drag to look around"
+PARALLAX_HELP = "Move the mouse to look behind things", "Tilt the phone, or drag, to look behind things"
 
 
 def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
@@ -134,15 +135,26 @@ def moving_page(path: Path, moving: MovingGaussians, opening: Opening) -> None:
     write_bytes(path, page_bytes("splats", settings, packed + gzip.compress(rest, 9, mtime=0)), "page")
 
 
-def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
-    """A mesh in the scene's frame, unlit, for its colours were photographed. Positions are held in 16 bits an axis."""
+def mesh_page(path: Path, mesh: Mesh, opening: Opening, reach: float = 0.0) -> None:
+    """A mesh in the scene's frame, unlit, for its colours were photographed. Positions are held in 16 bits an axis.
+
+    reach: of the camera to all sides, scene units: then it follows the pointer or a phone's tilt, and nothing turns it
+    """
     low = mesh.vertices.min(0).astype(np.float64)
     size = np.maximum(mesh.vertices.max(0) - low, 1e-12)
     steps = np.rint((mesh.vertices - low) / size * 65535).astype("<u2")
-    data = mesh.faces.astype("<u4").tobytes() + steps.tobytes() + mesh.colours.tobytes()
-    held = {"vertices": len(steps), "faces": len(mesh.faces), "low": low.tolist(), "high": (low + size).tolist()}
+    data = mesh.faces.astype("<u4").tobytes() + steps.tobytes()
+    held: dict[str, Any] = {"vertices": len(steps), "faces": len(mesh.faces)}
+    held |= {"low": low.tolist(), "high": (low + size).tolist(), "reach": reach}
+    if mesh.texture is None:
+        data += mesh.colours.tobytes()
+    else:
+        data += np.rint(mesh.texture.uv.clip(0, 1) * 65535).astype("<u2").tobytes()
+        held["picture"] = len(data)
+        data += webp(torch.from_numpy(mesh.texture.colours) / 255)
     settings = asdict(opening) | {"webgl": True, "packed": True} | held
-    write_bytes(path, page_bytes("mesh", settings, gzip.compress(data, 9, mtime=0)), "page")
+    help_text = PARALLAX_HELP if reach else None
+    write_bytes(path, page_bytes("mesh", settings, gzip.compress(data, 9, mtime=0), help_text), "page")
 
 
 def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
@@ -210,9 +222,9 @@ def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
     return held.getvalue()
 
 
-def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
-    """A page with a program of web/, its settings and its data."""
-    mouse, touch = ORBIT_HELP if settings["inward"] else LOOK_HELP
+def page_bytes(program: str, settings: dict[str, Any], data: bytes, help_text: tuple[str, str] | None = None) -> bytes:
+    """A page with a program of web/, its settings and its data. help_text: how to move, by mouse and by fingers"""
+    mouse, touch = help_text or (ORBIT_HELP if settings["inward"] else LOOK_HELP)
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
     red, green, blue = (round(255 * value) for value in settings["background"])
