@@ -21,7 +21,7 @@ from ...method import RayMethod
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
 from .cameras import Backgrounds, Rig
-from .networks import Decoded, VolumeDecoder, Encoder, divergence, opacity_prior, opacity_roughness
+from .networks import Decoded, Encoder, VolumeDecoder, divergence, opacity_prior, opacity_roughness
 
 Side = Annotated[int, between(8, 1024)]
 
