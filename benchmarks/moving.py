@@ -1,6 +1,7 @@
 """Scenes that move, with their truth: pictures of held-out cameras, what moves alone, and where its points go.
 
     python benchmarks/moving.py --scene procedural:jelly --size 100 --views 60 --seconds 90
+    python benchmarks/moving.py --scene procedural:jelly,rig=6 --views 96 --seconds 90 --methods neural-volumes
 
 Trains each method, its seconds counted in those of processors, because a machine may be busy. Compares views of
 held-out cameras at training moments, and between them.
@@ -37,6 +38,7 @@ from lumigraph.method import Method
 from lumigraph.method.capabilities import HasMotion, can
 from lumigraph.run import build
 from lumigraph.synthetic import SyntheticStage
+from lumigraph.synthetic.stage import told
 from lumigraph.training import fit, loop
 
 POINTS, PAIRS, NEAR = 400, 12, 0.05  # of a pair of moments; pairs; share of what moves's size
@@ -58,9 +60,10 @@ class Options:
 
 
 def main(options: Options) -> None:
-    name = options.scene.removeprefix("procedural:").split(",")[0]
     request = f"{options.scene},size={options.size},views={options.views},seed={options.seed}"
-    stage = procedural.scenes.stage(name, options.size, options.views, options.seed)
+    asked, name = request.removeprefix("procedural:"), options.scene.removeprefix("procedural:").replace(",", "-")
+    kind, numbers = told(procedural.scenes.options(asked.partition(",")[0]), asked)
+    stage = procedural.scenes.stage(kind, **{k: v for k, v in vars(numbers).items() if k != "jitter_poses"})
     scene = open_scene(request)
     options.output.mkdir(parents=True, exist_ok=True)
     print(f"{request}: the camera moves {degrees_per_frame(stage):.1f} degrees from a photograph to the next")

@@ -126,7 +126,7 @@ class Nerfies(FieldMethod):
         d = replace(d, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True)
         d = replace(d, deformation_frequencies=4, growth=0.5)
         c = replace(c, deformation=d, table_annealing=0.5, deformation_rate=0.3)
-        return replace(c, final_learning_rate=1e-3, decay_start=0.5)
+        return replace(c, final_learning_rate=1e-3, decay_start=0.3)
 
     @classmethod
     def smallest(cls) -> Any:

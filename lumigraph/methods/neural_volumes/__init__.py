@@ -21,7 +21,7 @@ from ...method import RayMethod
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
 from .cameras import Backgrounds, Rig
-from .networks import Decoded, Decoder, Encoder, divergence, opacity_prior, opacity_roughness
+from .networks import Decoded, Encoder, VolumeDecoder, divergence, opacity_prior, opacity_roughness
 
 Side = Annotated[int, between(8, 1024)]
 
@@ -76,7 +76,7 @@ class NeuralVolumes(RayMethod):
             torch.manual_seed(c.seed)
             self.encoder = Encoder(c.encoder_cameras, c.encoder_size, c.encoder_width, c.code)
             warp = c.affines, c.warp_resolution, c.warp_width
-            self.decoder = Decoder(c.code, c.volume_resolution, c.volume_width, *warp, c.view_dependence)
+            self.decoder = VolumeDecoder(c.code, c.volume_resolution, c.volume_width, *warp, c.view_dependence)
         self.rig = Rig(c.encoder_cameras, c.encoder_size)
         self.backgrounds = Backgrounds(frame, c.background_size, learns_background=not frame.has_alpha)
         self.decoded: tuple[Any, Any] = (None, None)  # of the last picture

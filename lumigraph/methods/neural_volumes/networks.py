@@ -69,7 +69,7 @@ class Encoder(nn.Module):
         return MEAN_SCALE * self.mean(joint), DEVIATION_SCALE * self.deviation(joint)
 
 
-class Template(nn.Module):
+class TemplateVolume(nn.Module):
     """A volume from numbers, by transposed convolutions that double it, from one voxel up."""
 
     def __init__(self, inputs: int, outputs: int, side: int, width: int):
@@ -131,8 +131,8 @@ def lattice(side: int) -> Float[Tensor, "side side side 3"]:
     return torch.stack([x, y, z], -1)
 
 
-class Decoder(nn.Module):
-    """Template volume, inverse warp and the affine map of the whole from a code (section 4.2).
+class VolumeDecoder(nn.Module):
+    """TemplateVolume volume, inverse warp and the affine map of the whole from a code (section 4.2).
 
     viewed: colours depend on the camera's direction too; opacity does not
     """
@@ -140,10 +140,10 @@ class Decoder(nn.Module):
     def __init__(self, code: int, side: int, width: int, maps: int, warp_side: int, warp_width: int, viewed: bool):
         super().__init__()
         if viewed:
-            self.colour: Template | None = Template(code + 3, 3, side, width)
-            self.template = Template(code, 1, side, width)
+            self.colour: TemplateVolume | None = TemplateVolume(code + 3, 3, side, width)
+            self.template = TemplateVolume(code, 1, side, width)
         else:
-            self.colour, self.template = None, Template(code, 4, side, width)
+            self.colour, self.template = None, TemplateVolume(code, 4, side, width)
         self.warp = AffineMixture(code, maps, warp_side, warp_width) if maps else None
         self.whole = Affine(code, 1, warp_width, GLOBAL_SHIFT_SCALE)
 

@@ -123,11 +123,12 @@ class NSFF(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """Hash tables instead of networks, one neighbour in a step, fewer samples and cells."""
+        """Hash tables instead of networks, one neighbour in a step, fewer levels, samples and cells."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
-        flow = replace(c.flow, both_ways=False, neighbours=1, max_flow=0.3, prior_interval=0.3)
+        table, steps = replace(c.table, levels=6, max_resolution=192), replace(c.steps, steps_per_diagonal=192)
         occupancy = replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64)
-        return replace(c, occupancy=occupancy, flow=flow, decay_start=0.3)
+        flow = replace(c.flow, both_ways=False, neighbours=1, max_flow=0.3, prior_interval=0.3)
+        return replace(c, table=table, steps=steps, occupancy=occupancy, flow=flow, decay_start=0.3)
 
     @classmethod
     def smallest(cls) -> Any:

@@ -98,12 +98,12 @@ class MotionPriors(Part):
         cameras, chosen = data.cameras, torch.tensor(train)
         if len(found.positions):
             distance = torch.cdist(found.origins, cameras.position[chosen])
-            i = distance.argmin(1)
-            pixels, visible = cameras.project(found.positions, chosen[i])
+            own = distance.argmin(1)
+            pixels, visible = cameras.project(found.positions, chosen[own])
             x, y = (pixels / smaller).long().unbind(-1)
             inside = visible & (x >= 0) & (y >= 0) & (x < size[1]) & (y < size[0])
             away = (found.positions - found.origins).norm(dim=-1)
-            depth[i[inside], y[inside], x[inside]] = away[inside].half()
+            depth[own[inside], y[inside], x[inside]] = away[inside].half()
         return depth
 
     @cached_property
