@@ -30,7 +30,7 @@ from lumigraph.metrics import psnr
 from lumigraph.paths.opening import Opening
 from lumigraph.run import Run, State, open_any
 
-pytestmark = budget("exports", 8)
+pytestmark = budget("exports", 10)
 BLACK = (0.0, 0.0, 0.0)
 OPENING = Opening("A test", (0.9, 0.8, 0.6), (0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 50.0, 0.05, 100, 0.3, 9, 110, True)
 
