@@ -1,6 +1,6 @@
-"""A street, from time 0 to time 1: three figures walk past a house, each at its own pace, their arms and legs swinging.
+"""A street, from time 0 to time 1: three figures walk past a house, their arms and legs swinging.
 
-Every limb is rigid and turns about its joint. `World.carried` gives the path of any point of a figure.
+Every limb is rigid, turns about its joint and touches no other. `World.carried` gives the path of any point of it.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ STRIDE, ARM_SWING = 28.0, 24.0  # degrees that a leg and an arm swing to either 
 SKIN, CREAM, GREY = (0.82, 0.60, 0.46), (0.93, 0.89, 0.80), (0.52, 0.52, 0.55)
 # Of each figure: where it walks (y), the way (1 to the right), where it begins, steps, and the colours of its coat.
 FIGURES = (
-    (-0.22, 1, -0.55, 2.0, (0.78, 0.16, 0.14), (0.96, 0.84, 0.40)),
-    (0.02, -1, 0.60, 1.5, (0.14, 0.32, 0.62), (0.86, 0.90, 0.94)),
-    (0.22, 1, -0.20, 2.5, (0.14, 0.45, 0.30), (0.90, 0.80, 0.55)),
+    (-0.29, 1, -0.55, 2.0, (0.78, 0.16, 0.14), (0.96, 0.84, 0.40)),
+    (-0.02, -1, 0.60, 1.5, (0.14, 0.32, 0.62), (0.86, 0.90, 0.94)),
+    (0.25, 1, -0.30, 2.5, (0.14, 0.45, 0.30), (0.90, 0.80, 0.55)),
 )
 
 
@@ -40,18 +40,20 @@ def figure(number: int, time: float) -> Iterator[Object]:
     cloth = Material(Mottle(coat, trim, size=0.14, contrast=3.0, seed=float(number)), roughness=0.8)
     trousers, skin = Material(Plain(tuple(0.5 * x for x in coat)), roughness=0.8), Material(Plain(SKIN), roughness=0.6)
     rise = 0.012 * math.cos(2 * phase)
-    hip = Pose.at(start + way * WALK * time, depth, GROUND + LEG + 0.05 + rise, turn=0.0 if way > 0 else 180.0)
-    body, below = limb(TORSO - 0.16, 0.085)
-    yield Object(body, cloth, hip @ Pose.at(0, 0, TORSO) @ below, name)
-    yield Object(Ball(HEAD), skin, hip @ Pose.at(0, 0, TORSO + 0.12), name)
+    hip = Pose.at(start + way * WALK * time, depth, GROUND + LEG + 0.06 + rise, turn=0.0 if way > 0 else 180.0)
+    body, below = limb(TORSO - 0.16, 0.07)
+    yield Object(body, cloth, hip @ Pose.at(0, 0, TORSO) @ below, f"{name}'s body")
+    yield Object(Ball(HEAD), skin, hip @ Pose.at(0, 0, TORSO + 0.16), f"{name}'s head")
     for side in (-1, 1):
         swing = side * math.sin(phase)
-        for joint, length, radius, angle, paint in (
-            ((0, 0.045 * side, 0), LEG, 0.042, STRIDE * swing, trousers),
-            ((0, 0.115 * side, TORSO - 0.03), ARM, 0.03, -ARM_SWING * swing, cloth),
+        for part, joint, length, radius, angle, paint in (
+            ("leg", (0, 0.045 * side, 0), LEG, 0.042, STRIDE * swing, trousers),
+            ("arm", (0, 0.1 * side, TORSO - 0.03), ARM, 0.026, -ARM_SWING * swing, cloth),
         ):
             shape, place = limb(length, radius)
-            yield Object(shape, paint, hip @ Pose.at(*joint) @ Pose.about((0, 1, 0), angle) @ place, name)
+            yield Object(
+                shape, paint, hip @ Pose.at(*joint) @ Pose.about((0, 1, 0), angle) @ place, f"{name}'s {part} {side}"
+            )
 
 
 def world(time: float) -> World:
