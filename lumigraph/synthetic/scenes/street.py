@@ -38,7 +38,10 @@ def figure(number: int, time: float) -> Iterator[Object]:
     depth, way, start, steps, coat, trim = FIGURES[number]
     name, phase = f"figure {number + 1}", 2 * math.pi * steps * time
     cloth = Material(Mottle(coat, trim, size=0.14, contrast=3.0, seed=float(number)), roughness=0.8)
-    trousers, skin = Material(Plain(tuple(0.5 * x for x in coat)), roughness=0.8), Material(Plain(SKIN), roughness=0.6)
+    trousers, skin = (
+        Material(Plain((0.5 * coat[0], 0.5 * coat[1], 0.5 * coat[2])), roughness=0.8),
+        Material(Plain(SKIN), roughness=0.6),
+    )
     rise = 0.012 * math.cos(2 * phase)
     hip = Pose.at(start + way * WALK * time, depth, GROUND + LEG + 0.06 + rise, turn=0.0 if way > 0 else 180.0)
     body, below = limb(TORSO - 0.16, 0.07)
