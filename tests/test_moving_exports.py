@@ -221,6 +221,8 @@ def test_every_export_takes_one_moment_or_all(run, tmp_path, capsys):
         assert psnr(render(back.at(time), camera, BLACK).rgb, render(cloud, camera, BLACK).rgb) > 30
     assert main(["export", "splats", run, str(moved), "--set", "time=2"]) == 2
     assert "every moment" in capsys.readouterr().err
+    assert main(["export", "splats", run, str(early), "--set", "time=7"]) == 2
+    assert "give a number from 1 to 3" in capsys.readouterr().err
     assert main(["export", "splats", str(moved), str(tmp_path / "part.4dgs"), "--sphere", "0", "0", "0", "0.4"]) == 0
     assert 0 < len(fourdgs.read_moving(tmp_path / "part.4dgs")) < len(back)
     assert main(["export", "web", run, str(tmp_path / "page.html")]) == 0
