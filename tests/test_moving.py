@@ -23,7 +23,7 @@ from lumigraph.synthetic import scenes, signed_distance
 from lumigraph.synthetic.shapes import SoftCapsule
 
 pytestmark = budget("capture", 6)
-NAMES = ("jelly", "clockwork")
+NAMES = ("jelly", "clockwork", "street")
 
 
 @pytest.fixture(scope="module", params=NAMES)

@@ -5,7 +5,7 @@
     signed_distance(stage.world, points)                  exact geometry
     open_scene("procedural:still-life,size=400")          the same as any other capture
     open_scene("procedural:tourists,jitter_poses=2")      with poses that are 2 degrees and 2 % off
-    render(stage.world_of(camera), camera)                the same, of a scene that moves: `jelly`, `clockwork`, `swing`
+    render(stage.world_of(camera), camera)                of a scene that moves: `jelly`, `clockwork`, `street`, `swing`
     scene_flow(stage, camera, later)                      where each pixel's surface point is at another moment
     write_blender(stage, folder)                          the same for other tools
 

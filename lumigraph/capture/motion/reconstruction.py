@@ -312,9 +312,11 @@ class Reconstruction:
         if not self.stages.is_done("moving", key):
             with self.stages.working("moving", key), counting("Looking for what moves"):
                 write_json(self.work / MOVING_FILE, asdict(leave_out_moving(self.database)), ours=True)
-        check_still(
-            self.intake.source, typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
-        )
+        check_still(self.intake.source, self.found_to_move())
+
+    def found_to_move(self) -> MovingFeatures:
+        """What `leave_out` has found."""
+        return typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
 
     def match(self, database: Path, among: Container[str] | None = None) -> None:
         """Match the chosen pairs; with `among`, those that have one of these photographs."""
