@@ -12,6 +12,7 @@ from budgets import budget
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, OpenCV, Pinhole
+from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.images import Layer
 from lumigraph.depth_maps import DepthMap, VoxelBlocks, sensor_faults, trust_of
 from lumigraph.errors import LumigraphError
@@ -170,6 +171,26 @@ def test_a_wrong_unit_is_noticed():
     assert "nothing was measured" in said
     with pytest.raises(LumigraphError, match="has no depth beside its photographs"):
         sensor_faults(replace(tiny.scene(), layers={}))
+
+
+def test_rendered_depth_of_another_method_is_fused():
+    """`convert RUN tsdf-fusion`: a teacher that renders the tiny ball becomes a mesh of its radius."""
+
+    class Teacher:
+        def render(self, camera: Camera) -> Rendering:
+            rays = camera.rays(camera.pixels())
+            b = (rays.origins * rays.directions).sum(-1)
+            under = b * b - rays.origins.square().sum(-1) + 0.36
+            depth = torch.where(under > 0, -b - under.clamp_min(0).sqrt(), torch.inf)
+            width, height = camera.size[0].tolist()
+            opaque = depth.isfinite().float()
+            rgb = torch.ones(height, width, 3)
+            return Rendering(rgb, depth.view(height, width), opaque.view(height, width))
+
+    method = TSDFFusion(tiny.scene().frame, Config(voxel_size=0.06, truncation=3.0, max_depth=0.0))
+    method.from_field(Teacher(), tiny.scene().cameras)
+    radius = np.linalg.norm(method.mesh().vertices, axis=-1)
+    assert method.complete and abs(np.median(radius) - 0.6) < 0.02
 
 
 def test_voxels_that_fit_no_scene_are_refused():

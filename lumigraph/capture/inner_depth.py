@@ -26,6 +26,7 @@ from .pictures import EXIF_SIDEWAYS, EXIF_UPRIGHT, HEIC_SUFFIXES, measure, reada
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 XMP, MORE_XMP = b"http://ns.adobe.com/xap/1.0/\0", b"http://ns.adobe.com/xmp/extension/\0"
+HEAD_BYTES = 1 << 17  # of a JPEG, within which the first part of XMP lies
 GUID_BYTES = 32 + 8  # of a further part of XMP ahead of its text: a name, a length, a place
 FIELD = re.compile(r'\b(G?Depth):(\w+)\s*(?:=\s*"([^"]*)"|>([^<]*)<)')
 ITEM = re.compile(r"<Container:Item\b(.*?)/?>", re.DOTALL)
@@ -102,7 +103,11 @@ def inner_depth(path: Path) -> InnerDepth | None:
     with readable(path):
         if suffix in HEIC_SUFFIXES:
             return of_heic(path)
-        return of_jpeg(read_bytes(path)) if suffix in JPEG_SUFFIXES else None
+        if suffix not in JPEG_SUFFIXES:
+            return None
+        with open(path, "rb") as file:
+            told = b"Depth:" in file.read(HEAD_BYTES)
+    return of_jpeg(read_bytes(path)) if told else None
 
 
 def of_heic(path: Path) -> InnerDepth | None:
