@@ -186,7 +186,7 @@ class DeepAppearance(Method):
         """Textures of 32 texels."""
         return Config(
             texture_log2=5, code=4, channels=8, max_channels=16, mesh_rows=13, mesh_columns=17, mesh_width=8,
-            textures_per_step=4, learning_rate=5e-3,
+            textures_per_step=9, learning_rate=1e-2, divergence_weight=1e-3,
         )  # fmt: skip
 
     # Learning
