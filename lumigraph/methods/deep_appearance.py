@@ -102,17 +102,18 @@ class Networks(nn.Module):
     """Encoder of mean texture and mesh, decoder to mesh, and with the view to a texture.
 
     numbers: of coordinates of the mesh
+    moving:  without, there is one mesh, which the encoder need not know
     """
 
-    def __init__(self, c: Config, numbers: int):
+    def __init__(self, c: Config, numbers: int, moving: bool):
         super().__init__()
         levels = c.texture_log2 - int(math.log2(FIRST_SIDE))
         widths = [min(c.max_channels, c.channels << max(0, levels - 1 - k)) for k in range(levels)]
         down = [3, *reversed(widths)]
         self.down = nn.ModuleList(nn.Conv2d(a, b, 4, 2, 1) for a, b in zip(down[:-1], down[1:], strict=True))
         flat = widths[0] * FIRST_SIDE**2
-        self.mesh_in = nn.Linear(numbers, c.mesh_width)
-        self.to_code = nn.Linear(flat + c.mesh_width, 2 * c.code)
+        self.mesh_in = nn.Linear(numbers, c.mesh_width) if moving else None
+        self.to_code = nn.Linear(flat + moving * c.mesh_width, 2 * c.code)
         self.mesh_out = nn.Sequential(
             nn.Linear(c.code, c.mesh_width), nn.LeakyReLU(SLOPE), nn.Linear(c.mesh_width, numbers)
         )
@@ -127,7 +128,9 @@ class Networks(nn.Module):
         """Mean and logarithm of the deviation of the codes of normalised textures and meshes."""
         for layer in self.down:
             texture = leaky_relu(layer(texture), SLOPE)
-        hidden = torch.cat([texture.flatten(1), leaky_relu(self.mesh_in(mesh), SLOPE)], -1)
+        hidden = texture.flatten(1)
+        if self.mesh_in is not None:
+            hidden = torch.cat([hidden, leaky_relu(self.mesh_in(mesh), SLOPE)], -1)
         mean, deviation = self.to_code(hidden).chunk(2, -1)
         return mean, deviation
 
@@ -161,7 +164,7 @@ class DeepAppearance(Method):
         self.register_buffer("deviations", torch.ones(2))
         self.times, self.meshes = Kept(torch.empty(0)), Kept(torch.empty(0, vertices, 3))
         self.textures = Kept(torch.empty(0, 3, side, side, dtype=torch.uint8))
-        self.networks = Networks(c, 3 * vertices)
+        self.networks = Networks(c, 3 * vertices, frame.times is not None)
         faces, uv = grid_faces(c.mesh_rows, c.mesh_columns)
         self.uv = uv
         self.register_buffer("faces", faces, persistent=False)
@@ -183,7 +186,7 @@ class DeepAppearance(Method):
         """Textures of 32 texels."""
         return Config(
             texture_log2=5, code=4, channels=8, max_channels=16, mesh_rows=13, mesh_columns=17, mesh_width=8,
-            textures_per_step=4, learning_rate=5e-3,
+            textures_per_step=9, learning_rate=1e-2, divergence_weight=1e-3,
         )  # fmt: skip
 
     # Learning

@@ -121,14 +121,9 @@ def _stereo(scene: Scene, grids: Sequence[Camera], size: int, seconds: float) ->
     known = torch.cat([x[x.isfinite()] for x in found])
     position = torch.cat([grid.position for grid in grids])
     span = float(torch.cdist(position, position).max())
-    one_place = span < MIN_PARALLAX * (float(known.median()) if len(known) else scene.frame.near)
-    if one_place:
+    if len(known) and span < MIN_PARALLAX * float(known.median()):
         found = [torch.full_like(x, math.nan) for x in found]  # without a baseline every depth agrees
     share = float(torch.cat([x.isfinite().flatten() for x in found]).float().mean())
-    hull = None if one_place or share >= TRUSTED_SHARE else hull_surface(scene)
-    if hull is not None:  # photographs too far apart to match have silhouettes
-        hulls = (mesh_distance(*hull, grid).nan_to_num(posinf=math.nan) for grid in grids)
-        return [torch.where(x.isfinite(), x, own) for x, own in zip(found, hulls, strict=True)]
     if share == 0:
         warnings.warn(
             f"Stereo finds no depth in {scene.source}: its photographs were taken from one place, do not overlap or "
@@ -162,7 +157,10 @@ def _measured(photograph: Photograph, grid: Camera) -> Float[Tensor, "height wid
 def hull_surface(scene: Scene) -> tuple[Float[Tensor, "vertex 3"], Tensor] | None:
     """Vertices and faces of the visual hull of photographs with alpha (Gortler 1996, sec. 3.2.1); None without one."""
     solid = visual_hull(scene, HULL_CELLS).numpy()
-    if not scene.frame.has_alpha or solid.all() or not solid.any():
+    centres = (np.arange(HULL_CELLS) + 0.5) * 2 / HULL_CELLS - 1
+    for axis, (low, high) in enumerate(zip(*scene.frame.bounds, strict=True)):
+        solid[(slice(None),) * axis + ((centres < low) | (centres > high),)] = False
+    if not scene.frame.has_alpha or not solid.any():
         return None
     smooth = gaussian_filter(solid.astype(np.float32), 1.0) - 0.5
     mesh = level_set(smooth, np.full(3, 1 / HULL_CELLS - 1), 2 / HULL_CELLS)
