@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -49,12 +50,15 @@ class Jump:
         eyes = None if self.interpupillary is None else self.interpupillary / unit
         found, _ = stereo_panorama(scene, self.size // 2 * 2, eyes)
         save_sphere(self.output, torch.cat([found.left, found.right]), whole=False)
+        reliable = f"{found.nearest * unit:.4g} on; what is nearer may tear"
+        if math.isinf(found.nearest):
+            reliable = "nowhere: the lenses are too narrow for so few cameras, so places at seams are seen by one only"
         show(
             {
                 "stereo pair": f"{self.output}, the left eye on top",
                 "rig": f"{len(found.rig.order)} cameras on a circle of radius {found.rig.radius * unit:.4g}",
                 "eyes": f"{found.eyes * unit:.4g} apart",
-                "reliable from": f"{found.nearest * unit:.4g} on; what is nearer may tear",
+                "reliable from": reliable,
                 "trusted depth": f"{100 * found.trusted:.0f} % of matched pixels",
                 "filled": f"{100 * (1 - float(found.seen.float().mean())):.0f} % that no camera saw, above and below",
             }

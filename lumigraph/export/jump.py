@@ -307,7 +307,8 @@ def splat(
 
 
 def nearest_distance(rig: Rig, photographs: list[Photograph], radius: float, limit: int) -> float:
-    """Distance from the middle beyond which both cameras see what they share, within the searched disparities.
+    """Distance from the middle beyond which both cameras see what they share, within the searched disparities;
+    infinity for lenses that are too narrow.
 
     Checked along the rays of both eyes, at eye level, from one camera to the next.
     """
