@@ -20,6 +20,7 @@ import torch
 from PIL import Image
 
 from lumigraph.depth_maps import stereo
+from lumigraph.depth_maps.optical_flow import optical_flow
 
 DISPARITIES, REPETITIONS = 64, 5
 
@@ -78,6 +79,15 @@ def main(folder: Path) -> None:
     report("`stereo.semi_global`", taken, np.abs(found.values.numpy() - truth)[known], found.sure.numpy()[known])
     blocks, taken = seconds(lambda: stereo.by_blocks(a, b, 0, DISPARITIES))
     report("`stereo.by_blocks`", taken, np.abs(blocks.numpy() - truth)[known], np.ones(known.sum(), bool))
+
+    print("\n| flow | bad-2.0 | mean error | processor s |\n|---|---|---|---|")
+    ways = {f"OpenCV's DIS, preset {k}": cv2.DISOpticalFlow_create(k).calc for k in (0, 1, 2)}
+    greys = [cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in (left, right)]
+    results = {name: seconds(lambda way=way: way(*greys, None)) for name, way in ways.items()}
+    results["`optical_flow`"] = seconds(lambda: optical_flow(a, b).numpy())
+    for name, (flow, taken) in results.items():
+        error = np.hypot(flow[..., 0] + truth, flow[..., 1])[known]
+        print(f"| {name} | {100 * (error > 2).mean():.1f} % | {error.mean():.2f} | {taken:.3f} |")
 
 
 if __name__ == "__main__":

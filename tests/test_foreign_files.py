@@ -96,6 +96,8 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "demo": ("demo --seconds 1 --output shown", ("shown/", "shown")),
     "capture": ("capture photographs --output placed", ("placed/",)),
     "depth": ("depth photographs --output deep", ("deep/",)),
+    "photo3d": ("photo3d photographs photo.html", ("photo.html",)),
+    "jump": ("jump procedural:ring,size=24,views=6 pair.png --size 128", ("pair.png",)),
 }
 WRITE_NOTHING = {"info", "methods"}
 WITHIN_RUNS = {"resume", "view"}  # see the tests of checkpoints and of what is saved in the viewer

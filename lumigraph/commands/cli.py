@@ -46,6 +46,7 @@ from .explain import Explain
 from .export import Export
 from .infer import Infer
 from .info import Info
+from .jump import Jump
 from .methods import Methods
 from .photo3d import Photo3DCommand
 from .render import Render
@@ -112,6 +113,7 @@ COMMANDS: dict[str, type] = {
     "capture": CaptureCommand,
     "depth": Depth,
     "photo3d": Photo3DCommand,
+    "jump": Jump,
     "train": Train,
     "track": Track,
     "resume": Resume,

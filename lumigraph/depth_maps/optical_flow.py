@@ -80,7 +80,7 @@ def refined(
             x, y = slope.unbind(-1)
             rest = x * flow[..., 0] + y * flow[..., 1] - difference
             data += weight[..., None] * torch.stack([x * x, x * y, y * y, x * rest, y * rest], -1)
-        steepness = sum((step(flow[..., k], axis) ** 2) for k in (0, 1) for axis in (0, 1))
+        steepness = torch.stack([step(flow[..., k], axis) ** 2 for k in (0, 1) for axis in (0, 1)]).sum(0)
         smooth = SMOOTHNESS * (steepness + ROBUST).rsqrt()
         flow = kernels.relax_flow(flow, data, smooth * across, smooth * down, INNER, RELAXATION)
     return flow

@@ -66,7 +66,7 @@ class StereoPanorama:
 
     left: Float[Tensor, "height width 3"]
     right: Float[Tensor, "height width 3"]
-    depth: tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]
+    depth: Float[Tensor, "2 height width"]
     seen: Bool[Tensor, "height width"]
     rig: Rig
     eyes: float
@@ -138,10 +138,11 @@ def stereo_panorama(
     values = sums[..., :4] / weight.clamp_min(1e-9)[..., None]
     views = [push_pull(values[eye, ..., :3], known[eye]) for eye in (0, 1)]
     views = [torch.where(known[eye][..., None], values[eye, ..., :3], views[eye]).clamp(0, 1) for eye in (0, 1)]
-    depth = tuple(torch.where(known[eye], values[eye, ..., 3], torch.nan) for eye in (0, 1))
+    depth = torch.where(known, values[..., 3], torch.nan)
     trusted = sum(shares) / len(shares)
     nearest = nearest_distance(rig, photographs, radius, pairs[0].limit)
-    panorama = StereoPanorama(*views, depth, known.all(0), rig, 2 * radius, nearest, trusted)  # type: ignore[arg-type]
+    seen = known[0] & known[1]
+    panorama = StereoPanorama(views[0], views[1], depth, seen, rig, 2 * radius, nearest, trusted)
     return panorama, disparities
 
 
@@ -206,7 +207,8 @@ class Pair:
         found = stereo.semi_global(left, right, 0, count, *self.valid, costs=costs)
         mirrored = [x.flip(1).contiguous() for x in (right, left, self.valid[1], self.valid[0])]
         its = stereo.semi_global(mirrored[0], mirrored[1], 0, count, mirrored[2], mirrored[3])
-        its = stereo.Disparity(its.values.flip(1), its.sure.flip(1))
+        its = stereo.Disparity(stereo.sharpened(its.values, mirrored[0], mirrored[1]).flip(1), its.sure.flip(1))
+        found = stereo.Disparity(stereo.sharpened(found.values, left, right), found.sure)
         return [found, its], torch.stack([now.float(), found.values])
 
     def places(self, disparity: Float[Tensor, "height width"], side: int) -> Float[Tensor, "height width 3"]:
@@ -305,7 +307,8 @@ def splat(
 
 
 def nearest_distance(rig: Rig, photographs: list[Photograph], radius: float, limit: int) -> float:
-    """Distance from the middle beyond which both cameras see what they share, within the searched disparities.
+    """Distance from the middle beyond which both cameras see what they share, within the searched disparities;
+    infinity for lenses that are too narrow.
 
     Checked along the rays of both eyes, at eye level, from one camera to the next.
     """

@@ -34,6 +34,7 @@ MAX_PHOTOGRAPHS = 16
 MIN_PARALLAX = 0.004  # of the distance between photographs to the median depth; below it there is one place
 MIN_SURE = 0.02  # share of pixels of sure depth, below which photographs have no parallax
 MARGIN = 0.002  # of the panorama's angles, cut off where single rays of photographs reach farther
+MAX_SIDE = 520  # pixels of a panorama, so that a page stays below ten megabytes
 MAX_LATITUDE = 80.0  # degrees
 TEXELS = 2  # of the texture along each side of a pixel of the panorama
 ZOOM = 0.85  # of a page's angle of view to a photograph's, so that borders stay outside
@@ -151,6 +152,7 @@ def panorama_camera(maps: list[DepthMap]) -> Camera:
     top, bottom = torch.cat([x[:: max(1, len(x) // 50_000)] for x in latitudes]).quantile(ends).tolist()
     limit = float(np.radians(MAX_LATITUDE))
     top, bottom = max(top, -limit), min(bottom, limit)
+    step = max(step, max(right - left, bottom - top) / MAX_SIDE)
     width, height = int((right - left) / step) + 1, int((bottom - top) / step) + 1
     whole = torch.tensor([[2 * np.pi / step, np.pi / step]], dtype=torch.float32)
     lens = Equirectangular(whole, torch.tensor([[-left / step, -top / step]], dtype=torch.float32))

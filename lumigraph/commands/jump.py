@@ -1,0 +1,66 @@
+"""`lumigraph jump`: a ring of cameras as omnidirectional stereo panoramas."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from ..files.ranges import Downscale, Positive, between
+from .common import show
+from .options import Overwrite, ReaderOption, needed, option
+
+
+@dataclass(frozen=True)
+class Jump:
+    """Stitch the photographs of a ring of cameras to an omnidirectional stereo pair, the left eye on top.
+
+    The cameras look outward from one level circle, six or more, and their poses are known (transforms.json, or
+    procedural:ring). The nearest distance that is reliable follows from the rig, and is printed.
+    """
+
+    scene: Annotated[Positional[str], needed("RIG")]
+    """Folder of photographs with poses, or procedural:ring,views=12."""
+    output: Annotated[Positional[Path], needed("FILE.jpg|.png")]
+    """The pair, a square picture for headsets."""
+    size: Annotated[int, between(128, 8192), option("PIXELS")] = 2048
+    """Width of a panorama in pixels; the photographs should be about as sharp."""
+    interpupillary: Annotated[Positive | None, option("LENGTH", "a quarter of the rig's diameter")] = None
+    """Distance between the eyes, in units of the photographs' frame; smaller than the rig."""
+    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
+    """Reduce the photographs by this whole number before reading."""
+    reader: ReaderOption = None
+    overwrite: Overwrite = False
+
+    def run(self) -> int:
+        import torch
+
+        from ..capture import open_scene
+        from ..export.jump import stereo_panorama
+        from ..export.panorama import picture_format, save_sphere
+        from ..files import claim
+
+        picture_format(self.output)
+        claim(self.output, "panorama", self.overwrite)
+        scene = open_scene(self.scene, self.downscale, self.reader, whole=True)
+        unit = scene.frame.to_export.scale
+        eyes = None if self.interpupillary is None else self.interpupillary / unit
+        found, _ = stereo_panorama(scene, self.size // 2 * 2, eyes)
+        save_sphere(self.output, torch.cat([found.left, found.right]), whole=False)
+        reliable = f"{found.nearest * unit:.4g} on; what is nearer may tear"
+        if math.isinf(found.nearest):
+            reliable = "nowhere: the lenses are too narrow for so few cameras, so places at seams are seen by one only"
+        show(
+            {
+                "stereo pair": f"{self.output}, the left eye on top",
+                "rig": f"{len(found.rig.order)} cameras on a circle of radius {found.rig.radius * unit:.4g}",
+                "eyes": f"{found.eyes * unit:.4g} apart",
+                "reliable from": reliable,
+                "trusted depth": f"{100 * found.trusted:.0f} % of matched pixels",
+                "filled": f"{100 * (1 - float(found.seen.float().mean())):.0f} % that no camera saw, above and below",
+            }
+        )
+        return 0
