@@ -315,7 +315,7 @@ class Reconstruction:
         check_still(self.intake.source, self.found_to_move())
 
     def found_to_move(self) -> MovingFeatures:
-        """What `leave_out` has found."""
+        """Features that `leave_out` has found to move."""
         return typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
 
     def match(self, database: Path, among: Container[str] | None = None) -> None:
