@@ -91,7 +91,7 @@ def test_gains_undo_exposures():
     darker = replace(scene, images=ImageStore.from_arrays([x.numpy() for x in images]))
     rig = jump.rig_of(darker)
     photographs = [darker.photograph(int(k)) for k in rig.order]
-    gains = jump.balanced([jump.Pair.of(rig, photographs, k, 128) for k in range(CAMERAS)])
+    gains = jump.balanced([jump.RingPair.of(rig, photographs, k, 128) for k in range(CAMERAS)])
     number = rig.order.tolist().index(3)
     others = gains[[k for k in range(CAMERAS) if k != number]].mean(0)
     torch.testing.assert_close(gains[number] / others, torch.full((3,), 1.25), rtol=0.05, atol=0)

@@ -119,7 +119,7 @@ def stereo_panorama(
     if radius >= rig.radius:
         raise LumigraphError("The eyes are farther apart than the cameras' circle is wide; give a smaller distance")
     photographs = [scene.photograph(int(k)) for k in rig.order]
-    pairs = [Pair.of(rig, photographs, k, width) for k in range(len(photographs))]
+    pairs = [RingPair.of(rig, photographs, k, width) for k in range(len(photographs))]
     gains = balanced(pairs)
     height = width // 2
     sums = torch.zeros(2, height, width, 5)  # weighted colour and distance, and weight, of the nearest surfaces
@@ -147,7 +147,7 @@ def stereo_panorama(
 
 
 @dataclass(frozen=True)
-class Pair:
+class RingPair:
     """Two neighbours turned to common rows: columns are angles from the plane across the baseline, rows angles around
     the baseline, so that a place is in one row of both.
 
@@ -165,7 +165,7 @@ class Pair:
     step: float
 
     @staticmethod
-    def of(rig: Rig, photographs: list[Photograph], number: int, width: int) -> Pair:
+    def of(rig: Rig, photographs: list[Photograph], number: int, width: int) -> RingPair:
         """Seen outward, the neighbour with the smaller azimuth is on the right. width: of the whole turn"""
         right, left = photographs[number], photographs[(number + 1) % len(photographs)]
         centres = torch.cat([left.camera.position, right.camera.position])
@@ -173,14 +173,14 @@ class Pair:
         down = normalize(-UP + (UP @ x) * x, dim=0)
         rotation = torch.stack([x, down, torch.linalg.cross(x, down)], 1)
         step = 2 * math.pi / width
-        directions = Pair.directions(step)
+        directions = RingPair.directions(step)
         seen = [turned(one, directions.reshape(-1, 3) @ rotation.T, directions.shape[:2]) for one in (left, right)]
         pictures, valid = zip(*seen, strict=True)
-        return Pair(rig, number, rotation, centres, pictures, valid, step)
+        return RingPair(rig, number, rotation, centres, pictures, valid, step)
 
     @staticmethod
     def directions(step: float) -> Float[Tensor, "height width 3"]:
-        """Of the pixels, in the frame of a pair."""
+        """Directions of the pixels in the frame of a pair."""
         columns, rows = (round(math.radians(x) / step) for x in (HALF_ANGLE, LATITUDE))
         across = (torch.arange(2 * columns) + 0.5 - columns) * step
         around = ((torch.arange(2 * rows) + 0.5 - rows) * step)[:, None]
@@ -214,7 +214,7 @@ class Pair:
     def places(self, disparity: Float[Tensor, "height width"], side: int) -> Float[Tensor, "height width 3"]:
         """Places of one picture's pixels. In a row's plane, tan of the left angle less tan of the right one is the
         baseline over the distance across it."""
-        directions = Pair.directions(self.step)
+        directions = RingPair.directions(self.step)
         angle = torch.asin(directions[..., 0])
         shift = disparity.clamp_min(0.05) * self.step
         other = angle - shift if side == 0 else angle + shift
@@ -236,7 +236,7 @@ def turned(
     return torch.where(inside[:, None], rgb, 0).reshape(*shape, 3).contiguous(), inside.view(*shape)
 
 
-def balanced(pairs: list[Pair]) -> Float[Tensor, "camera 3"]:
+def balanced(pairs: list[RingPair]) -> Float[Tensor, "camera 3"]:
     """Gains of the right cameras of pairs, in their order, that make neighbours alike: least squares of the logarithms
     of ratios of mean colours where both see, whose mean is zero."""
     count = len(pairs)
@@ -252,7 +252,7 @@ def balanced(pairs: list[Pair]) -> Float[Tensor, "camera 3"]:
 
 def splat(
     sums: Float[Tensor, "height width 5"],
-    pair: Pair,
+    pair: RingPair,
     places: Float[Tensor, "rows columns 3"],
     rgb: Float[Tensor, "rows columns 3"],
     side: int,

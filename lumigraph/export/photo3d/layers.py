@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
 from ...camera import Camera
 from ...datasets.scene import Photograph
-from .stitching import CUT, Layer, grid_faces
+from .stitching import CUT, PanoramaLayer, grid_faces
 
 BAND = 0.04  # of the panorama's width: how far the second layer reaches behind the first one's edges
 WINDOW = 4  # bands around a pixel whose farthest surface decides whether it is foreground
@@ -22,7 +22,7 @@ BEHIND = 1.002  # factor of its distance there, so that the first layer is drawn
 MIN_BEHIND = 1.1  # factor of distance from which on another photograph's surface is one behind
 
 
-def background(front: Layer, layers: list[Layer]) -> Layer:
+def background(front: PanoramaLayer, layers: list[PanoramaLayer]) -> PanoramaLayer:
     """Surfaces behind the edges of the first layer.
 
     A pixel is foreground if it lies well in front of what is around it, and hides something if it is near an edge.
@@ -59,7 +59,7 @@ def background(front: Layer, layers: list[Layer]) -> Layer:
     values = torch.where(known[..., None], values, smooth)
     beside = torch.from_numpy(ndimage.binary_dilation(hidden.numpy(), iterations=OVERLAP)) & ~foreground
     depth = torch.where(beside, front.depth, 1 / values[..., 0].clamp_min(1e-9)).maximum(BEHIND * front.depth)
-    return Layer(depth, values[..., 1:], hidden | beside, seen)
+    return PanoramaLayer(depth, values[..., 1:], hidden | beside, seen)
 
 
 def push_pull(values: Float[Tensor, "height width channel"], known: Bool[Tensor, "height width"]) -> Tensor:
@@ -82,7 +82,7 @@ def push_pull(values: Float[Tensor, "height width channel"], known: Bool[Tensor,
 
 
 def mesh_of(
-    front: Layer, back: Layer | None, panorama: Camera
+    front: PanoramaLayer, back: PanoramaLayer | None, panorama: Camera
 ) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"], Float[np.ndarray, "vertex 2"]]:
     """Vertices in the scene's frame, triangles, and places in the texture, whose upper half is the first layer's."""
     height, width = front.depth.shape
@@ -101,8 +101,8 @@ def mesh_of(
 
 
 def texture_of(
-    front: Layer,
-    back: Layer | None,
+    front: PanoramaLayer,
+    back: PanoramaLayer | None,
     label: Int[Tensor, "height width"],
     photographs: list[Photograph],
     gains: list[Float[Tensor, " 3"]],

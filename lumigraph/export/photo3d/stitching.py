@@ -26,7 +26,7 @@ SEAM, MIN_SEAM, SEAM_EDGE = 60.0, 15, 20.0  # cost of a change of photograph; at
 
 
 @dataclass(frozen=True)
-class Layer:
+class PanoramaLayer:
     """A layer of a panorama.
 
     depth: distance from its centre; known: where there is a surface; sure: where neighbours confirmed the depth
@@ -88,7 +88,9 @@ def exposures(maps: list[DepthMap], inverse: list[Tensor]) -> list[Float[Tensor,
     return gains
 
 
-def drawn(seen: DepthMap, inverse: Float[Tensor, "height width"], gain: Float[Tensor, " 3"], panorama: Camera) -> Layer:
+def drawn(
+    seen: DepthMap, inverse: Float[Tensor, "height width"], gain: Float[Tensor, " 3"], panorama: Camera
+) -> PanoramaLayer:
     """A photograph's surfaces seen from the panorama's centre, cut at edges of depth."""
     height, width = inverse.shape
     rays = seen.camera.rays(seen.camera.pixels())
@@ -101,7 +103,7 @@ def drawn(seen: DepthMap, inverse: Float[Tensor, "height width"], gain: Float[Te
     attributes = torch.cat([seen.rgb.reshape(-1, 3) * gain, seen.solid.reshape(-1, 1).float()], 1)
     values, depth, number = kernels.rasterize_mesh(corners, attributes, faces, (columns, rows))
     known = number >= 0
-    return Layer(
+    return PanoramaLayer(
         torch.where(known, depth, torch.inf), values[..., :3].clamp(0, 1), known, known & (values[..., 3] > 0.5)
     )
 
@@ -132,7 +134,7 @@ def grid_faces(
     return faces[whole]
 
 
-def stitched(layers: list[Layer], panorama: Camera) -> tuple[Layer, Int[Tensor, "height width"]]:
+def stitched(layers: list[PanoramaLayer], panorama: Camera) -> tuple[PanoramaLayer, Int[Tensor, "height width"]]:
     """One layer from those of all photographs, and the photograph of each pixel.
 
     Costs are high where others show another surface (LONELY), the depth was guessed, the photograph was taken far from
@@ -161,7 +163,7 @@ def stitched(layers: list[Layer], panorama: Camera) -> tuple[Layer, Int[Tensor, 
     rgb = rgb.gather(0, index[..., None].expand(-1, -1, -1, 3))[0]
     depth, rgb, known = filled(depth, rgb, known)
     depth = torch.from_numpy(ndimage.median_filter(depth.numpy(), 3))
-    return Layer(depth, rgb, known, sure), label
+    return PanoramaLayer(depth, rgb, known, sure), label
 
 
 def filled(
