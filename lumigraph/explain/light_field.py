@@ -64,7 +64,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Line:
+class CameraRow:
     """Views of a row of cameras, and distances along the axis in each; shared focal plane.
 
     focal: pixels; spacing: scene units between neighbours
@@ -81,7 +81,7 @@ class Line:
         return self.focal * self.spacing * (1 / z - 1 / self.focus)
 
 
-def seen_along(method: Method, camera: Camera, span: float, focus: float) -> Line:
+def seen_along(method: Method, camera: Camera, span: float, focus: float) -> CameraRow:
     """Render the row of cameras, sheared to the focal plane."""
     spacing = span / INTERVALS
     cameras = grid_of(camera, 1, INTERVALS + 1, spacing, focus)[0]
@@ -92,10 +92,10 @@ def seen_along(method: Method, camera: Camera, span: float, focus: float) -> Lin
         rgb.append(seen.rgb)
         depth.append(seen.depth * cosine)
     focal = float(camera.lens.focal[0, 0])  # type: ignore[attr-defined]
-    return Line(torch.stack(rgb), torch.stack(depth), focal, spacing, focus)
+    return CameraRow(torch.stack(rgb), torch.stack(depth), focal, spacing, focus)
 
 
-def measure(line: Line) -> Sampling:
+def measure(line: CameraRow) -> Sampling:
     """Interpolate views between fewer and fewer cameras, with depth rounded to fewer and fewer layers."""
     known = line.z[line.z.isfinite()]
     if not len(known):
@@ -109,21 +109,23 @@ def measure(line: Line) -> Sampling:
     return Sampling(LAYERS, cameras, near, far, float(disparity), found)
 
 
-def quality(line: Line, stride: int, layers: int, near: float, far: float) -> float:
+def quality(line: CameraRow, stride: int, layers: int, near: float, far: float) -> float:
     """PSNR of the views in the middle between neighbouring cameras."""
     middles = range(stride // 2, INTERVALS, stride)
     found = torch.stack([between(line, middle, stride // 2, layers, near, far) for middle in middles])
     return float(psnr(found, line.rgb[list(middles)]))
 
 
-def between(line: Line, view: int, reach: int, layers: int, near: float, far: float) -> Float[Tensor, "height width 3"]:
+def between(
+    line: CameraRow, view: int, reach: int, layers: int, near: float, far: float
+) -> Float[Tensor, "height width 3"]:
     """A view from the two at `reach` on either side."""
     left, right = (warped(line, view, view + side, layers, near, far) for side in (-reach, reach))
     return 0.5 * (left + right)
 
 
 def warped(
-    line: Line, view: int, camera: int, layers: int, near: float, far: float, rows: slice = slice(None)
+    line: CameraRow, view: int, camera: int, layers: int, near: float, far: float, rows: slice = slice(None)
 ) -> Float[Tensor, "height width 3"]:
     """Rows of a view from another camera's, each pixel at the middle of its layer of depth."""
     share = (1 / line.z[view, rows].nan_to_num(far, far).clamp(near, far) - 1 / far) / (1 / near - 1 / far)
@@ -155,7 +157,7 @@ def spectrum(epi: Float[Tensor, "view width 3"]) -> Float[Tensor, "view width"]:
     return ((size / size.max()).clamp_min(1e-4).log10() / 4 + 1).clamp(0, 1)
 
 
-def draw(folder: Path, name: str, line: Line, found: Sampling, row: int) -> dict[str, Any]:
+def draw(folder: Path, name: str, line: CameraRow, found: Sampling, row: int) -> dict[str, Any]:
     """Write lightfield.png (epipolar-plane images and their spectrum), lightfield.svg (cameras against layers) and
     lightfield.json, the figures, which are returned."""
     epi = line.rgb[:, row]
@@ -183,7 +185,9 @@ def draw(folder: Path, name: str, line: Line, found: Sampling, row: int) -> dict
     return about
 
 
-def interpolated_epi(line: Line, stride: int, layers: int, found: Sampling, row: int) -> Float[Tensor, "view width 3"]:
+def interpolated_epi(
+    line: CameraRow, stride: int, layers: int, found: Sampling, row: int
+) -> Float[Tensor, "view width 3"]:
     """The epipolar-plane image with all but every so many of its cameras interpolated."""
     rows = []
     for view in range(INTERVALS + 1):

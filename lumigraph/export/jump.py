@@ -39,7 +39,7 @@ STEADY_COST, STEADY_COLOUR = 2, 12  # cost of a disparity that differs from the 
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraCircle:
     """Cameras on a level circle, anticlockwise seen from above.
 
     order: numbers of the photographs; azimuths: of the cameras, radians, rising
@@ -68,13 +68,13 @@ class StereoPanorama:
     right: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "2 height width"]
     seen: Bool[Tensor, "height width"]
-    rig: Rig
+    rig: CameraCircle
     eyes: float
     nearest: float
     trusted: float
 
 
-def rig_of(scene: Scene) -> Rig:
+def rig_of(scene: Scene) -> CameraCircle:
     """The circle of the training cameras. Raises LumigraphError if they are on none, or one is missing."""
     numbers = scene.splits["train"]
     positions = scene.cameras.position[numbers]
@@ -101,7 +101,7 @@ def rig_of(scene: Scene) -> Rig:
             f"A camera is missing in {scene.source} between {names[0]} and {names[1]}: they are "
             f"{math.degrees(float(gaps[wide])):.0f} degrees apart, others {math.degrees(usual):.0f}; add its picture"
         )
-    return Rig(middle, radius, numbers[order], azimuths)
+    return CameraCircle(middle, radius, numbers[order], azimuths)
 
 
 @torch.no_grad()
@@ -156,7 +156,7 @@ class RingPair:
     step:     radians of a pixel
     """
 
-    rig: Rig
+    rig: CameraCircle
     number: int
     rotation: Float[Tensor, "3 3"]
     centres: Float[Tensor, "2 3"]
@@ -165,7 +165,7 @@ class RingPair:
     step: float
 
     @staticmethod
-    def of(rig: Rig, photographs: list[Photograph], number: int, width: int) -> RingPair:
+    def of(rig: CameraCircle, photographs: list[Photograph], number: int, width: int) -> RingPair:
         """Seen outward, the neighbour with the smaller azimuth is on the right. width: of the whole turn"""
         right, left = photographs[number], photographs[(number + 1) % len(photographs)]
         centres = torch.cat([left.camera.position, right.camera.position])
@@ -306,7 +306,7 @@ def splat(
     sums[:, there] = torch.where(drawn & fresh[..., None], values, joined)
 
 
-def nearest_distance(rig: Rig, photographs: list[Photograph], radius: float, limit: int) -> float:
+def nearest_distance(rig: CameraCircle, photographs: list[Photograph], radius: float, limit: int) -> float:
     """Distance from the middle beyond which both cameras see what they share, within the searched disparities;
     infinity for lenses that are too narrow.
 
