@@ -164,13 +164,12 @@ def draw(folder: Path, name: str, line: CameraRow, found: Sampling, row: int) ->
     marked = line.rgb[INTERVALS // 2].clone()
     marked[row] = torch.tensor([1.0, 0.2, 0.1])
     pictures = [marked, stretched(epi), stretched(spectrum(epi)[..., None].expand(-1, -1, 3))]
-    columns = ["the middle view", "epipolar-plane image", "its spectrum"]
-    rows = [Row("one line of pixels; a line of the image is that of one camera", pictures)]
+    rows = [Row(["the middle view, one line marked", "that line, camera by camera", "its spectrum"], pictures)]
     for layers in (LAYERS[0], LAYERS[2]):
         made = [interpolated_epi(line, stride, layers, found, row) for stride in (16, 8, 4)]
         names = [f"{INTERVALS // stride + 1} cameras" for stride in (16, 8, 4)]
         rows.append(Row([f"{x}, {layers} layer{'s' * (layers > 1)}" for x in names], [stretched(x) for x in made]))
-    save_picture(folder / "lightfield.png", contact_sheet(f"{name}: a light field", columns, rows), "figure")
+    save_picture(folder / "lightfield.png", contact_sheet(f"{name}: epipolar-plane images", [""] * 3, rows), "figure")
     bound, needed = found.bound(), found.needed()
     finite = [i for i, n in enumerate(needed) if math.isfinite(n)]
     series = [
