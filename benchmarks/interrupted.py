@@ -23,6 +23,7 @@ import torch
 
 from lumigraph.budget import Budget
 from lumigraph.run import Run
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 SAVE_SECONDS = 0.5
@@ -33,7 +34,7 @@ def go_on(folder: Path) -> None:
     """Train a run to its end."""
     run = Run(folder)
     settings = run.settings
-    fit(
+    ended = fit(
         run.new_method("cpu"),
         run.scene(),
         run,
@@ -42,6 +43,7 @@ def go_on(folder: Path) -> None:
         save_every=SAVE_SECONDS,
         show=False,
     )
+    go_on_unless(ended.signal)
 
 
 def child(folder: Path) -> subprocess.Popen:

@@ -30,6 +30,7 @@ from lumigraph.method import Method
 from lumigraph.metrics import psnr
 from lumigraph.run import build
 from lumigraph.system.console import console
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 PACE_STEPS = 30  # steps whose pace says how many fit
@@ -75,14 +76,16 @@ def measured(name: str, numbers: dict[str, Any], scene: Scene, options: Options)
     method = build(kind, scene.frame, config, device, 0)
     begin, steps = time.process_time(), 1
     if name in ("lumigraph", "view-interpolation"):
-        fit(method, scene, steps=1, show=False, rehearsal=False)
+        go_on_unless(fit(method, scene, steps=1, show=False, rehearsal=False).signal)
     else:
         for count in (2, PACE_STEPS):  # the first ones compile
             begin = time.process_time()
-            fit(build(kind, scene.frame, config, device, 0), scene, steps=count, show=False, rehearsal=False)
+            go_on_unless(
+                fit(build(kind, scene.frame, config, device, 0), scene, steps=count, show=False, rehearsal=False).signal
+            )
         each = (time.process_time() - begin) / PACE_STEPS
         steps, begin = max(PACE_STEPS, math.floor(options.seconds / each)), time.process_time()
-        fit(method, scene, steps=steps, show=False, rehearsal=False)
+        go_on_unless(fit(method, scene, steps=steps, show=False, rehearsal=False).signal)
     spent = time.process_time() - begin
     method.eval()
     scores, pictures = [], []

@@ -20,6 +20,7 @@ from lumigraph.capture import open_scene
 from lumigraph.evaluation import evaluate
 from lumigraph.method.depth import DepthNumbers
 from lumigraph.run import build
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 METHODS = ("instant-ngp", "dvgo", "plenoxels", "tensorf", "nerf", "gaussian-splatting", "planar-splatting")
@@ -45,7 +46,7 @@ def main() -> None:
             for weight in (0.0, given.weight):
                 config = replace(kind.cpu_preset(), measured=DepthNumbers(weight))
                 method = build(kind, scene.frame, config, torch.device("cpu"), 0, learning=True)
-                fit(method, scene, steps=given.steps, show=False)
+                go_on_unless(fit(method, scene, steps=given.steps, show=False).signal)
                 scores.append(evaluate(method, scene, views=TEST_VIEWS))
             (psnr, psnr_with), (depth, depth_with) = ([getattr(s, x) for s in scores] for x in ("psnr", "depth_error"))
             cells = [name, views, f"{psnr:.2f}", f"{psnr_with:.2f}", f"{depth:.1f} %", f"{depth_with:.1f} %"]

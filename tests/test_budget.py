@@ -84,7 +84,8 @@ DESCENDING = [name for name in SCENES if methods.find(name).steps_for is Method.
 def test_what_takes_each_photograph_once_has_one_effort(name):
     kind, scene = methods.find(name), tiny.scene()
     method = build(kind, scene.frame, kind.smallest(), torch.device("cpu"), seed=0)
-    assert {method.steps_for(quality, scene) for quality in QUALITIES} == {len(scene.splits["train"])}
+    efforts = {method.steps_for(quality, scene) for quality in QUALITIES}
+    assert efforts in ({len(scene.splits["train"])}, {1})  # one step for each photograph, or for all together
 
 
 @pytest.mark.parametrize("name", DESCENDING)

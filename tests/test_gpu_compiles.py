@@ -23,7 +23,7 @@ SCRIPT = Path(__file__).with_name("compile_for_gpus.py")
 def kernels_that_are_launched() -> set[tuple[str, str]]:
     """Every function that some engine launches on a grid, as (operation, function)."""
     sources = {name: (folder(name) / "gpu.py").read_text(encoding="utf-8") for name in OPERATIONS}
-    return {(name, kernel) for name, text in sources.items() for kernel in re.findall(r"launch\((\w+)", text)}
+    return {(name, kernel) for name, text in sources.items() for kernel in re.findall(r"launch\(\s*(\w+)", text)}
 
 
 @kept(lambda: {SCRIPT}.union(*map(depends, OPERATIONS)))

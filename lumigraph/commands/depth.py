@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
-from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..files.ranges import Downscale, between
 from .common import lines, show, typed
 from .options import ReaderOption, needed, option
+
+if TYPE_CHECKING:
+    from ..datasets.scene import Scene
 
 LOW_SURE_SHARE = 0.3
 LOW_SHARE = " (little: walls without texture, or too little in common; trust only the sure pixels)"

@@ -377,7 +377,7 @@ def tracked_meshes(data: Scene, rows: int, columns: int) -> Float[Tensor, "photo
 
 
 def hull_mesh(data: Scene, rows: int, columns: int) -> Float[Tensor, "rows columns 3"]:
-    """The outermost place of the visual hull in each direction from its middle. LumigraphError where there is none."""
+    """Place at which the visual hull ends in each direction from its middle. LumigraphError where there is none."""
     solid = visual_hull(data, HULL_RESOLUTION)
     if not data.frame.has_alpha or solid.all() or not solid.any():
         raise LumigraphError(
@@ -393,7 +393,8 @@ def hull_mesh(data: Scene, rows: int, columns: int) -> Float[Tensor, "rows colum
     index = ((places + 1) * (HULL_RESOLUTION / 2)).long()
     inside = ((index >= 0) & (index < HULL_RESOLUTION)).all(-1)
     i, j, k = index.clamp(0, HULL_RESOLUTION - 1).unbind(-1)
-    last = torch.where(inside & solid[i, j, k], along[:, None, None], 0.0).amax(0)
+    last = along[1] * (inside & solid[i, j, k]).long().cumprod(0).sum(0)
+    last = last - math.sqrt(3) / HULL_RESOLUTION  # a cell stays if the ball around it touches the silhouettes
     return cells.mean(0) + last[..., None].clamp_min(1 / HULL_RESOLUTION) * out
 
 
