@@ -83,10 +83,10 @@ class ExportWeb:
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
         kind = self._kind(opened, method)
-        still = at_one_moment(method)
         rows: dict[str, str] = {}
         if kind == "volume":
             method, rows = self._baked(opened, method)
+        still = at_one_moment(method)
         behind = backdrop(still, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
