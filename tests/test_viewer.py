@@ -627,7 +627,8 @@ def test_what_was_kept_for_clients_goes_when_the_last_has_left(tmp_path, monkeyp
     cloud = Splatted(RED)
     with Viewer(cloud, subject(tiny.scene(), tmp_path), choose_address(port=0)) as viewer:
         one, other = Client(viewer.address.url), Client(viewer.address.url)
-        one.picture()
+        for client in (one, other):
+            client.picture()  # it is there
         viewer._shared._picked = ("a crop", cloud.gaussians())
         one.close()
         assert not given_back.wait(0.5) and viewer._shared._picked is not None  # somebody is still there

@@ -69,7 +69,15 @@ def test_a_client_exports_what_it_sees(tmp_path):
 
 def test_every_export_is_offered_and_its_command_line_works(ball_run, tmp_path):
     menu = export_menu(ball_run, ball_run.method(), (), "auto")
-    offered = {"web", "collision", "mesh", "panorama", "points", "stereo"}  # it has neither Gaussians nor octree
+    offered = {
+        "web",
+        "collision",
+        "lightfield",
+        "mesh",
+        "panorama",
+        "points",
+        "stereo",
+    }  # it has no Gaussians, no octree
     assert set(menu.formats) == offered
     options = {name: {option.name: option for option in kind.options} for name, kind in menu.formats.items()}
     assert (
