@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from .camera.rays import Samples as Samples
     from .capture import open_dataset as open_dataset
     from .capture import open_scene as open_scene
+    from .commands.calls import call as call
+    from .commands.calls import capture as capture
+    from .commands.calls import open as open
+    from .commands.calls import train as train
     from .datasets.collection import Collection as Collection
     from .datasets.dataset import Dataset as Dataset
     from .datasets.scene import Scene as Scene
@@ -22,10 +26,6 @@ if TYPE_CHECKING:
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
     from .gaussians.rasterization import rasterization as rasterization
-    from .library import call as call
-    from .library import capture as capture
-    from .library import open as open
-    from .library import train as train
     from .method import Method as Method
     from .method import RayMethod as RayMethod
     from .run import Opened as Opened
@@ -55,15 +55,15 @@ _homes = {
     "Samples": "camera.rays",
     "Scene": "datasets.scene",
     "Shapes": "datasets.shapes",
-    "call": "library",
+    "call": "commands.calls",
     "composite": "volume",
     "fit": "training",
-    "open": "library",
+    "open": "commands.calls",
     "open_any": "run",
     "open_dataset": "capture",
     "open_scene": "capture",
     "rasterization": "gaussians.rasterization",
-    "train": "library",
+    "train": "commands.calls",
 }
 __all__ = sorted(_homes)
 

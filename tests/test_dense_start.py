@@ -69,7 +69,7 @@ def ball(lens: str = "pinhole", alpha: bool = True) -> Scene:
 
 @cache
 def dense(lens: str = "pinhole", alpha: bool = True) -> dense_points.Points:
-    """What sweeps find in these photographs, in which no point is known."""
+    """Points that sweeps find in these photographs, in which none is known."""
     return dense_cloud(ball(lens, alpha))
 
 

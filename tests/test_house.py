@@ -46,7 +46,7 @@ FLOORS: list[set[str]] = [
     {"derive"},
     {"benchmark", "explain"},
     {"commands"},
-    {"__main__", "library"},
+    {"__main__"},
 ]
 # What the floors alone would let through.
 STRANGERS: list[tuple[str, str]] = [
@@ -408,6 +408,30 @@ def rooms_table() -> str:
                 f"| {number} | `{name}` | {(ast.get_docstring(ast.parse(source)) or '').partition(chr(10))[0]} |"
             )
     return "\n".join(rows) + "\n"
+
+
+EXTRAS = {
+    "coacd",
+    "cv2",
+    "fourdgs",
+    "laspy",
+    "liblzfse",
+    "pye57",
+    "rawpy",
+    "ray",
+    "triton",
+}  # modules of no plain install
+
+
+def test_what_only_an_extra_installs_is_imported_where_it_is_used():
+    """A module that a plain installation lacks would break every command that imports all methods."""
+    needed = []
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.parse(path.read_text("utf-8")).body:
+            names = [x.name for x in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            needed += [f"{path.relative_to(PACKAGE)}: {x}" for x in names if x.partition(".")[0] in EXTRAS]
+    assert not [x for x in needed if not x.startswith("kernels/")], needed  # engines for GPUs are loaded on GPUs
 
 
 def test_the_table_of_rooms_is_up_to_date():

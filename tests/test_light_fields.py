@@ -114,7 +114,7 @@ def test_the_nearest_supported_surface_is_seen():
 
 
 def test_filled_depth_continues_a_plane():
-    """Of 1 / z, which is linear on a plane, the harmonic continuation is the plane."""
+    """A plane, on which 1 / z is linear, is its own harmonic continuation."""
     lens = Pinhole(torch.full((1, 2), 30.0), torch.full((1, 2), 16.0))
     camera = Camera(torch.eye(3, 4)[None], lens, torch.tensor([[32, 32]]))
     x, y = camera.pixels().view(32, 32, 2).unbind(-1)

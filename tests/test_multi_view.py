@@ -73,7 +73,7 @@ def test_a_plane_map_has_depth_and_normals_of_the_surface():
 
 
 def test_true_planes_reproject_without_error():
-    """Of two views of a plane, at pixels whose place both see; and a depth that is off by a tenth does not."""
+    """Two views of a plane agree at pixels whose place both see; with a depth that is off by a tenth they do not."""
     views = [flat_view(ball().photograph(i), SIZE) for i in (0, 1)]
     normal, distance = torch.tensor([0.0, 0.0, 1.0]), 0.2  # n . x = d in the world
     maps = []

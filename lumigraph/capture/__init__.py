@@ -216,7 +216,7 @@ class CallablePackage(ModuleType):
     """This package as `lumigraph.capture(photographs)`: a call has the name of its command, which is this package's."""
 
     def __call__(self, *photographs: Any, **options: Any) -> Scene:
-        return import_module("..library", __package__).capture(*photographs, **options)
+        return import_module("..commands.calls", __package__).capture(*photographs, **options)
 
 
 sys.modules[__name__].__class__ = CallablePackage

@@ -67,7 +67,7 @@ class ExportWeb:
     seconds: Annotated[Seconds, option("S")] = 30.0
     """Training time of the octree that a field is converted to, in seconds."""
     duration: Annotated[Seconds, option("SECONDS")] = 3.0
-    """Of splats that move: time that the whole capture takes when it is played; longer is slower."""
+    """Time that a capture of moving splats takes when it is played; longer is slower."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()

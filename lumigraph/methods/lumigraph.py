@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -14,15 +14,14 @@ from ..camera import Camera
 from ..camera.lens import OpenCV, Pinhole
 from ..camera.rays import Rendering
 from ..components.image_based.depth import Geometry, cosines, shape
-from ..components.image_based.kept_views import KeptViews, focal_length
+from ..components.image_based.kept_views import focal_length
+from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import surface_seen
-from ..datasets.scene import Frame, Photograph, Scene
+from ..datasets.scene import Frame, Scene
 from ..files.ranges import Count, NonNegative, Pixels, PositiveShare, Seed, between
-from ..method import Descend, Method
 from ..method.controls import Control
 from ..system.work import at_work
 
-STEREO_SHARE = 0.8  # of a budget in seconds, for depth
 LENS_SAMPLES = 24  # places on a lens of some aperture
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 FOCUS_RANGE = 8.0  # times the distance of the optimum plane, to which the control reaches
@@ -46,16 +45,14 @@ class Config:
     seed: Seed = 0
 
 
-class Lumigraph(Method):
+class Lumigraph(ImageBasedMethod):
     """Photographs, a depth map of each, and weights by angle, resolution and field of view."""
 
     Config = Config
-    any_lens: ClassVar[bool] = True
     plane: Tensor  # 1 / z of the optimum plane; 0 before photographs are known
 
     def __init__(self, frame: Frame, config: Any = None):
         super().__init__(frame, config or Config())
-        self.views = KeptViews(self.config.depth_size)
         self.register_buffer("plane", torch.tensor(0.0))
 
     @classmethod
@@ -68,30 +65,11 @@ class Lumigraph(Method):
         """Measured depth of a few pixels."""
         return Config(geometry="measured", depth_size=24, candidate_views=4, surface_views=3)
 
-    # Learning: there is none
-
-    @property
-    def complete(self) -> bool:
-        """True once the photographs are kept."""
-        return bool(self.views)
-
-    def steps_for(self, quality: Any, data: Any) -> int:
-        """One, in which nothing happens."""
-        return 1
-
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         c = self.config
-        self.views.keep(data, c.geometry, c.mesh_file, self.frame.background, STEREO_SHARE * seconds)
+        self.keep(data, c.geometry, seconds, c.mesh_file)
         self.plane.fill_(float(1 / self.views.tables.middle))
-
-    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
-        """The first photograph, for the trainer to count."""
-        return data.photograph(int(data.splits["train"][0]))
-
-    def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
-        """Nothing is left to learn once `begin` has kept the photographs."""
-        return {}
 
     # Rendering
 

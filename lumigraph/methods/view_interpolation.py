@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,16 +14,16 @@ from torch.nn.functional import grid_sample, interpolate, normalize
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..components.image_based.depth import cosines, shape
-from ..components.image_based.kept_views import NOTHING, KeptViews, continued, focal_length
+from ..components.image_based.kept_views import NOTHING, continued, focal_length
+from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import consensus
 from ..components.image_based.warping import behind, pushed, soft_splat
-from ..datasets.scene import Frame, Photograph, Scene
+from ..datasets.scene import Frame, Scene
+from ..depth_maps.optical_flow import optical_flow
 from ..files.ranges import NonNegative, Pixels, Positive, PositiveShare, Seed, between
 from ..geometry import to_matrix, to_quaternion
-from ..method import Descend, Method
 from ..system.work import at_work
 
-STEREO_SHARE = 0.8  # of a budget in seconds, for depth
 MIN_COVER = 0.2  # sum of splatting weights from which on a pixel is covered
 FLOW_DISAGREEMENT = 1.5  # pixels between a flow and the one back, at which a pixel's weight has fallen to 1 / e
 
@@ -44,15 +42,13 @@ class Config:
     seed: Seed = 0
 
 
-class ViewInterpolation(Method):
+class ViewInterpolation(ImageBasedMethod):
     """Photographs and their depth, or the flow between neighbours; a picture is made of the nearest ones."""
 
     Config = Config
-    any_lens: ClassVar[bool] = True
 
     def __init__(self, frame: Frame, config: Any = None):
         super().__init__(frame, config or Config())
-        self.views = KeptViews(self.config.depth_size)
         self._flows: dict[tuple[int, int], Tensor] = {}
 
     @classmethod
@@ -65,30 +61,11 @@ class ViewInterpolation(Method):
         """Measured depth of a few pixels."""
         return Config(geometry="measured", depth_size=24)
 
-    # Learning: there is none
-
-    @property
-    def complete(self) -> bool:
-        """True once the photographs are kept."""
-        return bool(self.views)
-
-    def steps_for(self, quality: Any, data: Any) -> int:
-        """One, in which nothing happens."""
-        return 1
-
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         c = self.config
         geometry: Any = "plane" if c.by == "flow" else c.geometry
-        self.views.keep(data, geometry, "", self.frame.background, STEREO_SHARE * seconds)
-
-    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
-        """The first photograph, for the trainer to count."""
-        return data.photograph(int(data.splits["train"][0]))
-
-    def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
-        """Nothing is left to learn once `begin` has kept the photographs."""
-        return {}
+        self.keep(data, geometry, seconds)
 
     # Rendering
 
@@ -197,17 +174,13 @@ class ViewInterpolation(Method):
         return best[1], best[2], best[3]
 
     def _flow(self, i: int, j: int) -> Float[Tensor, "pixel 2"]:
-        """Dense flow from one photograph to another by inverse search (Kroeger 2016), and kept."""
+        """Dense flow from one photograph to another, kept once found."""
         if (i, j) not in self._flows:
             tables = self.views.tables
             (width, height) = tables.sizes[i, :2].tolist()
-            colours = [tables.pictures[k, :height, :width, :3].contiguous().cpu().numpy() for k in (i, j)]
-            grey = [cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in colours]
-            if i == j or min(height, width) < 16:
-                flow = np.zeros((height, width, 2), np.float32)
-            else:
-                flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*grey, None)  # type: ignore[call-overload]
-            self._flows[i, j] = torch.from_numpy(flow).view(-1, 2).to(self.device)
+            first, second = (tables.pictures[k, :height, :width, :3].contiguous().cpu() for k in (i, j))
+            flow = torch.zeros(height, width, 2) if i == j else optical_flow(first, second)
+            self._flows[i, j] = flow.reshape(-1, 2).to(self.device)
         return self._flows[i, j]
 
 

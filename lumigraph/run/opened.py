@@ -51,7 +51,7 @@ class Opened(ABC):
         """Folder of saved camera paths."""
         return self.renders / "paths"
 
-    # Commands as calls: see `library`
+    # Commands as calls: see `commands/calls.py`
 
     def render(self, camera: Camera, device: str = "auto", **controls: Any) -> Rendering:
         """Picture of one camera, with leading axes (height, width). The method is loaded once.
@@ -69,31 +69,31 @@ class Opened(ABC):
 
     def film(self, file: Path | str, /, **options: Any) -> Path:
         """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
-        return library().film(self, file, **options)
+        return calls().film(self, file, **options)
 
     def export(self, kind: str, file: Path | str, /, **options: Any) -> Path:
         """Write files for other programs. kind: mesh, splats, points, web, panorama and others, as in
         `lumigraph export`; options: those of `lumigraph export KIND`."""
-        return library().export(self, kind, file, **options)
+        return calls().export(self, kind, file, **options)
 
     def evaluate(self, **options: Any) -> dict[str, Any]:
         """Compare with held-out photographs or shapes: the contents of eval.json. options: those of `lumigraph eval`.
 
         Raises LumigraphError for what is no run.
         """
-        return library().evaluate(self, **options)
+        return calls().evaluate(self, **options)
 
     def convert(self, method: str, output: Path | str, /, **options: Any) -> Opened:
         """Run of another method, initialised from this one. options: those of `lumigraph convert`."""
-        return library().derive("convert", self, output, method, **options)
+        return calls().derive("convert", self, output, method, **options)
 
     def compress(self, output: Path | str, /, **options: Any) -> Opened:
         """Run of a fraction of the size. options: those of `lumigraph compress`."""
-        return library().derive("compress", self, output, **options)
+        return calls().derive("compress", self, output, **options)
 
     def clean(self, output: Path | str, /, **options: Any) -> Opened:
         """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
-        return library().derive("clean", self, output, **options)
+        return calls().derive("clean", self, output, **options)
 
     @property
     def version(self) -> str:
@@ -200,6 +200,6 @@ class Trained(Opened):
         return read_evaluation(path) if path.exists() else None
 
 
-def library() -> Any:
+def calls() -> Any:
     """The module of calls, by name, for that room stands above this one."""
-    return importlib.import_module("..library", __package__)
+    return importlib.import_module("..commands.calls", __package__)

@@ -16,7 +16,7 @@ ZERO, HALF, ONE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float3
 
 @njit(fastmath=True, error_model="numpy")
 def _place(warp, h, y, rows, columns, u, v):
-    """Where row y is seen, counted from the centre of a border's first pixel; on the border if nowhere."""
+    """Place of row y, counted from the centre of a border's first pixel; on the border if it is not seen."""
     y = np.float32(y) + HALF
     u0 = warp[0, 1] * y + warp[0, 2] + h * warp[0, 3]
     v0 = warp[1, 1] * y + warp[1, 2] + h * warp[1, 3]
@@ -49,7 +49,7 @@ def _look_up(pixels, stride, u, v, seen, its):
 
 @njit(fastmath=True, error_model="numpy")
 def _products(a, trust, seen, its, line):
-    """What is to be added up: w, w a, w b, w a a, w b b, w a b."""
+    """Terms of the sums over a window: w, w a, w b, w a a, w b b, w a b."""
     ones, of_a, of_b, of_aa, of_bb, of_ab = line[0], line[1], line[2], line[3], line[4], line[5]
     for x in range(len(a)):
         w, wb = trust[x] * seen[x], trust[x] * its[x]

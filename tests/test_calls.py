@@ -7,8 +7,8 @@ import tiny
 from budgets import budget
 
 import lumigraph
+from lumigraph.commands.calls import typed
 from lumigraph.errors import LumigraphError
-from lumigraph.library import typed
 
 pytestmark = budget("runs", 6)
 
@@ -66,7 +66,9 @@ def test_a_fault_is_raised(call, said):
 
 def test_the_package_of_captures_is_a_call(monkeypatch):
     seen = {}
-    monkeypatch.setattr("lumigraph.library.call", lambda name, *given, **options: seen.update(options, name=name))
-    monkeypatch.setattr("lumigraph.library.open_scene", lambda folder: folder)
+    monkeypatch.setattr(
+        "lumigraph.commands.calls.call", lambda name, *given, **options: seen.update(options, name=name)
+    )
+    monkeypatch.setattr("lumigraph.commands.calls.open_scene", lambda folder: folder)
     assert str(lumigraph.capture("photos", "scene", frames=20)) == "scene"
     assert seen["name"] == "capture" and seen["frames"] == 20

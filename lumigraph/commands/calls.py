@@ -18,17 +18,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from . import methods
-from .capture import open_scene
-from .commands.capture import scene_folder
-from .commands.cli import parse
-from .commands.common import kept_rows
-from .datasets.dataset import Dataset
-from .datasets.scene import Scene
-from .errors import LumigraphError
-from .method import Method
-from .run import Opened, open_any
-from .system.work import at_work
+from .. import methods
+from ..capture import open_scene
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Scene
+from ..errors import LumigraphError
+from ..method import Method
+from ..run import Opened, open_any
+from ..system.work import at_work
+from .capture import scene_folder
+from .cli import parse
+from .common import kept_rows
 
 FRAMES = re.compile("[╭╮╰╯│─]+|-{3,}|For full helptext, run .*")  # around faults of options
 Progress = Callable[[int, float, dict[str, Any]], object]
@@ -105,8 +105,8 @@ def export(opened: Opened, kind: str, file: str | Path, /, **options: Any) -> Pa
 
 def evaluate(opened: Opened, **options: Any) -> dict[str, Any]:
     """Compare with held-out data; see `Opened.evaluate`."""
-    from .evaluation import stem
-    from .run.records import read_evaluation
+    from ..evaluation import stem
+    from ..run.records import read_evaluation
 
     options = {"overwrite": True, **options}
     call("eval", opened.path, **options)
