@@ -56,7 +56,7 @@ def main() -> None:
             socket.on("framereceived", lambda data: pictures.append(time.monotonic()) if len(data) > MIN_PICTURE else 0)
 
         page.on("websocket", listen)
-        page.goto(address)
+        page.goto(address, timeout=120_000)
         page.evaluate(GAPS)
         shots, ended = [], None
         while ended is None or time.monotonic() < ended + 2 * SHOTS_EVERY:

@@ -67,7 +67,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "rates.sh_lr": 2.5e-3 / 0.28209479177387814,  # rgb_colors, of a colour itself
         "rates.opacities_lr": 0.05,
         "rates.scales_lr": 1e-3,
-        "reduction": 1,
+        "frame_side": 0,
     },
     "nerf": {  # bmild/nerf, run_nerf.py, paper_configs/blender_config.txt and llff_config.txt
         "network.depth": 8,

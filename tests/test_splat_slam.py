@@ -144,7 +144,7 @@ def test_a_silhouette_guides_tracking():
 def room(tmp_path_factory):
     """A short recording of the room, tracked in one sitting, and in two."""
     folder = tmp_path_factory.mktemp("room")
-    options = "--frames 6 --downscale 1 --reduction 1 --first-iterations 20 --mapping-iterations 4 --keyframe-every 2"
+    options = "--frames 6 --downscale 1 --first-iterations 20 --mapping-iterations 4 --keyframe-every 2"
     source = "procedural:room,depth,views=300,size=64"
     for name in ("straight", "broken"):
         command = f"track splat-slam {source} --output {folder / name} {options}".split()

@@ -78,7 +78,7 @@ class Config:
     rates: RateNumbers = RateNumbers(
         means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, opacities_lr=0.05, scales_lr=1e-3
     )
-    reduction: Count = 1  # whole number by which frames are reduced for tracking and mapping; larger: faster, softer
+    frame_side: Annotated[int, between(0, 10_000)] = 0  # pixels of the longer side of frames, about; 0 as photographs
     max_gaussians: CloudSize = 4_000_000  # Gaussians at most; what is seen after that is not mapped
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -104,18 +104,18 @@ class SplatSlam(Method):
         self.cloud = Cloud(balls(torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3)), c.rates)
         self.cloud.quaternions.requires_grad_(False)
         self.cloud.extent.fill_(self.unit)  # the means' rate is in metres
-        self.tracker = Tracker(frame.image_count, c.tracking, self.unit, c.reduction)
+        self.tracker = Tracker(frame.image_count, c.tracking, self.unit, c.frame_side)
         self.register_buffer("radius", torch.tensor(0.0))
         self.register_buffer("anchor", torch.zeros(0, dtype=torch.int64))
         self.rehearses = False
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """Frames of half the size, aligned with the rendered surface first; few descents."""
+        """Small frames, aligned with the rendered surface first; few descents."""
         tracking = TrackingNumbers(first_estimate="surface")
         mapping = SplatMappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
         rates = replace(Config().rates, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3)
-        return Config(tracking, SplatPoseNumbers(tracking_iterations=5), mapping, rates, reduction=2)
+        return Config(tracking, SplatPoseNumbers(tracking_iterations=5), mapping, rates, frame_side=160)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -273,7 +273,7 @@ class SplatSlam(Method):
         if len(chosen) > room:
             warnings.warn(
                 f"The map has {c.max_gaussians:,} Gaussians, so new surfaces are left out; give more by "
-                "--max-gaussians, or frames that are smaller by --reduction",
+                "--max-gaussians, or frames that are smaller by --frame-side",
                 LumigraphWarning,
                 stacklevel=2,
             )

@@ -32,13 +32,13 @@ class DepthFrame:
     size: tuple[int, int]
 
     @staticmethod
-    def of(
-        scene: Scene, index: int, device: torch.device, like: DepthFrame | None = None, reduction: int = 1
-    ) -> DepthFrame:
-        """like: another frame, whose rays are taken where the lens is the same; reduction: factor by which a frame is
-        smaller than its photograph"""
+    def of(scene: Scene, index: int, device: torch.device, like: DepthFrame | None = None, side: int = 0) -> DepthFrame:
+        """like: another frame, whose rays are taken where the lens is the same; side: pixels of the frame's longer side,
+        about, to which a larger photograph is reduced by a whole number; 0 for the photograph as it is"""
         layers = ["depth"] if "depth" in scene.layers else []
-        photograph = scene.photograph(index, layers).reduced(reduction).to(device)
+        photograph = scene.photograph(index, layers)
+        reduction = max(1, round(int(photograph.camera.size.max()) / side)) if side else 1
+        photograph = photograph.reduced(reduction).to(device)
         camera = replace(photograph.camera, pose=torch.eye(3, 4, device=device)[None])
         same = like is not None and same_lens(like.camera, camera)
         rays = like.rays if like is not None and same else camera.rays(camera.pixels())

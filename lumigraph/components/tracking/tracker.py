@@ -39,7 +39,7 @@ class Tracker(Part):
     """Follows the frames of a recording one after another.
 
     unit:        scene units of a metre
-    reduction:   whole number by which frames are smaller than photographs
+    side:        pixels of the longer side of frames, about; 0 for that of photographs
     turn:        number of frames that were followed
     is_keyframe: of each image
     """
@@ -48,9 +48,9 @@ class Tracker(Part):
     turn: Tensor
     is_keyframe: Tensor
 
-    def __init__(self, image_count: int, numbers: TrackingNumbers, unit: float, reduction: int = 1):
+    def __init__(self, image_count: int, numbers: TrackingNumbers, unit: float, side: int = 0):
         super().__init__()
-        self.numbers, self.unit, self.reduction = numbers, unit, reduction
+        self.numbers, self.unit, self.side = numbers, unit, side
         self.trajectory = Trajectory(image_count)
         self.loops = Loops(unit) if numbers.track and numbers.close_loops else None
         self.register_buffer("turn", torch.tensor(0))
@@ -77,7 +77,7 @@ class Tracker(Part):
         """A frame, which is read unless it is a keyframe that is held."""
         if index not in self._held:
             like = next(iter(self._held.values()), None)
-            return DepthFrame.of(data, index, self.turn.device, like, self.reduction)
+            return DepthFrame.of(data, index, self.turn.device, like, self.side)
         return self._held[index]
 
     def held(self, data: Scene, index: int) -> DepthFrame:
