@@ -33,8 +33,8 @@ class DepthFrame:
 
     @staticmethod
     def of(scene: Scene, index: int, device: torch.device, like: DepthFrame | None = None, side: int = 0) -> DepthFrame:
-        """like: another frame, whose rays are taken where the lens is the same; side: pixels of the frame's longer side,
-        about, to which a larger photograph is reduced by a whole number; 0 for the photograph as it is"""
+        """like: another frame, whose rays are taken where the lens is the same; side: pixels of the frame's longer
+        side, about, to which a larger photograph is reduced by a whole number; 0 for the photograph as it is"""
         layers = ["depth"] if "depth" in scene.layers else []
         photograph = scene.photograph(index, layers)
         reduction = max(1, round(int(photograph.camera.size.max()) / side)) if side else 1
