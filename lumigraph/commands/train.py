@@ -274,7 +274,7 @@ class Train:
         seed = getattr(config, "seed", self.seed)
         method = build(kind, data.frame, config, device, seed, learning=True)
         if budget is None:
-            asked = self.quality
+            asked = self.quality or method.default_quality
             budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)
         run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as viewer:

@@ -60,6 +60,7 @@ class Method(nn.Module, ABC):
     in_blocks: ClassVar[bool] = False  # whether `train` divides a large scene into blocks, each a run of its own
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
+    default_quality: ClassVar[Quality | None] = None  # budget of `train` where none is asked for; None: by seconds
     taught_steps: ClassVar[int | None] = None  # default steps after another method's field; None: by seconds
     _place: Tensor
 

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..budget import Quality
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.mesh import Mesh
@@ -49,6 +50,7 @@ class TSDFFusion(RayMethod):
 
     Config = Config
     any_lens: ClassVar[bool] = True
+    default_quality: ClassVar[Quality | None] = "good"  # each depth map once, however long it takes
     taught_steps: ClassVar[int | None] = 1
     fused: Tensor  # depth maps so far
     count: Tensor  # of depth maps in all; 0 before any are known
