@@ -83,7 +83,8 @@ def main() -> None:
 def fused(run: Path) -> bool:
     """True after the last depth map, when the run's state is complete."""
     states = sorted((run / "checkpoints").glob("*/state.json"))
-    return bool(states) and json.loads(states[-1].read_text()).get("step", 0) > 0 and (run / "photographs.json").exists()
+    complete = (run / "photographs.json").exists()  # written last
+    return complete and bool(states) and json.loads(states[-1].read_text()).get("step", 0) > 0
 
 
 def surface_share(path: Path) -> float:
