@@ -20,7 +20,7 @@ from lumigraph.capture import open_scene
 from lumigraph.components.clouds import cloud_method
 from lumigraph.components.clouds.dense_points import Points, seen_points
 from lumigraph.datasets.scene import Scene
-from lumigraph.depth_maps.depth_map import surface_points
+from lumigraph.depth_maps.depth_map import SurfacePoints, free
 from lumigraph.depth_maps.multi_view import multi_view_depth
 from lumigraph.evaluation import evaluate
 from lumigraph.run import build
@@ -34,9 +34,10 @@ VIEWS = 48  # photographs whose depth is found, as many as plane sweeps take
 def fused_points(scene: Scene, size: int) -> Points:
     """Points of all depth maps; each is as large as a pixel of its map there."""
     maps = multi_view_depth(scene, size, views=VIEWS)
-    found = surface_points(maps)
+    found = SurfacePoints.cat([seen.points() for seen in maps])
     sizes = torch.cat([seen.depth[seen.solid] / seen.camera.lens.focal.mean() for seen in maps])
-    return Points(found.points, found.colours, sizes, found.origins)
+    sure = ~free(found.points, maps)
+    return Points(found.points[sure], found.colours[sure], sizes[sure], found.origins[sure])
 
 
 def main() -> None:
