@@ -96,7 +96,8 @@ def report(name: str, found: Tensor, truth: Tensor) -> None:
     share = (off / truth[known]).median()
     print(
         f"{name}: {100 * float(known.float().mean()):.0f} % of the pixels, off by {float(off.mean()):.3f} pixels on "
-        f"average and {float(off.median()):.3f} in the middle, of up to {float(truth.max()):.1f}; {100 * float(share):.1f} %"
+        f"average and {float(off.median()):.3f} in the middle, of up to {float(truth.max()):.1f}; "
+        f"{100 * float(share):.1f} % in the middle"
     )
 
 
