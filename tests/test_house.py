@@ -34,7 +34,7 @@ FLOORS: list[set[str]] = [
     {"camera", "figures", "metrics"},
     {"kernels"},
     {"datasets", "volume"},
-    {"depth_maps", "gaussians"},
+    {"depth_maps", "gaussians", "probes"},
     {"exchange", "paths"},
     {"method"},
     {"capture", "components"},
