@@ -34,7 +34,7 @@ SUN_COLOUR, LOW_SUN_COLOUR = (1.0, 0.95, 0.88), (1.0, 0.62, 0.32)  # high above,
 LOW_SUN = 20.0  # degrees of elevation below which the sun turns red
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnvironmentLight:
     """Radiance from each direction.
 
