@@ -33,7 +33,7 @@ FLOORS: list[set[str]] = [
     {"geometry"},
     {"camera", "figures", "metrics"},
     {"kernels"},
-    {"datasets", "volume"},
+    {"datasets", "light", "volume"},
     {"depth_maps", "gaussians", "probes"},
     {"exchange", "paths"},
     {"method"},
