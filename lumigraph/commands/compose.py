@@ -66,7 +66,7 @@ class Compose:
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
             place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
         named = [CompositionPart(relative(self.lead, self.output), Similarity.make(1.0))]
-        probes = self.probes and relative(self.probes, self.output)
+        probes = None if self.probes is None else relative(self.probes, self.output)
         named.append(CompositionPart(relative(self.part, self.output), place, self.box and CropBox(*self.box), probes))
         write_composition(self.output, named)
         opened = open_any(self.output)

@@ -43,7 +43,7 @@ DIRECTIONS = 192  # from which light comes, for shadows
 MAP_SIDE = 96  # pixels along a side of each direction's depth map
 MAP_DISTANCE = 200.0  # of its camera from the mesh, in radii of the mesh
 MAP_MARGIN = 1.1  # radii of the mesh that half a map shows
-BIAS = 0.03  # radii of the mesh by which an occluder must be nearer to the light
+BIAS, NORMAL_OFFSET = 0.01, 0.04  # radii of the mesh by which an occluder must be nearer, and a point is raised
 MAP_SCALE = MAP_SIDE / 2 / MAP_MARGIN * MAP_DISTANCE  # pixels of a map for a slope of 1 in its camera
 MIN_SHADOW = 1 / 100  # share of a point's irradiance; a mesh that can take no more casts no shadow there
 CREASE = math.cos(math.radians(40))  # cosine between faces from which on their common edge looks sharp
@@ -183,7 +183,8 @@ class ShadowMaps:
         lamps = [x.numpy() for x in (basis, self.toward, self.poses, self.depth)]
         for some in near.nonzero()[:, 0].split(POINTS_PER_CHUNK):
             p, n, left = points[some], normals[some], torch.empty(len(some), 3)
-            given = [x.numpy() for x in ((p - self.centre) / self.radius, n, grid.coefficients(p, n))]
+            local = (p - self.centre) / self.radius + NORMAL_OFFSET * n
+            given = [x.numpy() for x in (local, n, grid.coefficients(p, n))]
             loops.unshadowed(*given, *lamps, MAP_SCALE, BIAS, left.numpy())
             found[some] = left
         return found
@@ -232,7 +233,8 @@ class LitComposition(Composed):
             rgb = torch.where(front[..., None], mesh.rgb + (1 - cover)[..., None] * rgb, rgb)
             depth = torch.where(cover > MIN_SURFACE_OPACITY, mesh.depth, depth)
             opacity = cover + (1 - cover) * opacity
-        return Rendering(*(x.to(self.device) for x in (rgb, depth, opacity)))
+        rgb, depth, opacity = (x.to(self.device) for x in (rgb, depth, opacity))
+        return Rendering(rgb, depth, opacity)
 
 
 def surface_of(

@@ -67,17 +67,17 @@ def probes_page(
     position = middle_of(points, normals, solid, lift * scale) if place is None else torch.tensor(place[0])
     a, b, c = shown.vertices[shown.faces].unbind(1)
     area = float(torch.linalg.cross(b - a, c - a).norm(dim=-1).sum()) / 2
-    parts = {
-        "picture": webp(seen.rgb),
+    opaque = torch.cat([normals, torch.ones_like(normals[..., :1])], -1)
+    arrays = {
         "depth": numbers(depth),
-        "normals": (((normals + 1) * 127.5).round().byte().numpy()),
+        "normals": ((opaque + 1) * 127.5).round().byte().numpy(),
         **textures(grid),
         "vertices": numbers(shown.vertices),
         "vertexNormals": numbers(shown.normals),
         "albedo": numbers(shown.albedo),
         "faces": shown.faces.numpy().astype("<u4"),
     }
-    data, places = packed({name: x if isinstance(x, bytes) else opaque(name, x).tobytes() for name, x in parts.items()})
+    data, places = packed({"picture": webp(seen.rgb)} | {name: x.tobytes() for name, x in arrays.items()})
     lens = flat.lens
     assert isinstance(lens, Pinhole)
     settings = asdict(opening_of_scene(title, camera, method.frame)) | {
@@ -127,13 +127,6 @@ def middle_of(points: Tensor, normals: Tensor, solid: Tensor, lift: float) -> Fl
 
 def numbers(values: Tensor) -> np.ndarray:
     return values.numpy().astype("<f4")
-
-
-def opaque(name: str, values: np.ndarray) -> np.ndarray:
-    """Normals as RGBA; everything else as it is."""
-    if name != "normals":
-        return values
-    return np.concatenate([values, np.full((*values.shape[:2], 1), 255, np.uint8)], -1)
 
 
 def packed(parts: dict[str, bytes]) -> tuple[bytes, dict[str, tuple[int, int]]]:

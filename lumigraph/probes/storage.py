@@ -51,26 +51,25 @@ def write_probes(folder: Path, grid: ProbeGrid, geographic: dict[str, float] | N
     radiance = grid.radiance.double().numpy()
     low, high = radiance.min(0), radiance.max(0)
     high = np.maximum(high, low + MIN_RANGE)
-    wide = grid.mean.shape[1]
-    said = ProbeRecord(
-        grid.counts,
-        tuple(grid.origin.tolist()),
-        tuple(tuple(axis) for axis in grid.axes.tolist()),  # type: ignore[arg-type]
-        tuple(grid.up.tolist()),
-        grid.order,
-        wide - 2 * BORDER,
-        grid.far,
-        low.tolist(),
-        high.tolist(),
-        grid.state.tolist(),
-        geographic,
-    )
+    said = {
+        "format": FORMAT,
+        "counts": grid.counts,
+        "origin": grid.origin.tolist(),
+        "axes": grid.axes.tolist(),
+        "up": grid.up.tolist(),
+        "order": grid.order,
+        "side": grid.mean.shape[1] - 2 * BORDER,
+        "far": grid.far,
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "state": grid.state.tolist(),
+        **({} if geographic is None else {"geographic": geographic}),
+    }
     moments = [tiled((x / scale).double().numpy(), grid.counts) for x, scale in _moments(grid)]
     with replacing_folder(folder, "probes") as partial:
         save(partial / RADIANCE, ((radiance - low) / (high - low)).reshape(len(grid), -1))
         save(partial / DISTANCE, np.concatenate(moments))
-        fields = {name: value for name, value in vars(said).items() if value is not None}
-        write_json(partial / INDEX, {"format": FORMAT, **fields}, ours=True)
+        write_json(partial / INDEX, said, ours=True)
 
 
 def read_probes(path: Path | str) -> ProbeGrid:
