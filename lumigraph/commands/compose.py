@@ -52,7 +52,7 @@ class Compose:
         from ..composition import standing
         from ..geometry import Similarity
         from ..run import open_any
-        from ..run.composition import CompositionPart, MeshFile, relative, write_composition
+        from ..run.composition import CompositionPart, LitMeshFile, relative, write_composition
 
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
@@ -60,7 +60,7 @@ class Compose:
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         lead = open_any(self.lead)
-        part = open_any(self.part) if self.probes is None else MeshFile(self.part, self.probes)
+        part = open_any(self.part) if self.probes is None else LitMeshFile(self.part, self.probes)
         place = Similarity.make(1.0)
         if any(given is not None for given in (self.at, self.scale, self.turn)):
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)

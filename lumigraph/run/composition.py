@@ -130,7 +130,7 @@ class Composition(Opened):
                 f"{self.path} names {part.source} as a part, but there is no {place}; correct its path"
             )
         if part.probes is not None:
-            return MeshFile(place, self.path.parent / files.expanded(part.probes))
+            return LitMeshFile(place, self.path.parent / files.expanded(part.probes))
         key = place.resolve()
         if key not in inner.opened or key in inner.above:
             inner.opened[key] = open_part(place, inner)
@@ -143,7 +143,7 @@ class Composition(Opened):
         built: dict[Path, Method] = {}
         placed = []
         for i, (part, opened, place) in enumerate(zip(self.parts, self.opened, self.places, strict=True)):
-            if isinstance(opened, MeshFile):
+            if isinstance(opened, LitMeshFile):
                 to_probes = self.frame.to_export @ place
                 placed.append(Placed(opened.lit(to_probes), place, part.box))
                 continue
@@ -172,7 +172,7 @@ class Composition(Opened):
         return self.opened[self.lead].view_names()
 
 
-class MeshFile(Opened):
+class LitMeshFile(Opened):
     """A mesh in a file, in the light of probes: a part of a composition, which opens nowhere else."""
 
     def __init__(self, path: Path, probes: Path):
