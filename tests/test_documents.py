@@ -16,12 +16,14 @@ import torch
 from budgets import budget
 from shape_checks import PACKAGE
 from test_cleaning import soiled
+from test_probes import uniform
 
 import lumigraph
 from lumigraph import methods
 from lumigraph.components.sampling.importance import importance
 from lumigraph.exchange.packing import Stored, most_important
 from lumigraph.methods.instant_ngp import InstantNGP
+from lumigraph.probes import write_probes
 from lumigraph.run import build
 
 pytestmark = budget("runs", 12)
@@ -69,6 +71,7 @@ def test_every_block_has_a_test():
         "docs/convert.md",
         "docs/datasets.md",
         "docs/layers.md",
+        "docs/probes.md",
         "docs/python.md",
     }
     assert set(blocks()) == tested | ELSEWHERE | NEEDS_DATA
@@ -112,6 +115,12 @@ def test_layers_of_rays():
     batch, scene = after["batch"], after["scene"]
     assert batch.extra["depth"].shape[0] == len(batch.rays.image_index) == 4096
     assert (after["exposure"] == scene.about["exposure"][batch.rays.image_index]).all()
+
+
+def test_probes_are_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_probes(Path("lights"), uniform())
+    assert (execute("docs/probes.md")["light"] - torch.pi).abs().max() < 1e-3
 
 
 def test_a_cloud_is_cleaned():

@@ -46,6 +46,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         "export lightfield ball q.png --quilt 2 2 --size 16",
         ("q_qs2x2a1.00.png",),
     ),
+    "export probes": (
+        "export probes ball lights --counts 2 2 2 --resolution 4 --page lights.html",
+        ("lights/", "lights.html"),
+    ),
     "export octree": ("export octree octree o.npz", ("o.npz",)),
     "export points": ("export points ball p.ply", ("p.ply",)),
     "export splats": ("export splats gs s.spz", ("s.spz",)),

@@ -73,6 +73,7 @@ def test_every_export_is_offered_and_its_command_line_works(ball_run, tmp_path):
         "web",
         "collision",
         "lightfield",
+        "probes",
         "mesh",
         "panorama",
         "points",

@@ -1,4 +1,4 @@
-// Bundles src/{splats,mesh,volumes,views}.js into lumigraph/export/web/, each with its parts' versions and licences on top.
+// Bundles src/{splats,mesh,volumes,views,probes}.js into lumigraph/export/web/, each with its parts' versions and licences on top.
 
 import { build } from "esbuild";
 import { readFile } from "node:fs/promises";
@@ -25,6 +25,7 @@ for (const [page, parts] of [
   ["mesh", ["three"]],
   ["volumes", ["three"]],
   ["views", []],
+  ["probes", ["three"]],
 ]) {
   const pinned = parts.filter((name) => own.dependencies[name]).map((name) => `${name} ${own.dependencies[name]}`);
   const notices = await Promise.all(parts.map(notice));

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from ..color.srgb import srgb_from_linear
+from ..files.ffmpeg import decode
 from ..system.memory import free_memory
 
 Tag = ExifTags.Base
@@ -25,7 +25,6 @@ EXR_HALF = 1  # among the types of its channels
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's colour type
 TIFF_SUFFIXES, TIFF_FLOAT = (".tif", ".tiff"), 3  # and its sample format
 MAX_SIDE, DECODING_COPIES = 10**5, 4  # pixels; and copies in memory while an image is decoded, turned and reduced
-FFMPEG_PLANES = ("g", "b", "r", "a")  # order of FFmpeg's floating-point planes
 ARRAY_NAMES = {"labels": ("labels", "ids", "semantics")}  # accepted names in an .npz
 
 
@@ -184,20 +183,6 @@ def read_array(path: Path, name: str) -> np.ndarray:
     if array.ndim not in (2, 3):
         raise ValueError(f"it holds an array of {array.ndim} axes, where a picture has two or three")
     return array
-
-
-def decode(path: Path) -> np.ndarray:
-    """A picture's numbers by FFmpeg: RGB or RGBA, or one number to a pixel."""
-    with open(path, "rb") as file, av.open(file, "r") as container:
-        frame = next(container.decode(video=0))
-    if not frame.format.name.endswith(("f16le", "f16be")):
-        return frame.to_ndarray()
-    rows = [np.frombuffer(bytes(plane), np.float16).reshape(-1, plane.line_size // 2) for plane in frame.planes]
-    rows = [row[: frame.height, : frame.width] for row in rows]
-    if len(rows) == 1:
-        return rows[0].copy()
-    by_name = dict(zip(FFMPEG_PLANES, rows, strict=False))
-    return np.stack([by_name[k] for k in "rgba" if k in by_name], -1)
 
 
 def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:

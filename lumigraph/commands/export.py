@@ -13,6 +13,7 @@ from ..errors import LumigraphError, LumigraphWarning
 from ..files import claim
 from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, Share, SphereSize, between
 from .common import show
+from .export_probes import ExportProbes
 from .export_web import ExportWeb
 from .options import (
     DeviceOption,
@@ -622,6 +623,7 @@ What = (
     | Annotated[ExportOctree, subcommand("octree")]
     | Annotated[ExportPanorama, subcommand("panorama")]
     | Annotated[ExportPoints, subcommand("points")]
+    | Annotated[ExportProbes, subcommand("probes")]
     | Annotated[ExportSnerg, subcommand("snerg")]
     | Annotated[ExportSplats, subcommand("splats")]
     | Annotated[ExportStereo, subcommand("stereo")]

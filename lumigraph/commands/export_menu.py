@@ -16,7 +16,7 @@ from ..system.signals import start
 from .export import What
 
 ENDINGS = {"mesh": ".glb", "octree": ".npz", "panorama": ".jpg", "points": ".ply", "snerg": "", "splats": ".spz"}
-ENDINGS |= {"collision": ".glb", "lightfield": "", "stereo": ".jpg", "web": ".html"}
+ENDINGS |= {"collision": ".glb", "lightfield": "", "probes": "", "stereo": ".jpg", "web": ".html"}
 ELSEWHERE = (
     "source",
     "output",

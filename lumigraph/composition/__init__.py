@@ -4,6 +4,9 @@ from .composed import Composed as Composed
 from .composed import PickedCloud as PickedCloud
 from .composed import compose as compose
 from .composed import cropped as cropped
+from .lit import LitComposition as LitComposition
+from .lit import LitMesh as LitMesh
+from .lit import ShadedMesh as ShadedMesh
 from .placed import Placed as Placed
 from .placed import frame_around as frame_around
 from .placed import standing as standing

@@ -28,7 +28,7 @@ Kind = Literal[
     "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
     "page", "splats", "octree", "atlas", "points", "mesh", "panorama", "comparison",
     "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "canonical", "depth maps",
-    "light field", "quilt", "file",
+    "light field", "quilt", "probes", "file",
 ]  # fmt: skip
 
 

@@ -6,7 +6,8 @@
       "parts": [
         {"source": "runs/courtyard-1"},
         {"source": "toys.spz", "place": {"scale": 0.3, "rotation": 90, "translation": [0.5, 0, -0.4]}},
-        {"source": "runs/lego-1", "place": [[...], [...], [...], [0, 0, 0, 1]], "box": [[-1, -1, 0], [1, 1, 1]]}
+        {"source": "runs/lego-1", "place": [[...], [...], [...], [0, 0, 0, 1]], "box": [[-1, -1, 0], [1, 1, 1]]},
+        {"source": "ball.glb", "place": {"translation": [0.1, 0.2, 0]}, "probes": "courtyard-probes"}
       ]
     }
 
@@ -15,6 +16,7 @@ place:  similarity from the source's frame of the part to that of the compositio
         where keyframes and exports lie as well. A 4 x 4 matrix, or a scale, a rotation (a quaternion w, x, y, z, or
         degrees about +z) and a translation, in this order; what is left out changes nothing
 box:    two corners in the part's scene frame, as `lumigraph info` prints its bounds and the viewer crops it
+probes: of a part that is a mesh: the folder of probes that light it, in the composition's frame; see docs/probes.md
 lead:   the part whose cameras, background and vertical the composition has; by default the first
 
     {
@@ -44,13 +46,15 @@ import torch
 from .. import files
 from ..camera import Camera
 from ..camera.crop import CropBox
-from ..composition import Composed, Placed, compose, frame_around
+from ..capture.meshes import read_shape
+from ..composition import Composed, LitComposition, LitMesh, Placed, ShadedMesh, compose, frame_around
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
+from ..probes import read_probes
 from ..system.memory import ask_for
 from .folder import Run
 from .opened import Opened
@@ -64,11 +68,12 @@ CANONICAL_FORMAT = "lumigraph canonical 1"
 
 @dataclass(frozen=True)
 class CompositionPart:
-    """A part as the file says it. source: a path as it stands there; place and box: see above."""
+    """A part as the file says it. source, probes: paths as they stand there; place and box: see above."""
 
     source: str
     place: Similarity
     box: CropBox | None = None
+    probes: str | None = None
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,7 @@ class Composition(Opened):
             )
         self.parts, self.lead = read_composition(self.path)
         inner = Nesting((*within.above, here), within.opened)
-        self.opened = [self._open(part.source, open_part, inner) for part in self.parts]
+        self.opened = [self._open(part, open_part, inner) for part in self.parts]
         self.count = sum(part.count if isinstance(part, Composition) else 1 for part in self.opened)
         if self.count > MAX_PARTS:
             raise LumigraphError(f"{self.path} has {self.count:,} parts, and {MAX_PARTS:,} are the most; name fewer")
@@ -117,11 +122,15 @@ class Composition(Opened):
         del others[self.lead]
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
-    def _open(self, source: str, open_part: Callable[[Path, Nesting], Opened], inner: Nesting) -> Opened:
-        """The scene that a part names; each is opened once."""
-        place = self.path.parent / files.expanded(source)
+    def _open(self, part: CompositionPart, open_part: Callable[[Path, Nesting], Opened], inner: Nesting) -> Opened:
+        """The scene or mesh that a part names; each scene is opened once."""
+        place = self.path.parent / files.expanded(part.source)
         if not files.exists(place):
-            raise LumigraphError(f"{self.path} names {source} as a part, but there is no {place}; correct its path")
+            raise LumigraphError(
+                f"{self.path} names {part.source} as a part, but there is no {place}; correct its path"
+            )
+        if part.probes is not None:
+            return LitMeshFile(place, self.path.parent / files.expanded(part.probes))
         key = place.resolve()
         if key not in inner.opened or key in inner.above:
             inner.opened[key] = open_part(place, inner)
@@ -134,13 +143,18 @@ class Composition(Opened):
         built: dict[Path, Method] = {}
         placed = []
         for i, (part, opened, place) in enumerate(zip(self.parts, self.opened, self.places, strict=True)):
+            if isinstance(opened, LitMeshFile):
+                to_probes = self.frame.to_export @ place
+                placed.append(Placed(opened.lit(to_probes), place, part.box))
+                continue
             name = opened.path.resolve()
             if name not in built:
                 built[name] = opened.method(device)
             placed.append(Placed(built[name], place, part.box, leads=i == self.lead))
         needed = CLOUD_COPIES * sum(cloud_bytes(part.method) for part in placed)
         ask_for(needed, torch.device(device), f"{self.path} with {self.count:,} parts", "name fewer parts")
-        return compose(self.frame, placed).to(device)
+        lit = any(isinstance(part.method, LitMesh) for part in placed)
+        return (LitComposition if lit else compose)(self.frame, placed).to(device)
 
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the leading part."""
@@ -156,6 +170,26 @@ class Composition(Opened):
 
     def view_names(self) -> dict[str, list[str]]:
         return self.opened[self.lead].view_names()
+
+
+class LitMeshFile(Opened):
+    """A mesh in a file, in the light of probes: a part of a composition, which opens nowhere else."""
+
+    def __init__(self, path: Path, probes: Path):
+        self.path = path
+        self.shape = read_shape(path, path.stem)
+        if not len(self.shape.mesh.faces):
+            raise LumigraphError(f"{path} holds points and no triangles; name a mesh")
+        self.grid = read_probes(probes)
+        self.frame = self.shape.frame
+
+    def lit(self, to_probes: Similarity) -> LitMesh:
+        """The mesh in the probes' light. to_probes: from the mesh's scene frame to that of the probes"""
+        return LitMesh(self.frame, ShadedMesh.of(self.shape.mesh), self.grid, to_probes)
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The mesh where its file has it, in the light of probes in the same frame."""
+        return self.lit(self.frame.to_source)
 
 
 def cloud_bytes(method: Method) -> int:
@@ -185,6 +219,7 @@ class PartSaid:
     source: Name
     place: Any = field(default_factory=dict)
     box: tuple[Point, Point] | None = None
+    probes: Name | None = None
 
 
 @dataclass(frozen=True)
@@ -207,7 +242,10 @@ def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     parts = []
     for part in found.parts:
         place = place_from_json(part.place, path)
-        parts.append(CompositionPart(part.source, place, None if part.box is None else box_of(part.box, path)))
+        box = None if part.box is None else box_of(part.box, path)
+        parts.append(CompositionPart(part.source, place, box, part.probes))
+    if found.parts[found.lead].probes is not None:
+        raise LumigraphError(f"{path}: a mesh should lead, and has no cameras; correct `lead`")
     return parts, found.lead
 
 
@@ -231,6 +269,8 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
         said["place"] = place
     if part.box is not None:
         said["box"] = [list(part.box.lower), list(part.box.upper)]
+    if part.probes is not None:
+        said["probes"] = part.probes
     return said
 
 

@@ -45,10 +45,12 @@ from .members import is_category as is_category
 from .members import is_collection as is_collection
 from .members import member_stage
 from .members import members_of as members_of
-from .rendering import eight_bits, photograph, radiance
+from .rendering import eight_bits, open_sky, photograph, radiance, roughness
+from .rendering import lit as lit
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
+from .rendering import unoccluded as unoccluded
 from .stage import SyntheticStage as SyntheticStage
 from .stage import told
 from .world import Lamp as Lamp
@@ -166,6 +168,14 @@ def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]
         exact = {"depth": measured, "exact_depth": exact["depth"]}
     if stage.moving_things:
         lasting["moving"] = plane("moving", "index", np.int64, names=("still", "moving"))
+    if stage.world.environment is not None:
+        lasting |= {
+            "raw": PixelPlane(
+                partial(lit, stage.world_of(camera), camera), "linear", dtype=np.dtype(np.float32), channels=4
+            ),
+            "roughness": plane("roughness", "plain", np.float32),
+            "visibility": plane("visibility", "plain", np.float32),
+        }
     return lasting | {
         **exact,
         "normals": plane("normals", "direction", np.float32, 3),
@@ -203,7 +213,11 @@ def without_passers_by(stage: SyntheticStage, camera: Camera) -> np.ndarray:
 def known(stage: SyntheticStage, camera: Camera, name: str) -> np.ndarray:
     """Ground-truth layers along the rays through pixel centres, from `render`."""
     width, height = camera.size[0].tolist()
-    seen = trace(stage.world_of(camera), camera.rays(camera.pixels()), shaded=False)
+    world, rays = stage.world_of(camera), camera.rays(camera.pixels())
+    if name in ("roughness", "visibility"):
+        values = (roughness if name == "roughness" else open_sky)(world, rays)
+        return values.astype(np.float32).reshape(height, width)
+    seen = trace(world, rays, shaded=False)
     values = {
         "depth": seen.depth,
         "normals": seen.normal,

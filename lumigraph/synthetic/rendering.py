@@ -10,16 +10,18 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..color.srgb import srgb_from_linear
-from . import tracer
+from ..light import EnvironmentLight
+from . import environment, tracer
 from .world import World
 
 RAYS_PER_TASK = 4096
+POINTS_PER_TASK = 64
 FILM_HEADROOM = 64.0  # radiance relative to white that stays below the film's shoulder
 MAX_CONTRAST = 0.08  # between samples of a pixel; above it more are taken (0 is black, 1 white, sRGB-encoded)
 
@@ -60,6 +62,9 @@ def render(world: World, camera: Camera, samples: int = 4, more: int = 8) -> Ren
 def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) -> tuple[np.ndarray, np.ndarray]:
     """The picture alone, float32: straight sRGB colours (height, width, 3) and coverage (height, width) in [0, 1]."""
     width, height = camera.size[0].tolist()
+    if world.environment is not None:
+        light = lit(world, camera)
+        return srgb_from_linear(light[..., :3].clip(0, 1)).astype(np.float32), light[..., 3]
     places = camera.pixels()
     pixels = _gather(world, camera, places, samples, aims=1)
     count = np.full((len(pixels), 1), samples)
@@ -74,10 +79,71 @@ def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) ->
 
 def radiance(world: World, camera: Camera, samples: int = 12) -> np.ndarray:
     """The light of every pixel, linear sRGB (height, width, 3), without a film that bends what is bright."""
+    if world.environment is not None:
+        return lit(world, camera)[..., :3]
     width, height = camera.size[0].tolist()
     dim = replace(world, sky=replace(world.sky, exposure=world.sky.exposure / FILM_HEADROOM))
     pixels = _gather(dim, camera, camera.pixels(), samples, aims=1)
     return (FILM_HEADROOM / samples * pixels[:, :3]).astype(np.float32).reshape(height, width, 3)
+
+
+def lit(world: World, camera: Camera, samples: int = 4, lights: int = 32) -> Float[np.ndarray, "height width 4"]:
+    """Straight radiance (linear sRGB) and coverage of every pixel in the world's environment light.
+
+    samples: rays per pixel; lights: samples of the light for each of them
+    """
+    assert world.environment is not None
+    width, height = camera.size[0].tolist()
+    offsets = torch.from_numpy(hammersley(samples)).to(camera.pose) - 0.5
+    rays = camera.rays((camera.pixels()[:, None] + offsets).reshape(-1, 2))
+    origins, directions, radius = _arrays(rays)
+    table, seen = environment.LightTable.of(world.environment), np.empty((len(rays), 4))
+
+    def work(first: int) -> None:
+        part = slice(first, first + RAYS_PER_TASK)
+        given = origins[part], directions[part], radius[part] / samples**0.5
+        environment.light(world.arrays, table, *given, first, lights, world.bounces, seen[part])
+
+    list(_workers().map(work, range(0, len(rays), RAYS_PER_TASK)))
+    pixels = seen.reshape(height, width, samples, 4).sum(2)
+    pixels[..., :3] /= np.maximum(pixels[..., 3:], 1)
+    pixels[..., 3] /= samples
+    return pixels.astype(np.float32)
+
+
+def unoccluded(
+    world: World, points: np.ndarray, normals: np.ndarray, directions: np.ndarray
+) -> Bool[np.ndarray, "point direction"]:
+    """Mask of the directions above each surface point in which nothing is in the way."""
+    out = np.empty((len(points), len(directions)), bool)
+
+    def work(first: int) -> None:
+        part = slice(first, first + POINTS_PER_TASK)
+        given = (np.ascontiguousarray(x, np.float64) for x in (points[part], normals[part], directions))
+        environment.unoccluded(world.arrays, *given, out[part])
+
+    list(_workers().map(work, range(0, len(points), POINTS_PER_TASK)))
+    return out
+
+
+def roughness(world: World, rays: Rays) -> Float[np.ndarray, " ray"]:
+    """Roughness of the material that each ray meets; NaN where it meets none."""
+    origins, directions, _ = _arrays(rays)
+    out = np.empty(len(rays))
+    environment.roughness(world.arrays, origins, directions, out)
+    return out
+
+
+def open_sky(world: World, rays: Rays) -> Float[np.ndarray, " ray"]:
+    """Share of a uniform sky's light that reaches the surface which each ray meets; NaN where it meets none."""
+    seen, even = trace(world, rays, shaded=False), EnvironmentLight.uniform()
+    towards, power = (x.double().numpy() for x in even.lamps)
+    hit = np.flatnonzero(seen.identity >= 0)
+    points = rays.origins.double().numpy()[hit] + seen.depth[hit, None] * rays.directions.double().numpy()[hit]
+    weight = (seen.normal[hit] @ towards.T).clip(0) * power[:, 0]
+    out = np.full(len(rays), np.nan)
+    out[hit] = (unoccluded(world, points, seen.normal[hit], towards) * weight).sum(-1) / weight.sum(-1)
+    return out
 
 
 def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:

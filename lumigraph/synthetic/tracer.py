@@ -201,6 +201,17 @@ def film(x):
 
 
 @njit(**INNER_OPTIONS)
+def surface(thing, material, p, d, width):
+    """(normal, reflectance) at a point of an object that a ray along d meets; width: of the ray there."""
+    local = rotate_back(thing.rotation, along(p, -1.0, vec(thing.position)))
+    shape_normal = gradient(thing.kind, thing.size, local)
+    n = rotate(thing.rotation, shape_normal)
+    fixed = at_rest(thing.kind, thing.size, local)
+    blend, shade = pattern(material.texture, material.numbers, fixed, shape_normal, width / max(-dot(n, d), 0.05))
+    return n, scale(mix(vec(material.a), vec(material.b), blend), shade)
+
+
+@njit(**INNER_OPTIONS)
 def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
     """(radiance, distance, normal, thing, reflectance) for one ray; see `trace`."""
     t, found = meet(objects, nodes, o, d, INFINITY, 0.0, -1)
@@ -215,14 +226,8 @@ def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
         thing = objects[found]
         material = materials[thing.material]
         p = along(o, t, d)
-        local = rotate_back(thing.rotation, along(p, -1.0, vec(thing.position)))
-        shape_normal = gradient(thing.kind, thing.size, local)
-        n = rotate(thing.rotation, shape_normal)
         travelled += t
-        slant = max(-dot(n, d), 0.05)
-        fixed, width = at_rest(thing.kind, thing.size, local), radius * travelled / slant
-        blend, shade = pattern(material.texture, material.numbers, fixed, shape_normal, width)
-        albedo = scale(mix(vec(material.a), vec(material.b), blend), shade)
+        n, albedo = surface(thing, material, p, d, radius * travelled)
         if bounce == 0:
             facing, identity, own = n, thing.identity, albedo
             if aims == 0:
@@ -301,4 +306,5 @@ def _digest() -> int:
     return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
 
 
-trace, gather, signed_distance = _build(_digest())
+SOURCES = _digest()
+trace, gather, signed_distance = _build(SOURCES)

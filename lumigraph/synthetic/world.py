@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..color.srgb import linear_from_srgb
+from ..light import EnvironmentLight
 from .shapes import SolidShape
 from .textures import Colour, Texture
 
@@ -198,11 +199,17 @@ class Sky:
 
 @dataclass(frozen=True)
 class World:
-    """A scene to photograph. z points up, lengths in scene units."""
+    """A scene to photograph. z points up, lengths in scene units.
+
+    environment: an exact light from all sides in place of lights and sky; None where there is none
+    bounces:     reflections of its light between surfaces, 0 or 1
+    """
 
     objects: tuple[Object, ...]
     lights: tuple[Lamp | Sun, ...] = ()
     sky: Sky = Sky()
+    environment: EnvironmentLight | None = None
+    bounces: int = 0
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,10 @@
+"""Light probes: harmonics of light and distances on a grid, their files, and light at any surface between them."""
+
+from .grid import FREE as FREE
+from .grid import MATTER as MATTER
+from .grid import UNSEEN as UNSEEN
+from .grid import ProbeGrid as ProbeGrid
+from .grid import lattice as lattice
+from .harmonics import projected as projected
+from .storage import read_probes as read_probes
+from .storage import write_probes as write_probes
