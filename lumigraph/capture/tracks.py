@@ -1,5 +1,6 @@
-"""Tracks beside photographs, for every reader: tracks.json has boxes of rigid things that move, in the frame and unit of
-the photographs' poses, and moments in the unit of their times.
+"""Tracks beside photographs, for every reader: tracks.json has boxes of rigid things that move.
+
+It is in the frame and unit of the photographs' poses, with moments in the unit of their times.
 
     {
       "format": "lumigraph tracks 1",
@@ -10,8 +11,8 @@ the photographs' poses, and moments in the unit of their times.
     }
 
 size: of the box along its own axes, x forward, y to the left, z up. positions: of its centre. rotations: from the box's
-axes to the frame's, quaternions (w, x, y, z). Between two moments a pose is interpolated; before the first and after the
-last the thing is not there. One moment alone holds for all time.
+axes to the frame's, quaternions (w, x, y, z). Between two moments a pose is interpolated; before the first and after
+the last the thing is not there. One moment alone holds for all time.
 """
 
 from __future__ import annotations

@@ -60,12 +60,12 @@ class Track:
 
     def transformed(self, frame: Similarity) -> Track:
         """The same track in another frame."""
-        scale = frame.scale
+        length, width, height = (frame.scale * side for side in self.size)
         positions = frame.points(torch.tensor(self.positions, dtype=torch.float64))
         turned = frame.rotation @ to_matrix(torch.tensor(self.rotations, dtype=torch.float64))
         return replace(
             self,
-            size=tuple(scale * x for x in self.size),
+            size=(length, width, height),
             positions=tuple(map(tuple, positions.tolist())),
             rotations=tuple(map(tuple, to_quaternion(turned).tolist())),
         )
@@ -83,7 +83,8 @@ class Track:
             upper = min(max(int(torch.searchsorted(times, time, right=True)), 1), len(times) - 1)
             lower = upper - 1
             share = min(max((time - self.times[lower]) / (self.times[upper] - self.times[lower]), 0.0), 1.0)
-        position = torch.lerp(*(torch.tensor(self.positions[i], dtype=torch.float64) for i in (lower, upper)), share)
+        first, last = (torch.tensor(self.positions[i], dtype=torch.float64) for i in (lower, upper))
+        position = torch.lerp(first, last, share)
         a, b = (torch.nn.functional.normalize(torch.tensor(self.rotations[i]).double(), dim=0) for i in (lower, upper))
         return torch.cat([to_matrix(torch.lerp(a, b if a @ b >= 0 else -b, share)[None])[0], position[:, None]], 1)
 
@@ -109,9 +110,9 @@ class TrackEdit:
 
     def transformed(self, frame: Similarity) -> TrackEdit:
         """The same edit in another frame."""
-        matrix = frame.matrix[:3, :3] @ torch.tensor(self.shift, dtype=torch.float64)
+        shift = frame.matrix[:3, :3] @ torch.tensor(self.shift, dtype=torch.float64)
         track = None if self.track is None else self.track.transformed(frame)
-        return replace(self, shift=tuple(matrix.tolist()), track=track)
+        return replace(self, shift=tuple(shift.tolist()), track=track)
 
 
 @dataclass(frozen=True)
@@ -150,13 +151,15 @@ def nodes_of(tracks: Sequence[Track], edits: TrackEdits = TrackEdits(())) -> tup
                 raise LumigraphError(unknown(edit.node, known))
             continue
         like = edit.like or edit.node
-        base = nodes.get(edit.node) or nodes.get(like) or (known.get(like) and Node(like, like, known[like], like))
-        if base is None or (edit.like is not None and edit.like not in known):
+        if edit.node not in nodes and like not in known:
             raise LumigraphError(unknown(like, known))
+        if edit.like is not None and edit.like not in known:
+            raise LumigraphError(unknown(edit.like, known))
+        base = nodes.get(edit.node) or nodes.get(like) or Node(like, like, known[like], like)
         looks = edit.like or base.like
-        if (edit.like and edit.node in known) and known[edit.like].category != known[edit.node].category:
+        if known[looks].category != known[base.like].category:
             raise LumigraphError(
-                f"{edit.node} is a {known[edit.node].category} and {edit.like} a {known[edit.like].category}; "
+                f"{edit.node} is a {known[base.like].category} and {looks} a {known[looks].category}; "
                 "swap things of one category"
             )
         track = base.track if edit.track is None else edit.track

@@ -14,6 +14,9 @@ source: of a part: anything that opens, from this file's folder or absolute
 place:  similarity from the source's frame of the part to that of the composition, both those of photographs or files,
         where keyframes and exports lie as well. A 4 x 4 matrix, or a scale, a rotation (a quaternion w, x, y, z, or
         degrees about +z) and a translation, in this order; what is left out changes nothing
+edits:  changes of a scene graph's things (neural-scene-graph), in order, each of a `node`: "remove", "shift" [x, y, z]
+        and "turn" (degrees about its upright axis), "like" another thing, and its own "track" as in tracks.json. A node
+        of a new name adds a thing. Lengths are of the source's frame of the part
 box:    two corners in the part's scene frame, as `lumigraph info` prints its bounds and the viewer crops it
 lead:   the part whose cameras, background and vertical the composition has; by default the first
 
@@ -35,7 +38,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,6 +49,7 @@ from ..camera import Camera
 from ..camera.crop import CropBox
 from ..composition import Composed, Placed, compose, frame_around
 from ..datasets.scene import Frame
+from ..datasets.tracks import TrackEdit, TrackEdits
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
@@ -64,11 +68,12 @@ CANONICAL_FORMAT = "lumigraph canonical 1"
 
 @dataclass(frozen=True)
 class CompositionPart:
-    """A part as the file says it. source: a path as it stands there; place and box: see above."""
+    """A part as the file says it. source: a path as it stands there; place, box and edits: see above."""
 
     source: str
     place: Similarity
     box: CropBox | None = None
+    edits: TrackEdits = TrackEdits(())
 
 
 @dataclass(frozen=True)
@@ -137,10 +142,20 @@ class Composition(Opened):
             name = opened.path.resolve()
             if name not in built:
                 built[name] = opened.method(device)
-            placed.append(Placed(built[name], place, part.box, leads=i == self.lead))
+            placed.append(Placed(self._edited(built[name], part, opened), place, part.box, leads=i == self.lead))
         needed = CLOUD_COPIES * sum(cloud_bytes(part.method) for part in placed)
         ask_for(needed, torch.device(device), f"{self.path} with {self.count:,} parts", "name fewer parts")
         return compose(self.frame, placed).to(device)
+
+    def _edited(self, method: Method, part: CompositionPart, opened: Opened) -> Method:
+        """The part's method after the part's edits. Raises LumigraphError for one that is no scene graph."""
+        if not part.edits.edits:
+            return method
+        if TrackEdits not in method.takes:
+            raise LumigraphError(
+                f"{self.path} edits things of {part.source}, which is no scene graph; train neural-scene-graph"
+            )
+        return method.given(part.edits.transformed(opened.frame.to_source.inverse))
 
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the leading part."""
@@ -185,6 +200,7 @@ class PartSaid:
     source: Name
     place: Any = field(default_factory=dict)
     box: tuple[Point, Point] | None = None
+    edits: tuple[TrackEdit, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -207,7 +223,10 @@ def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     parts = []
     for part in found.parts:
         place = place_from_json(part.place, path)
-        parts.append(CompositionPart(part.source, place, None if part.box is None else box_of(part.box, path)))
+        for track in (edit.track for edit in part.edits if edit.track is not None):
+            track.check()
+        box = None if part.box is None else box_of(part.box, path)
+        parts.append(CompositionPart(part.source, place, box, TrackEdits(part.edits)))
     return parts, found.lead
 
 
@@ -231,6 +250,9 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
         said["place"] = place
     if part.box is not None:
         said["box"] = [list(part.box.lower), list(part.box.upper)]
+    if part.edits.edits:
+        usual = asdict(TrackEdit(""))
+        said["edits"] = [{k: v for k, v in asdict(edit).items() if v != usual[k]} for edit in part.edits.edits]
     return said
 
 

@@ -1,4 +1,4 @@
-"""Neural Scene Graphs: a static background and moving instances of classes in boxes (Ost et al. 2021, arXiv 2011.10379)."""
+"""Neural Scene Graphs: a static background, and moving instances of classes in boxes (Ost et al. 2021)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from ...camera.rays import Look, Rays
 from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ...components.fields.hash_field import CODES_RATE, CPU_LEVELS, HashField, HashNumbers, TableNumbers
+from ...components.fields.hash_field import CODES_RATE, HashField, HashNumbers
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
@@ -26,7 +26,7 @@ from ...composition.composed import union
 from ...datasets.scene import Batch, Frame, Scene
 from ...datasets.tracks import Node, Track, TrackEdit, TrackEdits, nodes_of
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, LearningRate, NonNegative, PositiveShare, Seed, Width, between
+from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
 from ...method import FieldMethod, Pass
 from ...method.controls import Control, Value, blend, moment
 from ...method.field import Colours, Densities, Directions, Points
@@ -45,13 +45,14 @@ class Config:
     network: NetworkNumbers = NetworkNumbers()
     rays: RayNumbers = RayNumbers(rays_per_step=8192)
     table: HashNumbers = HashNumbers()
-    class_table: TableNumbers = TableNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers()
     nodes: NodeNumbers = NodeNumbers()
     field: Literal["hash", "network"] = "network"  # fields of background and classes: the paper's, or hash tables
+    class_log2_hashmap_size: Annotated[int, between(1, 28)] = 17  # log2 of entries of a level of a class's hash table
+    class_max_resolution: Annotated[int, between(1, 1 << 20)] = 256  # cells along a box of its finest level
     hidden_width: Width = 256  # channels of a layer, as in NeRF; wider holds more detail, and costs time
     code_width: Annotated[int, between(1, 1024)] = 256  # numbers of an instance's latent code; more tell more apart
     code_weight: NonNegative = 1e-4  # weight of codes squared, eq. 10; higher: instances are more alike
@@ -95,7 +96,8 @@ class NeuralSceneGraph(FieldMethod):
             if c.field == "hash":
                 self.network = HashField(c.table, c.hidden_width, space, frame.reach, joining=joining)
                 self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
-                numbers = replace(c.table, **vars(c.class_table))
+                sizes = c.class_log2_hashmap_size, c.class_max_resolution
+                numbers = replace(c.table, log2_hashmap_size=sizes[0], max_resolution=sizes[1])
                 classes: list[ClassField] = [
                     HashClassField(numbers, c.hidden_width, c.code_width) for _ in self.categories
                 ]
@@ -113,16 +115,16 @@ class NeuralSceneGraph(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
-        classes = replace(CPU_LEVELS, log2_hashmap_size=15, base_resolution=8, max_resolution=96)
-        c = Config(**CPU_HASH, class_table=classes, field="hash", hidden_width=32, code_width=16, box_samples=24)
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, code_width=16, box_samples=24)
+        c = replace(c, class_log2_hashmap_size=15, class_max_resolution=96)
         c = replace(c, box_scale=1.1, pose_input="heading", huber_delta=0.3, code_weight=1e-3, decay_start=0.3)
         return replace(c, learning_rate=2e-2, final_learning_rate=1e-3)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and networks with corrections of poses, within some twenty quick steps."""
-        tiny = TableNumbers(levels=4, log2_hashmap_size=10, base_resolution=4, max_resolution=16)
-        c = Config(**TINY_HASH, class_table=tiny, field="hash", hidden_width=16, code_width=4, box_samples=8)
+        c = Config(**TINY_HASH, field="hash", hidden_width=16, code_width=4, box_samples=8)
+        c = replace(c, class_log2_hashmap_size=10, class_max_resolution=16)
         c = replace(c, nodes=NodeNumbers(refine_tracks=True), box_scale=1.1, pose_input="heading")
         return replace(c, learning_rate=2e-2, final_learning_rate=2e-3)
 
@@ -146,7 +148,7 @@ class NeuralSceneGraph(FieldMethod):
         there = {node.name for node in nodes_of(self.tracks, self.edits)}
         own = tuple(edit for edit in chosen if edit.node in there)
         self.shown_nodes: tuple[Node, ...] = nodes_of(self.tracks, TrackEdits((*self.edits.edits, *own)))
-        self.table = PoseTable(self.shown_nodes, self.tracks)
+        self.table = PoseTable(self.shown_nodes, self.frame.tracks)
 
     @property
     def instances(self) -> dict[str, str]:
@@ -166,6 +168,10 @@ class NeuralSceneGraph(FieldMethod):
             rows.append(torch.lerp(codes[known[a]], codes[known[b]], share if between_two else 0.0))
         return torch.stack(rows) if rows else codes[:0]
 
+    @property
+    def class_fields(self) -> list[ClassField]:
+        return list(self.classes)  # type: ignore[arg-type]
+
     def class_of(self, node: Node) -> int:
         """Number of the class of a node's looks."""
         return self.categories.index(next(track.category for track in self.tracks if track.name == node.like))
@@ -178,7 +184,7 @@ class NeuralSceneGraph(FieldMethod):
     def crossings(self, rays: Rays) -> Crossings:
         """Stretches of rays inside the boxes of their moments."""
         if self.table.times.device != self.device:
-            self.table = PoseTable(self.shown_nodes, self.tracks, self.device)
+            self.table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
         scale, near = self.config.box_scale, 0.5 * self.frame.near
         return crossings(rays, self.moments(rays), self.table, self.nodes.twist, scale, near)
 
@@ -187,9 +193,8 @@ class NeuralSceneGraph(FieldMethod):
         found = self.crossings(rays)
         if not len(found):
             return []
-        shares = stratified(len(found), self.config.box_samples, generator, rays.origins.device)
-        spread = torch.cat([shares, torch.ones_like(shares[:, :1])], -1)
-        t = torch.lerp(found.enter[:, None], found.leave[:, None], 0.5 * (spread[:, 1:] + spread[:, :-1]))
+        count = self.config.box_samples
+        t = found.at(stratified(len(found), count, generator, rays.origins.device))
         points = found.origins[:, None] + t[..., None] * found.directions[:, None]
         stretch = torch.arange(len(found), device=t.device).repeat_interleave(t.shape[1])
         density, rgb = self.evaluate(points.flatten(0, 1), found, stretch)
@@ -197,7 +202,7 @@ class NeuralSceneGraph(FieldMethod):
         looks = []
         for place in range(int(found.rank.max()) + 1):
             here = found.rank == place
-            samples = found[here].samples(len(rays), shares[here])
+            samples = found[here].samples(len(rays), count)
             looks.append(Look(f"boxes {place}", samples, density[here].flatten(), rgb[here].flatten(0, 1)))
         return looks
 
@@ -211,7 +216,7 @@ class NeuralSceneGraph(FieldMethod):
         directions = normalize(found.directions, dim=-1)[stretch]
         kinds = torch.tensor([self.class_of(node) for node in self.shown_nodes], device=points.device)[node]
         density, rgb = points.new_zeros(len(points)), points.new_zeros(len(points), 3)
-        for number, field in enumerate(self.classes):
+        for number, field in enumerate(self.class_fields):
             mine = (kinds == number).nonzero()[:, 0]
             if len(mine):
                 here, features = field.geometry(coordinates[mine], code[mine])
@@ -229,7 +234,7 @@ class NeuralSceneGraph(FieldMethod):
         density, rgb = super().field(points, directions)
         rays = Rays(points[:1], directions[:1], points.new_zeros(1))
         moments = self.moments(rays) if len(points) else points.new_zeros(1)
-        table = PoseTable(self.shown_nodes, self.tracks, self.device)
+        table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
         poses = table.at(moments, self.nodes.twist)
         point, node, local = inside(points, poses, table.size, self.config.box_scale)
         if not len(point):
@@ -273,12 +278,13 @@ class NeuralSceneGraph(FieldMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
         rate = CODES_RATE if c.field == "hash" else 1.0
-        codes = [{"params": [self.codes], "scale": rate}]
+        codes: list[dict[str, Any]] = [{"params": [self.codes], "scale": rate}]
         if isinstance(self.network, HashField):
             own = self.network.optimizers_at(c.learning_rate, groups=codes)
         else:
-            own = [torch.optim.Adam([{"params": list(self.network.parameters())}, *codes], c.learning_rate, eps=1e-7)]
-        classes = [optimizer for field in self.classes for optimizer in field.optimizers_at(c.learning_rate)]
+            groups = [{"params": list(self.network.parameters())}, *codes]
+            own = [torch.optim.Adam(groups, c.learning_rate, eps=1e-7)]
+        classes = [optimizer for field in self.class_fields for optimizer in field.optimizers_at(c.learning_rate)]
         return [*own, *classes, *super().optimizers()]
 
     # Editing

@@ -1,5 +1,7 @@
-"""Fields of a class: density and colour in the coordinates of a box, under the latent code of an instance (Ost 2021,
-section 3.2). A code of these fields is the latent code followed by the pose's numbers, which colour alone depends on."""
+"""Fields of a class: density and colour in a box's coordinates, under the latent code of an instance (Ost 2021, 3.2).
+
+A code of these fields is the latent code followed by numbers of the box's pose, which colour alone depends on.
+"""
 
 from __future__ import annotations
 
@@ -76,9 +78,7 @@ class HashClassField(HashField):
         widths = [hidden_width] * numbers.density_layers
         self.density_network = MLP(numbers.width + latent, *widths, numbers.geometry_features)
 
-    def geometry(
-        self, points: Points, code: Codes | None = None
-    ) -> tuple[Densities, Float[Tensor, "point geometry"]]:
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:
         assert code is not None
         latent = code[:, : self.latent]
         scaled = self.encode(points) * (1 + self.modulation(latent))

@@ -82,11 +82,11 @@ class PoseTable:
         share = ((t - begin) / (end - begin).clamp_min(1e-9)).clamp(0, 1)[..., None]
 
         def between(keys: Float[Tensor, "node key n"]) -> Float[Tensor, "node moment n"]:
-            rows = [keys.gather(1, index[..., None].expand(-1, -1, keys.shape[-1])) for index in (lower, upper)]
-            return torch.lerp(*rows, share)
+            first, last = (keys.gather(1, i[..., None].expand(-1, -1, keys.shape[-1])) for i in (lower, upper))
+            return torch.lerp(first, last, share)
 
         position = between(self.positions)
-        rotation = to_matrix(between(self.quaternions).flatten(0, 1)).unflatten(0, (nodes, -1))
+        rotation = to_matrix(between(self.quaternions).flatten(0, 1)).view(nodes, len(times), 3, 3)
         if twist is not None:
             own = twist[self.own.clamp_min(0)] * (self.own >= 0)[:, None, None]
             pad = self.times.shape[1] - own.shape[1]
@@ -169,13 +169,16 @@ class Crossings:
         first = torch.searchsorted(self.ray, self.ray)
         return number - first
 
-    def samples(self, rays: int, shares: Float[Tensor, "stretch sample"]) -> Samples:
-        """Samples of stretches on different rays, at shares of each. rays: number of all rays"""
-        t = torch.lerp(self.enter[:, None], self.leave[:, None], shares)
-        packs = Samples.rows(t, self.leave)
-        counts = torch.zeros(rays, dtype=torch.long, device=t.device)
-        counts[self.ray] = shares.shape[1]
-        return Samples(packs.t_start, packs.t_end, packed(counts))
+    def at(self, shares: Float[Tensor, "#stretch sample"]) -> Float[Tensor, "stretch sample"]:
+        """Distances at shares of each stretch."""
+        return torch.lerp(self.enter[:, None], self.leave[:, None], shares)
+
+    def samples(self, rays: int, count: int) -> Samples:
+        """Even samples of stretches on different rays. rays: number of all rays; count: of each stretch"""
+        edges = self.at(torch.linspace(0, 1, count + 1, device=self.enter.device)[None])
+        counts = torch.zeros(rays, dtype=torch.long, device=self.ray.device)
+        counts[self.ray] = count
+        return Samples(edges[:, :-1].flatten(), edges[:, 1:].flatten(), packed(counts))
 
 
 def crossings(

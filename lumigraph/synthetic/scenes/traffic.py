@@ -36,6 +36,8 @@ LAWN = Material(Mottle((0.36, 0.52, 0.22), (0.20, 0.34, 0.12), size=0.08))
 ASPHALT = Material(Mottle((0.40, 0.40, 0.42), (0.32, 0.32, 0.34), size=0.05))
 PAVING = Material(Checker((0.72, 0.68, 0.62), (0.58, 0.54, 0.49), size=0.22))
 STONE = Material(Mottle((0.84, 0.80, 0.72), (0.68, 0.63, 0.55), size=0.1))
+ROOF = Material(Stripes((0.50, 0.30, 0.24), (0.40, 0.24, 0.20), period=0.05))
+DOOR = Material(Plain((0.22, 0.32, 0.30)), gloss=0.4)
 LEAVES = Material(Mottle((0.30, 0.46, 0.18), (0.14, 0.26, 0.09), size=0.07, contrast=1.4))
 # Of each house: azimuth (degrees), half of its width, its height, and its walls.
 HOUSES = (
@@ -92,7 +94,9 @@ def square() -> tuple[Object, ...]:
         angle = math.radians(azimuth)
         at = Pose.at(1.75 * math.cos(angle), 1.75 * math.sin(angle), GROUND, turn=azimuth - 90.0)
         roof = Material(Stripes((0.50, 0.30, 0.24), (0.40, 0.24, 0.20), period=0.05))
-        parts.append(Object(Cuboid((half, 0.25, 0.5 * height)), Material(walls), at @ Pose.at(0, 0, 0.5 * height), "house"))
+        parts.append(
+            Object(Cuboid((half, 0.25, 0.5 * height)), Material(walls), at @ Pose.at(0, 0, 0.5 * height), "house")
+        )
         parts.append(Object(Cuboid((half + 0.03, 0.29, 0.04)), roof, at @ Pose.at(0, 0, height + 0.04), "house"))
         door = Material(Plain((0.22, 0.32, 0.30)), gloss=0.4)
         parts.append(Object(Cuboid((0.09, 0.015, 0.17)), door, at @ Pose.at(0.12, -0.25, 0.17), "house"))
