@@ -31,7 +31,7 @@ from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
 from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Scene
-from lumigraph.datasets.tracks import Node, TrackEdit, TrackEdits, nodes_of
+from lumigraph.datasets.tracks import GraphNode, TrackEdit, TrackEdits, nodes_of
 from lumigraph.evaluation import evaluate
 from lumigraph.figures import to_bytes
 from lumigraph.files import write_json
@@ -117,7 +117,7 @@ def wrong(tracks: tuple, deviation: float, seed: int) -> tuple:
     return tuple(found)
 
 
-def crossing(camera: Camera, nodes: tuple[Node, ...]) -> Tensor:
+def crossing(camera: Camera, nodes: tuple[GraphNode, ...]) -> Tensor:
     """Mask (height, width) of pixels whose rays cross a box."""
     width, height = camera.size[0].tolist()
     rays = camera.rays(camera.pixels())
@@ -131,7 +131,7 @@ def psnr(errors: list[Tensor]) -> float:
     return float(-10 * torch.cat(errors).square().mean().log10())
 
 
-def in_boxes(method: Method, scene: Scene, nodes: tuple[Node, ...]) -> float:
+def in_boxes(method: Method, scene: Scene, nodes: tuple[GraphNode, ...]) -> float:
     """PSNR of all pixels of held-out frames whose rays cross a box."""
     errors = []
     for i in scene.splits["test"].tolist():

@@ -18,13 +18,13 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.datasets.images import ImageStore, Layer, LayerSource
 from lumigraph.datasets.scene import Frame, Scene
-from lumigraph.datasets.tracks import Track
+from lumigraph.datasets.tracks import BoxTrack
 from lumigraph.run import Run, build
 
 SIZE, FOCAL, DISTANCE = 24, 32.0, 3.0
 # Boxes around a half and a quarter of the ball, for methods that need some.
 TRACKS = tuple(
-    Track(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),))
+    BoxTrack(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),))
     for name, size, place in (("half", (0.7, 1.3, 1.3), (0.35, 0, 0)), ("quarter", (0.7, 0.65, 1.3), (-0.35, 0.33, 0)))
 )
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
-from ..datasets.tracks import Track
+from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
 
@@ -118,7 +118,7 @@ class Capture:
     around: tuple[tuple[float, float, float], float] | None = None
     origin: GeographicOrigin | None = None
     notes: list[str] = field(default_factory=list)
-    tracks: tuple[Track, ...] = ()
+    tracks: tuple[BoxTrack, ...] = ()
     kept: bool = False
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:

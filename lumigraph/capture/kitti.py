@@ -21,7 +21,7 @@ import torch
 
 from ..camera.lens import Pinhole
 from ..datasets.scene import GeographicOrigin
-from ..datasets.tracks import Track
+from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..files import read_text
 from ..geometry import to_quaternion
@@ -155,7 +155,7 @@ def about(axis: int, angle: float) -> np.ndarray:
     return found
 
 
-def read_labels(path: Path, drive: list[np.ndarray] | None) -> tuple[Track, ...]:
+def read_labels(path: Path, drive: list[np.ndarray] | None) -> tuple[BoxTrack, ...]:
     """Tracks of all labelled things, in the frame of the poses. drive: poses of camera 0; None where it stands still"""
     boxes: dict[tuple[str, str], dict[float, tuple[np.ndarray, tuple[float, float, float]]]] = {}
     for row in read_rows(path, LABEL_COLUMNS, words=(2,)):
@@ -175,7 +175,7 @@ def read_labels(path: Path, drive: list[np.ndarray] | None) -> tuple[Track, ...]
         poses = np.stack([found[t][0] for t in times])
         rotations = to_quaternion(torch.from_numpy(poses[:, :3, :3])).tolist()
         size, positions = found[times[0]][1], tuple(map(tuple, poses[:, :3, 3].tolist()))
-        tracks.append(Track(f"{kind} {track}", kind, size, tuple(times), positions, tuple(map(tuple, rotations))))
+        tracks.append(BoxTrack(f"{kind} {track}", kind, size, tuple(times), positions, tuple(map(tuple, rotations))))
         if min(size) <= 0:
             raise LumigraphError(f"{path}: the box of {kind} {track} has no size; correct columns 11 to 13")
     return tuple(tracks)

@@ -24,7 +24,7 @@ import torch
 
 from .. import files
 from ..camera import Camera
-from ..datasets.tracks import Track, check_names
+from ..datasets.tracks import BoxTrack, check_names
 from ..errors import LumigraphError
 from ..files.ranges import typed
 from ..geometry import Similarity
@@ -38,11 +38,11 @@ FORMAT = "lumigraph tracks 1"
 class TracksRecord:
     """The file."""
 
-    tracks: tuple[Track, ...]
+    tracks: tuple[BoxTrack, ...]
     format: str = FORMAT
 
 
-def read_tracks(path: Path) -> tuple[Track, ...]:
+def read_tracks(path: Path) -> tuple[BoxTrack, ...]:
     """The tracks in a file. Raises LumigraphError for a file that holds none, and for a track that is none."""
     said = files.read_json(path)
     if not isinstance(said, dict) or said.get("format") != FORMAT:
@@ -57,7 +57,7 @@ def read_tracks(path: Path) -> tuple[Track, ...]:
     return tracks
 
 
-def write_tracks(path: Path, tracks: tuple[Track, ...]) -> None:
+def write_tracks(path: Path, tracks: tuple[BoxTrack, ...]) -> None:
     """Write a file of tracks."""
     files.write_json(path, {"format": FORMAT, "tracks": [asdict(track) for track in tracks]})
 
@@ -69,7 +69,7 @@ def with_tracks(capture: Capture, folder: Path) -> Capture:
     return replace(capture, tracks=read_tracks(path)) if path.is_file() else capture
 
 
-def seen_tracks(capture: Capture, to_scene: Similarity, cameras: Camera) -> tuple[tuple[Track, ...], list[str]]:
+def seen_tracks(capture: Capture, to_scene: Similarity, cameras: Camera) -> tuple[tuple[BoxTrack, ...], list[str]]:
     """Tracks in the scene's frame whose boxes some photograph to learn from shows, and a sentence about the others.
 
     cameras: of the photographs to learn from. Raises LumigraphError for moments beside photographs without any
@@ -92,7 +92,7 @@ def seen_tracks(capture: Capture, to_scene: Similarity, cameras: Camera) -> tupl
     ]
 
 
-def shows(camera: Camera, track: Track) -> bool:
+def shows(camera: Camera, track: BoxTrack) -> bool:
     """True if a place of a track's box projects into a camera's picture at its moment: corners, centres."""
     pose = track.pose(None if camera.time is None else float(camera.time[0]))
     if pose is None:

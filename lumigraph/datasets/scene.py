@@ -21,7 +21,7 @@ from ..files.ranges import Coordinate, Point, Row, Share, between, typed
 from ..geometry import Similarity, is_similarity
 from ..geometry import Vector as Vector
 from .images import UNKNOWN_INDEX, ImageStore, Layer, cosines, resized
-from .tracks import Track
+from .tracks import BoxTrack
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {
@@ -109,7 +109,7 @@ class Frame:
     scale: Size = 1.0
     origin: GeographicOrigin | None = None
     train_count: Annotated[int, between(0, 10**6)] = 0
-    tracks: tuple[Track, ...] = ()
+    tracks: tuple[BoxTrack, ...] = ()
 
     @property
     def is_open(self) -> bool:

@@ -24,7 +24,7 @@ MAX_TIME_ERROR = 1e-5  # of a moment, relative to its size: single precision
 
 
 @dataclass(frozen=True)
-class Track:
+class BoxTrack:
     """One thing and where its box is.
 
     name, category: of the thing, and of its kind
@@ -58,7 +58,7 @@ class Track:
         if not all(any(rotation) for rotation in self.rotations):
             raise LumigraphError(f"Track {self.name} has a rotation of four zeros; give a quaternion (w, x, y, z)")
 
-    def transformed(self, frame: Similarity) -> Track:
+    def transformed(self, frame: Similarity) -> BoxTrack:
         """The same track in another frame."""
         length, width, height = (frame.scale * side for side in self.size)
         positions = frame.points(torch.tensor(self.positions, dtype=torch.float64))
@@ -106,7 +106,7 @@ class TrackEdit:
     remove: bool = False
     shift: Point = (0.0, 0.0, 0.0)
     turn: Annotated[float, between(-1e6, 1e6)] = 0.0
-    track: Track | None = None
+    track: BoxTrack | None = None
 
     def transformed(self, frame: Similarity) -> TrackEdit:
         """The same edit in another frame."""
@@ -127,7 +127,7 @@ class TrackEdits:
 
 
 @dataclass(frozen=True)
-class Node:
+class GraphNode:
     """A thing of a scene graph, as it is shown.
 
     like:  name of the track whose looks it has
@@ -137,14 +137,14 @@ class Node:
 
     name: str
     like: str
-    track: Track
+    track: BoxTrack
     own: str
 
 
-def nodes_of(tracks: Sequence[Track], edits: TrackEdits = TrackEdits(())) -> tuple[Node, ...]:
+def nodes_of(tracks: Sequence[BoxTrack], edits: TrackEdits = TrackEdits(())) -> tuple[GraphNode, ...]:
     """The things of a scene graph after edits. Raises LumigraphError for an edit of a thing that does not exist."""
     known = {track.name: track for track in tracks}
-    nodes = {name: Node(name, name, track, name) for name, track in known.items()}
+    nodes = {name: GraphNode(name, name, track, name) for name, track in known.items()}
     for edit in edits.edits:
         if edit.remove:
             if nodes.pop(edit.node, None) is None:
@@ -155,7 +155,7 @@ def nodes_of(tracks: Sequence[Track], edits: TrackEdits = TrackEdits(())) -> tup
             raise LumigraphError(unknown(like, known))
         if edit.like is not None and edit.like not in known:
             raise LumigraphError(unknown(edit.like, known))
-        base = nodes.get(edit.node) or nodes.get(like) or Node(like, like, known[like], like)
+        base = nodes.get(edit.node) or nodes.get(like) or GraphNode(like, like, known[like], like)
         looks = edit.like or base.like
         if known[looks].category != known[base.like].category:
             raise LumigraphError(
@@ -164,16 +164,16 @@ def nodes_of(tracks: Sequence[Track], edits: TrackEdits = TrackEdits(())) -> tup
             )
         track = base.track if edit.track is None else edit.track
         moved = resized(turned(track, edit.turn, edit.shift), known[looks].size)
-        nodes[edit.node] = Node(edit.node, looks, moved, base.own if edit.track is None else "")
+        nodes[edit.node] = GraphNode(edit.node, looks, moved, base.own if edit.track is None else "")
     return tuple(nodes.values())
 
 
-def unknown(name: str, known: dict[str, Track]) -> str:
+def unknown(name: str, known: dict[str, BoxTrack]) -> str:
     """One sentence about a name that no track has."""
     return f"the scene graph has no {name!r}; there are {', '.join(known) or 'none'}"
 
 
-def turned(track: Track, degrees: float, shift: Point = (0.0, 0.0, 0.0)) -> Track:
+def turned(track: BoxTrack, degrees: float, shift: Point = (0.0, 0.0, 0.0)) -> BoxTrack:
     """The track with its box turned about its upright axis and then shifted, at every moment."""
     half = 0.5 * math.radians(degrees)
     turn = to_matrix(torch.tensor([[math.cos(half), 0.0, 0.0, math.sin(half)]], dtype=torch.float64))
@@ -186,7 +186,7 @@ def turned(track: Track, degrees: float, shift: Point = (0.0, 0.0, 0.0)) -> Trac
     )
 
 
-def resized(track: Track, size: tuple[float, float, float]) -> Track:
+def resized(track: BoxTrack, size: tuple[float, float, float]) -> BoxTrack:
     """The track with a box of another size, whose lower side stays where it was."""
     if size == track.size:
         return track
@@ -195,7 +195,7 @@ def resized(track: Track, size: tuple[float, float, float]) -> Track:
     return replace(track, size=size, positions=tuple(map(tuple, positions.tolist())))
 
 
-def check_names(tracks: Sequence[Track], where: Path | str) -> None:
+def check_names(tracks: Sequence[BoxTrack], where: Path | str) -> None:
     """Raise LumigraphError where two tracks have one name."""
     names = [track.name for track in tracks]
     if twice := next((name for name in names if names.count(name) > 1), None):

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 from ..camera import Camera
-from ..datasets.tracks import Track
+from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..files.ranges import Seed, between, typed
 from ..geometry import evenly
@@ -61,7 +61,7 @@ class SyntheticStage:
     called: Callable[[int], str] | None = None
     depth_camera: DepthCamera | None = None
     unit: float = 1.0
-    tracks: tuple[Track, ...] = ()
+    tracks: tuple[BoxTrack, ...] = ()
     error: float | None = None
 
     @cached_property

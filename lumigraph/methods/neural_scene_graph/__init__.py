@@ -24,7 +24,7 @@ from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import held_decay
 from ...composition.composed import union
 from ...datasets.scene import Batch, Frame, Scene
-from ...datasets.tracks import Node, Track, TrackEdit, TrackEdits, nodes_of
+from ...datasets.tracks import BoxTrack, GraphNode, TrackEdit, TrackEdits, nodes_of
 from ...errors import LumigraphError
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
 from ...method import FieldMethod, Pass
@@ -32,7 +32,7 @@ from ...method.controls import Control, Value, blend, moment
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
 from .fields import ClassField, HashClassField, NetworkClassField
-from .nodes import Crossings, NodeNumbers, Nodes, PoseTable, crossings, inside
+from .nodes import BoxStretches, NodeNumbers, PoseTable, TrackCorrections, crossings, inside
 
 REMOVED = "removed"  # choice of an instance's control
 CODE_STEPS, CODE_RAYS, CODE_RATE = 200, 512, 2e-2  # of finding the codes of unseen instances
@@ -107,8 +107,8 @@ class NeuralSceneGraph(FieldMethod):
                 classes = [NetworkClassField(c.network, c.hidden_width, c.code_width) for _ in self.categories]
             self.classes = nn.ModuleList(classes)
             self.codes = nn.Parameter(0.1 * torch.randn(len(frame.tracks), c.code_width))
-        self.nodes = Nodes(frame.tracks, c.nodes)
-        self.found: tuple[tuple[Track, ...], Tensor] = (), torch.zeros(0, c.code_width)
+        self.nodes = TrackCorrections(frame.tracks, c.nodes)
+        self.found: tuple[tuple[BoxTrack, ...], Tensor] = (), torch.zeros(0, c.code_width)
         self.edits = TrackEdits(())
         self.arrange()
 
@@ -131,7 +131,7 @@ class NeuralSceneGraph(FieldMethod):
     # The graph
 
     @property
-    def tracks(self) -> tuple[Track, ...]:
+    def tracks(self) -> tuple[BoxTrack, ...]:
         """Tracks of all instances that have a code."""
         return (*self.frame.tracks, *self.found[0])
 
@@ -147,7 +147,7 @@ class NeuralSceneGraph(FieldMethod):
                 chosen.append(TrackEdit(track, like=nearest))
         there = {node.name for node in nodes_of(self.tracks, self.edits)}
         own = tuple(edit for edit in chosen if edit.node in there)
-        self.shown_nodes: tuple[Node, ...] = nodes_of(self.tracks, TrackEdits((*self.edits.edits, *own)))
+        self.shown_nodes: tuple[GraphNode, ...] = nodes_of(self.tracks, TrackEdits((*self.edits.edits, *own)))
         self.table = PoseTable(self.shown_nodes, self.frame.tracks)
 
     @property
@@ -172,7 +172,7 @@ class NeuralSceneGraph(FieldMethod):
     def class_fields(self) -> list[ClassField]:
         return list(self.classes)  # type: ignore[arg-type]
 
-    def class_of(self, node: Node) -> int:
+    def class_of(self, node: GraphNode) -> int:
         """Number of the class of a node's looks."""
         return self.categories.index(next(track.category for track in self.tracks if track.name == node.like))
 
@@ -181,7 +181,7 @@ class NeuralSceneGraph(FieldMethod):
 
     # Along rays
 
-    def crossings(self, rays: Rays) -> Crossings:
+    def crossings(self, rays: Rays) -> BoxStretches:
         """Stretches of rays inside the boxes of their moments."""
         if self.table.times.device != self.device:
             self.table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
@@ -206,7 +206,7 @@ class NeuralSceneGraph(FieldMethod):
             looks.append(Look(f"boxes {place}", samples, density[here].flatten(), rgb[here].flatten(0, 1)))
         return looks
 
-    def evaluate(self, points: Points, found: Crossings, stretch: Tensor) -> tuple[Densities, Colours]:
+    def evaluate(self, points: Points, found: BoxStretches, stretch: Tensor) -> tuple[Densities, Colours]:
         """Density per scene unit and colour at points in boxes' axes, each of one of the stretches (eq. 5)."""
         half = 0.5 * self.config.box_scale * self.table.size
         node = found.node[stretch]
@@ -242,7 +242,7 @@ class NeuralSceneGraph(FieldMethod):
         rotation, position = poses.rotation[node, 0], poses.position[node, 0]
         seen = torch.einsum("pij,pi->pj", rotation, directions[point])
         zero = local.new_zeros(len(point))
-        found = Crossings(point, node, zero, zero, local, seen, rotation[:, :, 0], position)
+        found = BoxStretches(point, node, zero, zero, local, seen, rotation[:, :, 0], position)
         half = 0.5 * self.config.box_scale * table.size[node]
         self.table = table
         more, colour = self.evaluate(local * half, found, torch.arange(len(point), device=point.device))
@@ -315,7 +315,7 @@ class NeuralSceneGraph(FieldMethod):
         return told
 
 
-def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[Track, ...], Float[Tensor, "track code"]]:
+def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ...], Float[Tensor, "track code"]]:
     """Tracks of a scene that a graph does not know, in the graph's frame, and codes that show its photographs.
 
     Codes begin at the mean of their class; only these learn. Raises LumigraphError for a scene without new tracks of a

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ...camera.rays import Rays, Samples
 from ...components.training.schedules import falling
-from ...datasets.tracks import MAX_TIME_ERROR, Node, Track
+from ...datasets.tracks import MAX_TIME_ERROR, BoxTrack, GraphNode
 from ...files.ranges import LearningRate, NonNegative
 from ...geometry import to_matrix
 from ...method import Part
@@ -50,7 +50,7 @@ class PoseTable:
     own: row of the corrections that hold for each node; -1 for none
     """
 
-    def __init__(self, nodes: Sequence[Node], tracks: Sequence[Track], device: torch.device | str = "cpu"):
+    def __init__(self, nodes: Sequence[GraphNode], tracks: Sequence[BoxTrack], device: torch.device | str = "cpu"):
         rows = {track.name: i for i, track in enumerate(tracks)}
         keys = max([1, *(len(node.track.times) for node in nodes)])
         count = len(nodes)
@@ -107,10 +107,10 @@ def exponential(omega: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3 3"]:
     return eye + angle.sin() / angle * cross + (1 - angle.cos()) / angle.square() * (cross @ cross)
 
 
-class Nodes(Part):
+class TrackCorrections(Part):
     """Corrections of the given poses, 0 at first: a turn about the scene's axes and a shift in lengths of the box."""
 
-    def __init__(self, tracks: Sequence[Track], numbers: NodeNumbers):
+    def __init__(self, tracks: Sequence[BoxTrack], numbers: NodeNumbers):
         super().__init__()
         self.numbers = numbers
         keys = max([1, *(len(track.times) for track in tracks)])
@@ -137,7 +137,7 @@ class Nodes(Part):
 
 
 @dataclass(frozen=True)
-class Crossings:
+class BoxStretches:
     """Stretches of rays inside boxes, by ray and then by distance.
 
     ray, node:           of each stretch
@@ -158,9 +158,9 @@ class Crossings:
     def __len__(self) -> int:
         return len(self.ray)
 
-    def __getitem__(self, index: Tensor) -> Crossings:
+    def __getitem__(self, index: Tensor) -> BoxStretches:
         """The stretches that a mask or an index picks."""
-        return Crossings(*(value[index] for value in vars(self).values()))
+        return BoxStretches(*(value[index] for value in vars(self).values()))
 
     @property
     def rank(self) -> Int[Tensor, " stretch"]:
@@ -188,8 +188,8 @@ def crossings(
     twist: Float[Tensor, "track key 6"] | None,
     scale: float,
     near: float,
-) -> Crossings:
-    """Where rays cross the boxes of their moments (section 4.2; the slab test of Kay and Kajiya 1986).
+) -> BoxStretches:
+    """Stretches of rays in the boxes of their moments (section 4.2; the slab test of Kay and Kajiya 1986).
 
     scale: factor on the boxes' sizes
     near:  distance at which rays begin
@@ -212,7 +212,7 @@ def crossings(
     rotation, position = poses.rotation[node, moment[ray]], poses.position[node, moment[ray]]
     local = torch.einsum("sij,si->sj", rotation, rays.origins[ray] - position)
     direction = torch.einsum("sij,si->sj", rotation, rays.directions[ray])
-    return Crossings(ray, node, begin, end, local, direction, rotation[:, :, 0], position)
+    return BoxStretches(ray, node, begin, end, local, direction, rotation[:, :, 0], position)
 
 
 def inside(points: Float[Tensor, "point 3"], poses: Poses, size: Float[Tensor, "node 3"], scale: float) -> Any:

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...datasets.tracks import Track, TrackEdits, nodes_of
+from ...datasets.tracks import BoxTrack, TrackEdits, nodes_of
 from ...files.ranges import between
 from ..cameras import look_at, pinhole, sphere_point
 from ..categories.cars import objects
@@ -121,15 +121,15 @@ def world(seed: int, cars: int, time: float) -> World:
     return World((*square(), *driving), (SUN,), SKY)
 
 
-def tracks(seed: int, cars: int, times: np.ndarray) -> tuple[Track, ...]:
+def tracks(seed: int, cars: int, times: np.ndarray) -> tuple[BoxTrack, ...]:
     """The boxes of all cars at moments."""
 
-    def track(number: int) -> Track:
+    def track(number: int) -> BoxTrack:
         poses = [place(seed, number, float(t)) for t in times]
         turns = [math.atan2(p.rotation[1][0], p.rotation[0][0]) for p in poses]
         rotations = tuple((math.cos(0.5 * a), 0.0, 0.0, math.sin(0.5 * a)) for a in turns)
         size, positions = car(seed, number)[1], tuple(p.position for p in poses)
-        return Track(f"car {number + 1}", "car", size, tuple(times.tolist()), positions, rotations)
+        return BoxTrack(f"car {number + 1}", "car", size, tuple(times.tolist()), positions, rotations)
 
     return tuple(track(number) for number in range(cars))
 
