@@ -115,6 +115,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "box_samples": 7,
         "box_scale": 1.9,
         "pose_input": "location",
+        "symmetric": False,
         "huber_delta": 1.0,
         "learning_rate": 5e-4,
     },

@@ -59,6 +59,7 @@ class Config:
     box_samples: Annotated[int, between(2, 512)] = 7  # samples of a ray in a box, section 4.2; more are sharper, slower
     box_scale: Annotated[float, between(1, 4)] = 1.9  # factor on the boxes' sizes, which then hold shadows
     pose_input: Literal["location", "heading"] = "location"  # of a box, that colour depends on besides the direction
+    symmetric: bool = False  # left and right sides of boxes are alike, so that either one shows the other
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
     learning_rate: LearningRate = 5e-4  # Adam's learning rate at first; higher: faster, may diverge
     final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
@@ -117,8 +118,10 @@ class NeuralSceneGraph(FieldMethod):
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, code_width=16, box_samples=24)
         c = replace(c, class_log2_hashmap_size=15, class_max_resolution=96)
-        c = replace(c, box_scale=1.1, pose_input="heading", huber_delta=0.3, code_weight=1e-3, decay_start=0.3)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3)
+        c = replace(
+            c, box_scale=1.1, pose_input="heading", symmetric=True, huber_delta=0.3, code_weight=1e-3, decay_start=0.3
+        )
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -210,10 +213,14 @@ class NeuralSceneGraph(FieldMethod):
         """Density per scene unit and colour at points in boxes' axes, each of one of the stretches (eq. 5)."""
         half = 0.5 * self.config.box_scale * self.table.size
         node = found.node[stretch]
-        coordinates = points / half[node]
+        coordinates, directions = points / half[node], found.directions[stretch]
+        side = torch.ones_like(points[:, :1])
+        if self.config.symmetric:
+            side = torch.where(points[:, 1:2] < 0, -side, side)
+            mirrored = torch.cat([torch.ones_like(side), side, torch.ones_like(side)], -1)
+            coordinates, directions = coordinates * mirrored, directions * mirrored
         pose = found.heading if self.config.pose_input == "heading" else found.location
-        code = torch.cat([self.shown_codes()[found.node], pose], -1)[stretch]
-        directions = normalize(found.directions, dim=-1)[stretch]
+        code = torch.cat([torch.cat([self.shown_codes()[found.node], pose], -1)[stretch], side], -1)
         kinds = torch.tensor([self.class_of(node) for node in self.shown_nodes], device=points.device)[node]
         density, rgb = points.new_zeros(len(points)), points.new_zeros(len(points), 3)
         for number, field in enumerate(self.class_fields):

@@ -5,6 +5,7 @@ A code of these fields is the latent code followed by numbers of the box's pose,
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -22,7 +23,8 @@ from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
 CUBE = Box(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 0.0)  # coordinates of a box
-POSE_NUMBERS = 3  # of a box's pose, that colour depends on
+POSE_NUMBERS = 4  # that colour depends on: the box's location or heading, and the side of a symmetric box
+MAX_BANDS = 2  # spherical-harmonics bands of a hash field: few views show each side of an instance
 POSE_FREQUENCIES = 4  # octaves of these: multires_obj of the release
 THIN = 2.0  # density of a hash field is exp(-THIN) per coordinate at first, so that nothing hides the background
 
@@ -37,8 +39,8 @@ class NetworkClassField(Field):
         self.latent = latent
         self.encode_position = FrequencyEncoding(3, numbers.position_frequencies)
         self.encode_direction = FrequencyEncoding(3, numbers.direction_frequencies)
-        self.encode_pose = FrequencyEncoding(POSE_NUMBERS, POSE_FREQUENCIES)
-        inputs = self.encode_position.width + latent, self.encode_direction.width + self.encode_pose.width
+        self.encode_pose = FrequencyEncoding(POSE_NUMBERS - 1, POSE_FREQUENCIES)
+        inputs = self.encode_position.width + latent, self.encode_direction.width + self.encode_pose.width + 1
         shape = numbers.depth, hidden_width, numbers.skip_layer
         self.network = CoordinateNetwork(*inputs, *shape, exact=not numbers.bfloat16)
 
@@ -55,7 +57,8 @@ class NetworkClassField(Field):
         assert code is not None
 
         def answer(feature: Tensor, directions: Tensor, pose: Tensor) -> tuple[Tensor]:
-            seen = torch.cat([self.encode_direction(directions), self.encode_pose(pose)], -1)
+            place, side = pose.split([POSE_NUMBERS - 1, 1], -1)
+            seen = torch.cat([self.encode_direction(directions), self.encode_pose(place), side], -1)
             return (self.network.seen(feature, seen).sigmoid(),)
 
         return in_chunks(answer, features, directions, code[:, self.latent :])[0]
@@ -67,12 +70,14 @@ class NetworkClassField(Field):
 
 class HashClassField(HashField):
     """A hash table over the box and two small networks. The latent code scales the table's features and is an input of
-    both networks, so that instances share what they have in common and differ in detail."""
+    the first network, so that instances share what they have in common and differ in detail. The second one has no
+    code, so that instances share how they are lit."""
 
     deforms = True
 
     def __init__(self, numbers: HashNumbers, hidden_width: int, latent: int):
-        super().__init__(numbers, hidden_width, CUBE, 1.0, code=latent + POSE_NUMBERS)
+        numbers = replace(numbers, sh_bands=min(numbers.sh_bands, MAX_BANDS))
+        super().__init__(numbers, hidden_width, CUBE, 1.0, code=POSE_NUMBERS)
         self.latent = latent
         self.modulation = nn.Linear(latent, numbers.width, bias=False)
         widths = [hidden_width] * numbers.density_layers
@@ -84,6 +89,10 @@ class HashClassField(HashField):
         scaled = self.encode(points) * (1 + self.modulation(latent))
         geometry = self.density_network(side_by_side(scaled, latent))
         return truncated_exp(geometry[:, 0] - THIN), geometry
+
+    def colour(self, features: Tensor, directions: Directions, code: Codes | None = None) -> Colours:
+        assert code is not None
+        return super().colour(features, directions, code[:, self.latent :])
 
     def optimizers_at(self, learning_rate: float, groups: Any = ()) -> list[torch.optim.Optimizer]:  # type: ignore[override]
         """Adam for table and networks. groups: further groups of parameters"""
