@@ -156,7 +156,12 @@ class NeuralSceneGraph(FieldMethod):
     @property
     def instances(self) -> dict[str, str]:
         """Names of the controls of all instances, by the names of these."""
-        return {track.name: re.sub(r"\W", "_", track.name) for track in self.tracks}
+        names: dict[str, str] = {}
+        for track in self.tracks:
+            name = re.sub(r"\W", "_", track.name)
+            name = name if name.isidentifier() and name != "time" else f"thing_{name}"
+            names[track.name] = f"{name}_{len(names) + 1}" if name in names.values() else name
+        return names
 
     def shown_codes(self) -> Float[Tensor, "node code"]:
         """The latent code of each node, between two where a control says so."""
