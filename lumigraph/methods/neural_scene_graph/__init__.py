@@ -116,7 +116,7 @@ class NeuralSceneGraph(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, code_width=16, box_samples=24)
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, code_width=16, box_samples=16)
         c = replace(c, class_log2_hashmap_size=15, class_max_resolution=96)
         c = replace(
             c, box_scale=1.1, pose_input="heading", symmetric=True, huber_delta=0.3, code_weight=1e-3, decay_start=0.3
