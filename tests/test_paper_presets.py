@@ -101,6 +101,24 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "warmup": 2500 / 1_000_000,
         "mask.occupancy_resolution": 0,
     },
+    # princeton-computational-imaging/neural-scene-graphs, example_configs/config_kitti_0006_example_train.txt, main.py
+    "neural-scene-graph": {
+        "field": "network",
+        "network.depth": 8,
+        "network.skip_layer": 5,
+        "network.position_frequencies": 10,
+        "network.direction_frequencies": 4,
+        "hidden_width": 256,
+        "rays.rays_per_step": 8192,
+        "code_width": 256,
+        "code_weight": 1e-4,  # latent_balance
+        "box_samples": 7,
+        "box_scale": 1.9,
+        "pose_input": "location",
+        "symmetric": False,
+        "huber_delta": 1.0,
+        "learning_rate": 5e-4,
+    },
     "nerf-w": {  # the paper's supplement; samples also in rover-xingyu/Ha-NeRF, issue 31. The others from memory
         "field": "network",
         "network.depth": 8,

@@ -18,9 +18,15 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.datasets.images import ImageStore, Layer, LayerSource
 from lumigraph.datasets.scene import Frame, Scene
+from lumigraph.datasets.tracks import BoxTrack
 from lumigraph.run import Run, build
 
 SIZE, FOCAL, DISTANCE = 24, 32.0, 3.0
+# Boxes around a half and a quarter of the ball, for methods that need some.
+TRACKS = tuple(
+    BoxTrack(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),))
+    for name, size, place in (("half", (0.7, 1.3, 1.3), (0.35, 0, 0)), ("quarter", (0.7, 0.65, 1.3), (-0.35, 0.33, 0)))
+)
 
 # What a user would do by putting a file into lumigraph/methods/.
 if (folder := str(Path(__file__).parent / "methods")) not in lumigraph.methods.__path__:
@@ -79,7 +85,7 @@ def made(count: int, size: int, focal: float) -> Scene:
     pose, index = poses(count), torch.arange(count)
     lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
     cameras = Camera(pose, lens, torch.full((count, 2), size), image_index=index)
-    frame = Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True, image_count=count)
+    frame = Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True, image_count=count, tracks=TRACKS)
     splits = {"train": index[index % 4 != 0], "test": index[index % 4 == 0]}
     images = ImageStore.from_arrays([picture(p) for p in pose])
     planes = [LayerSource(partial(lambda p: ball(p)[0].numpy(), p)) for p in pose]

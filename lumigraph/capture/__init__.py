@@ -35,6 +35,7 @@ from .part import places_of as places_of
 from .pictures import list_images
 from .raw import with_raw
 from .surveyed import with_surveyed
+from .tracks import with_tracks
 from .unposed import Unposed as Unposed
 from .unposed import unposed as without_poses
 from .views import multiscale as multiscale
@@ -185,7 +186,8 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     if (request := requested(source)) is not None:
         return synthetic().read(request)
     path = expanded(source)
-    return with_inner_depth(with_raw(with_masks(choose_reader(path, reader).read(path), path), path))
+    capture = with_tracks(choose_reader(path, reader).read(path), path)
+    return with_inner_depth(with_raw(with_masks(capture, path), path))
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:

@@ -18,12 +18,14 @@ from ..datasets.images import ImageSource, in_parallel, load
 from ..datasets.scene import Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
+from ..geometry import Similarity
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import MAX_COORDINATE, Capture, Shot, checked_pose
 from .normalise import find_forward, find_place, similarity
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
+from .tracks import seen_tracks
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
 MAX_NAMES = 20  # missing files in a warning; further ones are counted
@@ -103,11 +105,14 @@ def assemble(
         times=span(cameras.time),
         origin=capture.origin,
     )
+    tracks, unseen = seen_tracks(capture, Similarity(torch.from_numpy(matrix)), cameras[splits["train"]])
+    frame = replace(frame, tracks=tracks)
     if frame.is_open and capture.around is None:
         train = splits["train"]
         seen = [shots[i] for i in train.tolist()]
         frame = replace(frame, forward=find_forward(capture, seen, cameras[train], matrix, frame.near))
     layers, left_out = make_layers(shots, chosen, images, matrix)
+    left_out += unseen
     for warning in left_out:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
     points = None if capture.points is None else torch.from_numpy(capture.points @ matrix[:3, :3].T + matrix[:3, 3])

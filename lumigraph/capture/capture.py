@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
+from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
 
@@ -99,6 +100,7 @@ class Capture:
     around:   of a part of a larger capture, centre and half-size of its box of interest, source's frame and units
     origin:   of the source's frame on Earth; its axes then point east, north and up, in metres
     notes:     what its user should know, one sentence each
+    tracks:   boxes of rigid things that move, source's frame and units, moments as in `Shot.time`
     kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
 
@@ -116,6 +118,7 @@ class Capture:
     around: tuple[tuple[float, float, float], float] | None = None
     origin: GeographicOrigin | None = None
     notes: list[str] = field(default_factory=list)
+    tracks: tuple[BoxTrack, ...] = ()
     kept: bool = False
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:

@@ -21,6 +21,7 @@ from ..files.ranges import Coordinate, Point, Row, Share, between, typed
 from ..geometry import Similarity, is_similarity
 from ..geometry import Vector as Vector
 from .images import UNKNOWN_INDEX, ImageStore, Layer, cosines, resized
+from .tracks import BoxTrack
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {
@@ -93,6 +94,7 @@ class Frame:
     scale:       units of exports to a unit of the capture's frame, by a length that the user knows
     origin:      of the capture's frame on Earth, where its photographs' GPS has determined it
     train_count: photographs to learn from; 0 where that is not known
+    tracks:      boxes of rigid things that move, in the scene's frame
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -107,6 +109,7 @@ class Frame:
     scale: Size = 1.0
     origin: GeographicOrigin | None = None
     train_count: Annotated[int, between(0, 10**6)] = 0
+    tracks: tuple[BoxTrack, ...] = ()
 
     @property
     def is_open(self) -> bool:

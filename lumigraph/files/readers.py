@@ -15,6 +15,7 @@ READERS = (
     "seven_scenes",
     "nice_slam",
     "phones",
+    "kitti",
     "colmap",
     "llff",
     "light_field",

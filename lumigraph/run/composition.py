@@ -15,6 +15,9 @@ source: of a part: anything that opens, from this file's folder or absolute
 place:  similarity from the source's frame of the part to that of the composition, both those of photographs or files,
         where keyframes and exports lie as well. A 4 x 4 matrix, or a scale, a rotation (a quaternion w, x, y, z, or
         degrees about +z) and a translation, in this order; what is left out changes nothing
+edits:  changes of a scene graph's things (neural-scene-graph), in order, each of a `node`: "remove", "shift" [x, y, z]
+        and "turn" (degrees about its upright axis), "like" another thing, and its own "track" as in tracks.json. A node
+        of a new name adds a thing. Lengths are of the source's frame of the part
 box:    two corners in the part's scene frame, as `lumigraph info` prints its bounds and the viewer crops it
 probes: of a part that is a mesh: the folder of probes that light it, in the composition's frame; see docs/probes.md
 lead:   the part whose cameras, background and vertical the composition has; by default the first
@@ -37,7 +40,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,6 +52,7 @@ from ..camera.crop import CropBox
 from ..capture.meshes import read_shape
 from ..composition import Composed, LitComposition, LitMesh, Placed, ShadedMesh, compose, frame_around
 from ..datasets.scene import Frame
+from ..datasets.tracks import TrackEdit, TrackEdits
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
@@ -68,12 +72,13 @@ CANONICAL_FORMAT = "lumigraph canonical 1"
 
 @dataclass(frozen=True)
 class CompositionPart:
-    """A part as the file says it. source, probes: paths as they stand there; place and box: see above."""
+    """A part as the file says it. source, probes: paths as they stand there; place, box and edits: see above."""
 
     source: str
     place: Similarity
     box: CropBox | None = None
     probes: str | None = None
+    edits: TrackEdits = TrackEdits(())
 
 
 @dataclass(frozen=True)
@@ -150,11 +155,21 @@ class Composition(Opened):
             name = opened.path.resolve()
             if name not in built:
                 built[name] = opened.method(device)
-            placed.append(Placed(built[name], place, part.box, leads=i == self.lead))
+            placed.append(Placed(self._edited(built[name], part, opened), place, part.box, leads=i == self.lead))
         needed = CLOUD_COPIES * sum(cloud_bytes(part.method) for part in placed)
         ask_for(needed, torch.device(device), f"{self.path} with {self.count:,} parts", "name fewer parts")
         lit = any(isinstance(part.method, LitMesh) for part in placed)
         return (LitComposition if lit else compose)(self.frame, placed).to(device)
+
+    def _edited(self, method: Method, part: CompositionPart, opened: Opened) -> Method:
+        """The part's method after the part's edits. Raises LumigraphError for one that is no scene graph."""
+        if not part.edits.edits:
+            return method
+        if TrackEdits not in method.takes:
+            raise LumigraphError(
+                f"{self.path} edits things of {part.source}, which is no scene graph; train neural-scene-graph"
+            )
+        return method.given(part.edits.transformed(opened.frame.to_source.inverse))
 
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the leading part."""
@@ -220,6 +235,7 @@ class PartSaid:
     place: Any = field(default_factory=dict)
     box: tuple[Point, Point] | None = None
     probes: Name | None = None
+    edits: tuple[TrackEdit, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -242,8 +258,10 @@ def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     parts = []
     for part in found.parts:
         place = place_from_json(part.place, path)
+        for track in (edit.track for edit in part.edits if edit.track is not None):
+            track.check()
         box = None if part.box is None else box_of(part.box, path)
-        parts.append(CompositionPart(part.source, place, box, part.probes))
+        parts.append(CompositionPart(part.source, place, box, part.probes, TrackEdits(part.edits)))
     if found.parts[found.lead].probes is not None:
         raise LumigraphError(f"{path}: a mesh should lead, and has no cameras; correct `lead`")
     return parts, found.lead
@@ -271,6 +289,9 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
         said["box"] = [list(part.box.lower), list(part.box.upper)]
     if part.probes is not None:
         said["probes"] = part.probes
+    if part.edits.edits:
+        usual = asdict(TrackEdit(""))
+        said["edits"] = [{k: v for k, v in asdict(edit).items() if v != usual[k]} for edit in part.edits.edits]
     return said
 
 

@@ -37,6 +37,7 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..capture.capture import Capture, PixelPlane, Shot
 from ..capture.raw import RawPhoto, facts, planes
+from ..geometry import Similarity
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
@@ -122,6 +123,7 @@ def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None 
         reach=stage.unit * stage.reach,
         near=stage.unit * stage.near,
         background=background,
+        tracks=tuple(track.transformed(Similarity.make(stage.unit)) for track in stage.tracks),
         kept=kept,
     )
 

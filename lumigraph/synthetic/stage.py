@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 from ..camera import Camera
+from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..files.ranges import Seed, between, typed
 from ..geometry import evenly
@@ -42,6 +43,7 @@ class SyntheticStage:
              kept; None where pictures are not kept
     depth_camera: measures depth beside the pictures, which the cameras' `image_index` counts; None where depth is exact
     unit:    of the source's frame to a unit of the world
+    tracks:  boxes of the rigid things that move
     error:   the length of which errors of poses are so many percent; None for the longest side of the bounds
     """
 
@@ -59,6 +61,7 @@ class SyntheticStage:
     called: Callable[[int], str] | None = None
     depth_camera: DepthCamera | None = None
     unit: float = 1.0
+    tracks: tuple[BoxTrack, ...] = ()
     error: float | None = None
 
     @cached_property
