@@ -15,6 +15,7 @@ place:  similarity from the source's frame of the part to that of the compositio
         where keyframes and exports lie as well. A 4 x 4 matrix, or a scale, a rotation (a quaternion w, x, y, z, or
         degrees about +z) and a translation, in this order; what is left out changes nothing
 box:    two corners in the part's scene frame, as `lumigraph info` prints its bounds and the viewer crops it
+mask:   in place of a box, a file of voxels that `lumigraph segment` has cut; with "keep": "outside" all but them
 lead:   the part whose cameras, background and vertical the composition has; by default the first
 
     {
@@ -37,14 +38,14 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 
 from .. import files
 from ..camera import Camera
-from ..camera.crop import CropBox
-from ..composition import Composed, Placed, compose, frame_around
+from ..camera.crop import Crop, CropBox
+from ..composition import Composed, Placed, VoxelMask, compose, frame_around, read_mask
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
@@ -60,15 +61,18 @@ MAX_DEPTH = 32  # compositions inside each other
 CLOUD_COPIES = 2  # of each part's Gaussians while they are joined: in their place, and in the whole
 FORMAT = "lumigraph composition 1"
 CANONICAL_FORMAT = "lumigraph canonical 1"
+Keep = Literal["inside", "outside"]
 
 
 @dataclass(frozen=True)
 class CompositionPart:
-    """A part as the file says it. source: a path as it stands there; place and box: see above."""
+    """A part as the file says it. source, mask: paths as they stand there; place, box and keep: see above."""
 
     source: str
     place: Similarity
     box: CropBox | None = None
+    mask: str | None = None
+    keep: Keep = "inside"
 
 
 @dataclass(frozen=True)
@@ -112,8 +116,9 @@ class Composition(Opened):
             for part, opened in zip(self.parts, self.opened, strict=True)
         ]
         self.places[self.lead] = Similarity.make(1.0)  # to the last digit
-        every = zip(self.opened, self.places, self.parts, strict=True)
-        others = [(opened.frame, place, part.box) for opened, place, part in every]
+        self.crops = [self._crop(part) for part in self.parts]
+        every = zip(self.opened, self.places, self.crops, strict=True)
+        others = [(opened.frame, place, boxed(crop)) for opened, place, crop in every]
         del others[self.lead]
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
@@ -127,17 +132,23 @@ class Composition(Opened):
             inner.opened[key] = open_part(place, inner)
         return inner.opened[key]
 
+    def _crop(self, part: CompositionPart) -> Crop | None:
+        """Box or mask of a part; None for all of it."""
+        if part.mask is None:
+            return part.box
+        return replace(read_mask(self.path.parent / files.expanded(part.mask)), outside=part.keep == "outside")
+
     def method(self, device: torch.device | str = "cpu") -> Method:
         """All parts in one picture. A source that is named several times is held once.
 
         Raises LumigraphError where its clouds, one for each part, do not fit into memory."""
         built: dict[Path, Method] = {}
         placed = []
-        for i, (part, opened, place) in enumerate(zip(self.parts, self.opened, self.places, strict=True)):
+        for i, (opened, place) in enumerate(zip(self.opened, self.places, strict=True)):
             name = opened.path.resolve()
             if name not in built:
                 built[name] = opened.method(device)
-            placed.append(Placed(built[name], place, part.box, leads=i == self.lead))
+            placed.append(Placed(built[name], place, self.crops[i], leads=i == self.lead))
         needed = CLOUD_COPIES * sum(cloud_bytes(part.method) for part in placed)
         ask_for(needed, torch.device(device), f"{self.path} with {self.count:,} parts", "name fewer parts")
         return compose(self.frame, placed).to(device)
@@ -185,6 +196,8 @@ class PartSaid:
     source: Name
     place: Any = field(default_factory=dict)
     box: tuple[Point, Point] | None = None
+    mask: Name | None = None
+    keep: Keep = "inside"
 
 
 @dataclass(frozen=True)
@@ -207,7 +220,10 @@ def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     parts = []
     for part in found.parts:
         place = place_from_json(part.place, path)
-        parts.append(CompositionPart(part.source, place, None if part.box is None else box_of(part.box, path)))
+        if part.box is not None and part.mask is not None:
+            raise LumigraphError(f"{path}: {part.source} has a box and a mask; leave one of them out")
+        box = None if part.box is None else box_of(part.box, path)
+        parts.append(CompositionPart(part.source, place, box, part.mask, part.keep))
     return parts, found.lead
 
 
@@ -231,7 +247,16 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
         said["place"] = place
     if part.box is not None:
         said["box"] = [list(part.box.lower), list(part.box.upper)]
+    if part.mask is not None:
+        said |= {"mask": part.mask, "keep": part.keep}
     return said
+
+
+def boxed(crop: Crop | None) -> CropBox | None:
+    """Box that a part stays in; None for one that keeps what is outside a mask."""
+    if isinstance(crop, VoxelMask):
+        return None if crop.outside else crop.box
+    return crop if isinstance(crop, CropBox) else None
 
 
 def box_of(corners: tuple[Vector, Vector], where: Path | str) -> CropBox:
