@@ -29,7 +29,7 @@ from lumigraph.geometry import Similarity
 from lumigraph.run import Run, open_any
 from lumigraph.selection import Selection, Strokes, describe, distil_features, feature_network, read_strokes
 from lumigraph.selection.cutting import UNKNOWN_COLOUR, closed, cut, motion, tinted
-from lumigraph.selection.distilled import VoxelGrid, weigher_of
+from lumigraph.selection.distilled import SelectionGrid, weigher_of
 from lumigraph.selection.growth import clusters, walked
 from lumigraph.training import fit
 
@@ -304,7 +304,7 @@ def test_a_motion_turns_about_the_part():
 
 
 def halves() -> VoxelMask:
-    grid = VoxelGrid.over(WHITE, 20)
+    grid = SelectionGrid.over(WHITE, 20)
     chosen = torch.zeros(grid.count, dtype=torch.bool)
     index = torch.arange(grid.count)
     chosen[grid.middles(index)[:, 1] < 0] = True

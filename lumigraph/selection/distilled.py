@@ -40,7 +40,7 @@ RAYS = 8192  # of a field, rendered at once
 
 
 @dataclass(frozen=True)
-class VoxelGrid:
+class SelectionGrid:
     """Voxels in the frame of a method: the lower corner, the length of an edge, and the number along each axis."""
 
     lower: tuple[float, float, float]
@@ -48,13 +48,13 @@ class VoxelGrid:
     size: tuple[int, int, int]
 
     @staticmethod
-    def over(frame: Frame, cells: int = GRID_CELLS) -> VoxelGrid:
+    def over(frame: Frame, cells: int = GRID_CELLS) -> SelectionGrid:
         """Cubes that cover the box of interest."""
         (a, b, c), upper = frame.bounds
         sides = [high - low for low, high in zip((a, b, c), upper, strict=True)]
         edge = max(sides) / cells
         nx, ny, nz = (max(1, math.ceil(side / edge - 1e-6)) for side in sides)
-        return VoxelGrid((a, b, c), edge, (nx, ny, nz))
+        return SelectionGrid((a, b, c), edge, (nx, ny, nz))
 
     @property
     def count(self) -> int:
@@ -89,7 +89,7 @@ class Distilled:
     positions: Float[Tensor, "point 3"]
     features: Float[Tensor, "point feature"]
     seen: Float[Tensor, " point"]
-    grid: VoxelGrid | None = None
+    grid: SelectionGrid | None = None
     voxels: Int[Tensor, " point"] | None = None
 
     def __len__(self) -> int:
@@ -189,7 +189,7 @@ class FieldWeigher:
     """Sums over pixels of values times the weights of samples in each voxel."""
 
     def __init__(self, method: Any, cells: int = GRID_CELLS):
-        self.method, self.grid = method, VoxelGrid.over(method.frame, cells)
+        self.method, self.grid = method, SelectionGrid.over(method.frame, cells)
 
     def _weights(self, camera: Camera) -> Any:
         """Chunks of rays: the first one, the ray, voxel and weight of each sample inside the grid."""
