@@ -63,6 +63,18 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "export stereo": ("export stereo ball eyes.jpg", ("eyes.jpg",)),
     "clean": ("clean gs --output some.ply", ("some.ply", "some.ply.png")),
     "clean, to a run": ("clean gs --output fewer", ("fewer/",)),
+    "segment": (
+        "segment gs --strokes strokes.png --view ball_0 --output part.ply",
+        ("part.ply", "part.ply.png"),
+    ),
+    "segment, a field": (
+        "segment ball --strokes strokes.png --view ball_0 --output part.json",
+        ("part.json", "part.mask.safetensors", "part.json.png"),
+    ),
+    "segment, masks": (
+        "segment gs --strokes strokes.png --view ball_0 --output labels --action masks",
+        ("labels/", "labels.png"),
+    ),
     "compress": ("compress gs --output small", ("small/", "small")),
     "convert": ("convert ball plenoxels --output other --steps 1 --distil", ("other/", "other")),
     "compose": ("compose gs gs --output two.json", ("two.json",)),

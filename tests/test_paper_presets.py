@@ -31,6 +31,27 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "hidden_width": 256,
         "learning_rate": 1e-3,
     },
+    "object-nerf": {  # zju3dv/object_nerf, config/default_conf.yml and toy_desk_2.yml
+        "field": "network",
+        "network.depth": 8,
+        "network.skip_layer": 5,  # skips: [4], counted from 0 before the layer
+        "network.position_frequencies": 10,
+        "network.direction_frequencies": 4,
+        "hidden_width": 256,
+        "object_layers": 4,
+        "object_width": 128,
+        "instances": 64,
+        "code": 64,
+        "rays.coarse_samples": 64,
+        "rays.fine_samples": 64,
+        "rays.rays_per_step": 2048,
+        "object_colour_weight": 1.0,
+        "object_opacity_weight": 10.0,
+        "outside_weight": 0.05,
+        "guided": True,
+        "guard_margin": 0.05,  # frustum_bound
+        "learning_rate": 1e-3,
+    },
     "imap": {  # sections 3.1 to 3.4. From memory; rates and iterations are not in the paper
         "field": "network",
         "layers": 4,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,7 +18,12 @@ IDENTITY_ROWS: Rows = Similarity.make(1.0).rows
 
 
 class Crop(ABC):
-    """A part of space, by plain numbers, so that two are equal if they say the same."""
+    """A part of space, by plain numbers, so that two are equal if they say the same.
+
+    convex: whether all between where a ray enters and leaves is inside
+    """
+
+    convex: ClassVar[bool] = True
 
     @abstractmethod
     def holds(self, points: Float[Tensor, "*point 3"], tolerance: float = 0.0) -> Bool[Tensor, "*point"]:
@@ -35,6 +41,10 @@ class Crop(ABC):
     @abstractmethod
     def bounds(self) -> tuple[Vector, Vector]:
         """The lower and the upper corner of the smallest upright box around it."""
+
+    def coloured(self, points: Float[Tensor, "point 3"], rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Colours of a field at points of the part."""
+        return rgb
 
     def entered(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Bool[Tensor, " ray"]]:
         """Distance at which each ray is first inside, 0 for one that begins inside, and whether it ever is."""

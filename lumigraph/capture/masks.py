@@ -5,6 +5,8 @@ masks/          what to learn from: where a mask is black (0) the photograph is 
 object_masks/   what the object is: where one is black there is nothing, so that the object stands alone. A mask is the
                 photograph's alpha.
 
+labels/         what each pixel shows, as a whole number: the layer `labels`. `lumigraph segment` writes such a folder.
+
 A mask is named after its photograph, image.png or image.jpg.png for image.jpg, and has its shape, at any size.
 """
 
@@ -16,10 +18,10 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from ..errors import LumigraphWarning
-from .capture import Capture
+from .capture import Capture, PixelPlane
 from .pictures import list_images
 
-MASKS, OBJECT_MASKS = "masks", "object_masks"
+MASKS, OBJECT_MASKS, LABELS = "masks", "object_masks", "labels"
 IMAGE_FOLDERS = ("images", "image", "input", "photos", "photographs", "frames")  # folders that a name may begin with
 
 
@@ -57,7 +59,17 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
         if there:
             missing += [f"{OBJECT_MASKS} of {shot.name}" for shot in found if shot.alpha is None]
             shots = there
+    if (folder / LABELS).is_dir():
+        found = [replace(shot, planes=labelled(folder / LABELS, shot.name) | shot.planes) for shot in shots]
+        warn_unmatched(folder / LABELS, any(LABELS in shot.planes for shot in found))
+        shots = found
     return replace(capture, shots=shots, missing=missing)
+
+
+def labelled(folder: Path, name: str) -> dict[str, PixelPlane]:
+    """The labels of a photograph in a folder; empty where there are none."""
+    found = find_mask(folder, name)
+    return {} if found is None else {LABELS: PixelPlane(found, "index")}
 
 
 def warn_unmatched(folder: Path, matched: bool) -> None:

@@ -52,6 +52,7 @@ from .photo3d import Photo3DCommand
 from .render import Render
 from .report import Report
 from .resume import Resume
+from .segment import Segment
 from .track import Track
 from .train import Train, with_options_of
 from .view import ViewCommand
@@ -122,6 +123,7 @@ COMMANDS: dict[str, type] = {
     "render": Render,
     "view": ViewCommand,
     "clean": Clean,
+    "segment": Segment,
     "compose": Compose,
     "canonicalise": Canonicalise,
     "compress": Compress,

@@ -12,3 +12,6 @@ from .placed import frame_around as frame_around
 from .placed import standing as standing
 from .played import FilteredCloud as FilteredCloud
 from .played import PlayedCloud as PlayedCloud
+from .voxel_mask import VoxelMask as VoxelMask
+from .voxel_mask import mask_of as mask_of
+from .voxel_mask import read_mask as read_mask

@@ -52,10 +52,14 @@ class Placed:
             ray = found.samples.ray_index
             enter, leave = self.crop.through(local)
             begin, end = torch.maximum(begin, enter[ray]), torch.minimum(end, leave[ray])
+        keep, rgb = begin < end, found.rgb
+        if self.crop is not None and not self.crop.convex:
+            points, _ = Samples(begin, end, found.samples.ray_starts).along(local)
+            keep, rgb = keep & self.crop.holds(points), self.crop.coloured(points, rgb)
         begin, end = ((t - behind).clamp_min(0) * scale for t in (begin, end))
-        keep = begin < end
+        keep = keep & (begin < end)
         samples = Samples(begin, end, found.samples.ray_starts).keep(keep)
-        return Look(found.name, samples, found.density[keep] / scale, found.rgb[keep])
+        return Look(found.name, samples, found.density[keep] / scale, rgb[keep])
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per unit of the picture, at points of the picture's frame."""

@@ -20,6 +20,7 @@ edits:  changes of a scene graph's things (neural-scene-graph), in order, each o
         of a new name adds a thing. Lengths are of the source's frame of the part
 box:    two corners in the part's scene frame, as `lumigraph info` prints its bounds and the viewer crops it
 probes: of a part that is a mesh: the folder of probes that light it, in the composition's frame; see docs/probes.md
+mask:   in place of a box, a file of voxels that `lumigraph segment` has cut; with "keep": "outside" all but them
 lead:   the part whose cameras, background and vertical the composition has; by default the first
 
     {
@@ -42,15 +43,25 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 
 from .. import files
 from ..camera import Camera
-from ..camera.crop import CropBox
+from ..camera.crop import Crop, CropBox
 from ..capture.meshes import read_shape
-from ..composition import Composed, LitComposition, LitMesh, Placed, ShadedMesh, compose, frame_around
+from ..composition import (
+    Composed,
+    LitComposition,
+    LitMesh,
+    Placed,
+    ShadedMesh,
+    VoxelMask,
+    compose,
+    frame_around,
+    read_mask,
+)
 from ..datasets.scene import Frame
 from ..datasets.tracks import TrackEdit, TrackEdits
 from ..errors import LumigraphError
@@ -68,17 +79,20 @@ MAX_DEPTH = 32  # compositions inside each other
 CLOUD_COPIES = 2  # of each part's Gaussians while they are joined: in their place, and in the whole
 FORMAT = "lumigraph composition 1"
 CANONICAL_FORMAT = "lumigraph canonical 1"
+Keep = Literal["inside", "outside"]
 
 
 @dataclass(frozen=True)
 class CompositionPart:
-    """A part as the file says it. source, probes: paths as they stand there; place, box and edits: see above."""
+    """A part as the file says it. source, probes, mask: paths as they stand there; the rest: see above."""
 
     source: str
     place: Similarity
     box: CropBox | None = None
     probes: str | None = None
     edits: TrackEdits = TrackEdits(())
+    mask: str | None = None
+    keep: Keep = "inside"
 
 
 @dataclass(frozen=True)
@@ -122,8 +136,9 @@ class Composition(Opened):
             for part, opened in zip(self.parts, self.opened, strict=True)
         ]
         self.places[self.lead] = Similarity.make(1.0)  # to the last digit
-        every = zip(self.opened, self.places, self.parts, strict=True)
-        others = [(opened.frame, place, part.box) for opened, place, part in every]
+        self.crops = [self._crop(part) for part in self.parts]
+        every = zip(self.opened, self.places, self.crops, strict=True)
+        others = [(opened.frame, place, boxed(crop)) for opened, place, crop in every]
         del others[self.lead]
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
@@ -141,6 +156,12 @@ class Composition(Opened):
             inner.opened[key] = open_part(place, inner)
         return inner.opened[key]
 
+    def _crop(self, part: CompositionPart) -> Crop | None:
+        """Box or mask of a part; None for all of it."""
+        if part.mask is None:
+            return part.box
+        return replace(read_mask(self.path.parent / files.expanded(part.mask)), outside=part.keep == "outside")
+
     def method(self, device: torch.device | str = "cpu") -> Method:
         """All parts in one picture. A source that is named several times is held once.
 
@@ -150,12 +171,12 @@ class Composition(Opened):
         for i, (part, opened, place) in enumerate(zip(self.parts, self.opened, self.places, strict=True)):
             if isinstance(opened, LitMeshFile):
                 to_probes = self.frame.to_export @ place
-                placed.append(Placed(opened.lit(to_probes), place, part.box))
+                placed.append(Placed(opened.lit(to_probes), place, self.crops[i]))
                 continue
             name = opened.path.resolve()
             if name not in built:
                 built[name] = opened.method(device)
-            placed.append(Placed(self._edited(built[name], part, opened), place, part.box, leads=i == self.lead))
+            placed.append(Placed(self._edited(built[name], part, opened), place, self.crops[i], leads=i == self.lead))
         needed = CLOUD_COPIES * sum(cloud_bytes(part.method) for part in placed)
         ask_for(needed, torch.device(device), f"{self.path} with {self.count:,} parts", "name fewer parts")
         lit = any(isinstance(part.method, LitMesh) for part in placed)
@@ -236,6 +257,8 @@ class PartSaid:
     box: tuple[Point, Point] | None = None
     probes: Name | None = None
     edits: tuple[TrackEdit, ...] = ()
+    mask: Name | None = None
+    keep: Keep = "inside"
 
 
 @dataclass(frozen=True)
@@ -260,8 +283,10 @@ def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
         place = place_from_json(part.place, path)
         for track in (edit.track for edit in part.edits if edit.track is not None):
             track.check()
-        box = None if part.box is None else box_of(part.box, path)
-        parts.append(CompositionPart(part.source, place, box, part.probes, TrackEdits(part.edits)))
+        if part.box is not None and part.mask is not None:
+            raise LumigraphError(f"{path}: {part.source} has a box and a mask; leave one of them out")
+        box, edits = None if part.box is None else box_of(part.box, path), TrackEdits(part.edits)
+        parts.append(CompositionPart(part.source, place, box, part.probes, edits, part.mask, part.keep))
     if found.parts[found.lead].probes is not None:
         raise LumigraphError(f"{path}: a mesh should lead, and has no cameras; correct `lead`")
     return parts, found.lead
@@ -292,7 +317,16 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
     if part.edits.edits:
         usual = asdict(TrackEdit(""))
         said["edits"] = [{k: v for k, v in asdict(edit).items() if v != usual[k]} for edit in part.edits.edits]
+    if part.mask is not None:
+        said |= {"mask": part.mask, "keep": part.keep}
     return said
+
+
+def boxed(crop: Crop | None) -> CropBox | None:
+    """Box that a part stays in; None for one that keeps what is outside a mask."""
+    if isinstance(crop, VoxelMask):
+        return None if crop.outside else crop.box
+    return crop if isinstance(crop, CropBox) else None
 
 
 def box_of(corners: tuple[Vector, Vector], where: Path | str) -> CropBox:

@@ -58,6 +58,10 @@ class Addition(Part):
 
     base_colours: bool = False
 
+    def layers(self, data: Scene) -> tuple[str, ...]:
+        """Names of the layers that a step reads of its photograph."""
+        return ()
+
     # The cloud
 
     def begin_cloud(self, method: Any) -> None:

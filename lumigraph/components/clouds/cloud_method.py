@@ -137,7 +137,8 @@ class CloudMethod(Method, ABC):
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
-        photograph = data.photograph(int(train[order[place]]), depth_layers(self.config, data))
+        layers = depth_layers(self.config, data) + tuple(x for part in self.additions for x in part.layers(data))
+        photograph = data.photograph(int(train[order[place]]), layers)
         self.figures["reduction"] = times = self.reduction(min(photograph.rgb.shape[:2]))
         return photograph.reduced(times).to(self.device)
 

@@ -5,22 +5,32 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
+from ...camera import Camera
+from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
 from ...components.clouds.cloud import RateNumbers
-from ...components.clouds.cloud_method import CloudMethod
+from ...components.clouds.cloud_method import BLACK, CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
+from ...components.instances import edit_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...gaussians.splatting import render
 from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
+from .instances import Identities, InstanceNumbers
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
 from .robust_mask import RobustMask, RobustNumbers
+
+# Codes that one pass of the rasteriser composites, learnt once the geometry is there.
+CPU_GROUPS = InstanceNumbers(
+    identity_code=8, identity_lr=0.05, classifier_lr=0.02, identity_interval=2, identity_start=0.4
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,7 @@ class Config:
     distractors: RobustNumbers = RobustNumbers()
     sparse: FewViewNumbers = FewViewNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
+    groups: InstanceNumbers = InstanceNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
@@ -71,14 +82,22 @@ class GaussianSplatting(CloudMethod):
         self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
         self.tidying = Tidying(c.tidying)
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
+        self.identities = Identities(c.groups, count) if c.groups.objects == "yes" else None
         self.poses = poses_for(frame, c.poses)
+
+    def rasterized(self, camera: Camera) -> Rendering:
+        if self.identities is None or edit_of(self) is None:
+            return super().rasterized(camera)
+        return render(self.identities.recoloured_cloud(self, self.filtered()), camera, BLACK, self.near_plane)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
         c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
         c = replace(c, refine=RefineNumbers(120_000, cap_ramp=True), mcmc=McmcNumbers(joining_per_step=120.0))
-        return replace(c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"))
+        return replace(
+            c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"), groups=CPU_GROUPS
+        )
 
     @classmethod
     def smallest(cls) -> Any:
@@ -92,4 +111,5 @@ class GaussianSplatting(CloudMethod):
             adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
             poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
             photographs=AppearanceNumbers(appearance="no"),
+            groups=InstanceNumbers(objects="yes", instances=4, identity_code=4, identity_lr=0.05, neighbour_samples=32),
         )

@@ -1,0 +1,117 @@
+"""Instances: objects of a scene by their labels, and the controls that remove, move or copy one of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..datasets.scene import Scene
+from ..errors import LumigraphError
+from ..geometry import Similarity
+from ..method.controls import Control
+
+LABELS = "labels"
+MOVE, COPY, REMOVE, ALONE = EDITS = "move", "copy", "remove", "alone"
+AXES = "x", "y", "z"
+CONTROLS = {"edit", "turn", *(f"shift_{axis}" for axis in AXES)}
+SHIFT, TURN = (f"{change} of what is moved or copied" for change in ("Shift", "Rotation"))
+NOT_AN_INSTANCE = -1  # label of pixels that show no object, or an unknown one
+MAX_LABEL = 255  # the largest label that names an instance
+OPAQUE_ALPHA = 0.5
+
+
+@dataclass(frozen=True)
+class Edit:
+    """An edit of one instance.
+
+    number: label of the instance
+    kind:   one of EDITS
+    shift:  scene units
+    turn:   degrees about the vertical through its middle, counterclockwise from above
+    """
+
+    number: int
+    kind: str
+    shift: tuple[float, float, float]
+    turn: float
+
+    @property
+    def leaves(self) -> bool:
+        """True if the instance is gone from its own place."""
+        return self.kind in (REMOVE, MOVE)
+
+    @property
+    def appears(self) -> bool:
+        """True if the instance is at another place."""
+        return self.kind in (MOVE, COPY)
+
+    def place(self, middle: Float[Tensor, " 3"]) -> Similarity:
+        """From its own place to the other one. middle: about which it turns"""
+        angle, middle = math.radians(self.turn), middle.double().cpu()
+        cosine, sine = math.cos(angle), math.sin(angle)
+        rotation = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        return Similarity.make(1.0, rotation, middle - rotation @ middle + torch.tensor(self.shift).double())
+
+
+def edit_controls(learnt: Bool[Tensor, " label"], reach: float) -> tuple[Control, ...]:
+    """Controls of edits; none before instances are learnt."""
+    names = tuple(str(x) for x in learnt.nonzero()[:, 0].tolist())
+    if not names:
+        return ()
+    far, choices = 2 * reach, tuple(f"{kind} {name}" for kind in EDITS for name in names)
+    about = "Move, copy or remove an instance by its label, or show it alone; to move and copy, shift or turn it."
+    return (
+        Control("edit", choices[0], choices=choices, about=about),
+        *(Control(f"shift_{x}", 0.0, range=(-far, far), unit="scene units", about=f"{SHIFT} along {x}.") for x in AXES),
+        Control("turn", 0.0, range=(-180.0, 180.0), unit="degrees", about=f"{TURN} about the vertical."),
+    )
+
+
+def edit_of(method: Any) -> Edit | None:
+    """The edit of a method's settings; None for the scene as it is."""
+    if not method.settings.keys() & CONTROLS:
+        return None
+    kind, label = str(method.control("edit")).split()
+    x, y, z = (float(method.control(f"shift_{axis}")) for axis in AXES)
+    edit = Edit(int(label), kind, (x, y, z), float(method.control("turn")))
+    return None if edit.appears and not (x or y or z or edit.turn) else edit
+
+
+def check_labels(scene: Scene) -> None:
+    """Raises LumigraphError for photographs without labels, of which alpha is none either."""
+    if LABELS not in scene.layers and not scene.images.has_alpha:
+        raise LumigraphError(
+            f"{scene.source} has no labels of objects; put a picture of whole numbers for each photograph, of its "
+            "name, into a folder `labels` beside them (`lumigraph segment --action masks` makes one)"
+        )
+    if LABELS in scene.layers and not len(scene.layers[LABELS]):
+        raise LumigraphError(f"No label picture of {scene.source} matches a photograph; name each after its photograph")
+
+
+def labels_of(
+    extra: dict[str, Tensor], alpha: Tensor | None, room: int
+) -> tuple[Int[Tensor, "*pixels"], Bool[Tensor, "*pixels"]]:
+    """Label of each pixel, NOT_AN_INSTANCE where it shows none; and whether that is known. Without labels the opaque
+    pixels of photographs with alpha are instance 0. Raises LumigraphError for labels beyond `room`."""
+    if LABELS not in extra:
+        assert alpha is not None
+        opaque = alpha > OPAQUE_ALPHA
+        return torch.where(opaque, 0, NOT_AN_INSTANCE), torch.ones_like(opaque)
+    labels = extra[LABELS]
+    if bool((labels >= room).any()):
+        raise LumigraphError(
+            f"The labels go up to {int(labels.max())}, and there is room for {room} instances; give --instances "
+            f"{int(labels.max()) + 1}, or number them from 0"
+        )
+    known = labels >= 0
+    return labels, known if alpha is None else known | (alpha <= OPAQUE_ALPHA)
+
+
+def layers_of(scene: Scene) -> tuple[str, ...]:
+    """Names of the layers that instances are learnt from."""
+    return (LABELS,) if LABELS in scene.layers else ()

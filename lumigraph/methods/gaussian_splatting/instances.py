@@ -1,0 +1,180 @@
+"""Instances: an identity code of each Gaussian, learnt from masks by the same rasteriser (Ye 2024, Gaussian Grouping,
+arXiv 2312.00732), by which instances are removed, moved, copied or shown alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+from torch.nn.functional import cross_entropy, log_softmax
+
+from ...components.clouds.addition import Addition, Step
+from ...components.instances import ALONE, check_labels, edit_controls, edit_of, labels_of, layers_of
+from ...datasets.scene import Scene
+from ...exchange.packing import Stored
+from ...files.ranges import LearningRate, NonNegative, Share, Steps, between
+from ...gaussians import Gaussians, joined
+from ...method.controls import Control
+
+CHANNELS = 4  # numbers that one pass of the rasteriser composites: three colours and a depth
+MIN_SHARE = 0.4  # probability from which on a Gaussian belongs to the instance that it most likely shows
+
+
+@dataclass(frozen=True)
+class InstanceNumbers:
+    """A Config's numbers of instances; those of Gaussian Grouping."""
+
+    objects: Literal["no", "yes"] = "no"  # learn identity codes from label pictures, to edit by instance
+    instances: Annotated[int, between(2, 256)] = 64  # instances that there is room for, labels 0 to one below
+    identity_code: Annotated[int, between(4, 64)] = 16  # numbers of an identity code, section 3.2; a multiple of 4
+    identity_lr: LearningRate = 2.5e-3  # learning rate of identity codes; the authors' release
+    classifier_lr: LearningRate = 5e-4  # learning rate of the classifier; the authors' release
+    identity_weight: NonNegative = 1.0  # weight of the cross entropy of rendered identities, eq. 4
+    neighbour_weight: NonNegative = 2.0  # weight of the neighbours' agreement, eq. 4; 0: off
+    neighbours: Annotated[int, between(1, 64)] = 5  # k, nearest Gaussians that should agree, section 3.2
+    neighbour_samples: Annotated[int, between(16, 100_000)] = 1000  # m, Gaussians of a step that are compared with them
+    identity_interval: Steps = 1  # steps between those that learn identities; more are faster
+    identity_start: Share = 0.0  # share of the budget before identities are learnt; later: geometry is known
+
+
+class Identities(Addition):
+    """Identity codes and a linear classifier. They change neither positions nor colours.
+
+    codes:  of each Gaussian
+    places: of each Gaussian when its code was last followed: a cloud that was densified finds its codes by them
+    seen:   labels that photographs have
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("codes", "places")
+    codes: nn.Parameter
+    places: Tensor
+    seen: Tensor
+
+    def __init__(self, numbers: InstanceNumbers, count: int):
+        super().__init__()
+        self.numbers, n = numbers, numbers
+        self.codes = nn.Parameter(torch.zeros(count, n.identity_code))
+        self.classifier = nn.Linear(n.identity_code, n.instances + 1)  # and one class for no instance
+        self.register_buffer("places", torch.zeros(count, 3))
+        self.register_buffer("seen", torch.zeros(n.instances, dtype=torch.bool))
+        self.optimizer: torch.optim.Adam | None = None
+
+    def layers(self, data: Scene) -> tuple[str, ...]:
+        return layers_of(data)
+
+    # Following the cloud
+
+    def begin_scene(self, method: Any, data: Scene, sweep: Any) -> None:
+        check_labels(data)
+
+    def begin_cloud(self, method: Any) -> None:
+        """Random codes for a new cloud."""
+        count = len(method.cloud)
+        chance = method.random(5)
+        drawn = torch.randn(count, self.numbers.identity_code, generator=chance).to(self.places.device)
+        self._set(drawn, method.cloud.means.detach().clone())
+
+    def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
+        """Codes for a cloud whose Gaussians were cloned, split or pruned: of the nearest old one."""
+        if len(means) == len(self.places) and torch.equal(means.detach(), self.places):
+            return
+        if len(means) != len(self.places):
+            nearest = cKDTree(self.places.cpu().numpy()).query(means.detach().cpu().numpy(), workers=-1)[1]
+            self._set(self.codes.data[torch.from_numpy(nearest)], means.detach().clone())
+        else:
+            self.places = means.detach().clone()
+
+    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
+        self._set(self.codes.data[keep], self.places[keep])
+
+    def _set(self, codes: Tensor, places: Tensor) -> None:
+        """Replace the codes. Their moments begin anew, for a cloud changes every hundred steps."""
+        old, self.places = self.codes, places
+        self.codes = nn.Parameter(codes.clone())
+        if self.optimizer is not None:
+            self.optimizer.state.pop(old, None)
+            self.optimizer.param_groups[0]["params"] = [self.codes]
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        n = self.numbers
+        groups = [{"params": [self.codes], "lr": n.identity_lr}]
+        groups.append({"params": [*self.classifier.parameters()], "lr": n.classifier_lr})
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        return [self.optimizer]
+
+    def storage(self) -> dict[str, Stored]:
+        return {"codes": Stored("half"), "places": Stored("nothing")}
+
+    # Learning
+
+    def regularize(self, method: Any, step: Step) -> None:
+        """Cross entropy of rendered identities, and the neighbours' agreement (eqs. 3 and 4)."""
+        n = self.numbers
+        if method.progress < n.identity_start or int(method.drawn) % n.identity_interval:
+            return
+        self.follow(method.cloud.means)
+        labels, known = labels_of(step.photograph.extra, step.photograph.alpha, n.instances)
+        self.seen[labels[labels >= 0].unique()] = True
+        logits = self.classifier(self.rendered(step))
+        target = torch.where(labels >= 0, labels, n.instances)
+        if known.any():
+            step.terms["identity"] = n.identity_weight * cross_entropy(logits[known], target[known])
+        if n.neighbour_weight and len(self.codes) > n.neighbours:
+            step.terms["neighbours"] = n.neighbour_weight * self.disagreement(step.chance)
+
+    def rendered(self, step: Step) -> Float[Tensor, "height width code"]:
+        """Codes, composited as colours are; gradients reach the codes alone."""
+        picture = step.picture
+        footprints = picture.centres.detach(), picture.conics.detach(), picture.opacities.detach()
+        fixed = replace(picture, centres=footprints[0], conics=footprints[1], opacities=footprints[2])
+        found = []
+        for four in self.codes.split(CHANNELS, -1):
+            rgb, last, _ = fixed.composited(four[:, :3].contiguous(), four[:, 3].contiguous(), 1e-4)
+            found.append(torch.cat([rgb, last[..., None]], -1))
+        return torch.cat(found, -1)
+
+    def disagreement(self, chance: torch.Generator) -> Float[Tensor, ""]:
+        """Mean KL divergence of some Gaussians' identities from those of their nearest neighbours (eq. 3), in a random
+        part of the cloud that bounds the memory."""
+        n = self.numbers
+        pool = torch.randperm(len(self.codes), generator=chance)[: 20 * n.neighbour_samples]
+        places = self.places.cpu()[pool].numpy()
+        some = pool[: n.neighbour_samples]
+        count = min(n.neighbours + 1, len(pool))
+        _, near = cKDTree(places).query(places[: len(some)], count, workers=-1)
+        near = pool[torch.from_numpy(np.asarray(near).reshape(len(some), -1)[:, 1:])]
+        own = log_softmax(self.classifier(self.codes[some]), -1)
+        others = log_softmax(self.classifier(self.codes[near]), -1)
+        return (own.exp()[:, None] * (own[:, None] - others)).sum(-1).mean()
+
+    # Editing
+
+    @torch.no_grad()
+    def labels(self, cloud: Gaussians) -> Int[Tensor, " gaussian"]:
+        """The instance of each Gaussian; -1 for none."""
+        probability, label = self.classifier(self.codes).softmax(-1).max(-1)
+        return torch.where((probability >= MIN_SHARE) & (label < self.numbers.instances), label, -1)
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return edit_controls(self.seen, 1.0)
+
+    def recoloured_cloud(self, method: Any, cloud: Gaussians) -> Gaussians:
+        """The cloud under the edit of the settings."""
+        edit = edit_of(method)
+        if edit is None:
+            return cloud
+        own = self.labels(cloud) == edit.number
+        if edit.kind == ALONE or not own.any():
+            return cloud[own] if own.any() or edit.kind == ALONE else cloud
+        parts = [cloud[~own]] if edit.leaves else [cloud]
+        if edit.appears:
+            place = edit.place(cloud.means[own].median(0).values)
+            parts.append(cloud[own].transformed(place.matrix))
+        return joined(parts)

@@ -1,0 +1,282 @@
+"""ObjectNeRF: a scene branch, and an object branch with a code for each instance (Yang et al. 2021, arXiv 2109.01847).
+
+Masks of the photographs teach the object branch, an instance at a time. Where a nearer surface hides an instance, its
+mask is 0 and says nothing of what is behind: guided by the scene branch's depth, such samples teach nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import max_pool3d
+
+from ...camera.rays import Look, Rays, Rendering
+from ...components.fields.appearance import CodeWidth
+from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
+from ...components.fields.hash_field import CODES_RATE, HashField, HashNumbers
+from ...components.fields.instance_codes import InstanceCodes
+from ...components.instances import ALONE, Edit, check_labels, edit_controls, edit_of, labels_of, layers_of
+from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.sampling.spaces import space_of
+from ...components.training.photometric import huber
+from ...components.training.schedules import held_decay
+from ...composition.composed import kept, union
+from ...datasets.scene import Batch, Frame, Scene
+from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
+from ...geometry import Similarity
+from ...method import FieldMethod
+from ...method.controls import Control
+from ...method.field import Colours, Densities, Directions, Points
+from ...volume import composite
+from .fields import InstanceBoxes, ObjectNetwork, ObjectTable
+
+
+@dataclass(frozen=True)
+class Config:
+    """The numbers of the authors' release (zju3dv/object_nerf, config/); those of the paper have their section."""
+
+    network: NetworkNumbers = NetworkNumbers()
+    rays: RayNumbers = RayNumbers(64, 64, rays_per_step=2048)
+    table: HashNumbers = HashNumbers()
+    occupancy: OccupancyNumbers = OccupancyNumbers()
+    steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
+    field: Literal["hash", "network"] = "network"  # both branches: the paper's networks, or faster hash tables
+    hidden_width: Width = 256  # channels of the scene branch; wider holds more detail, and costs time
+    object_layers: Layers = 4  # hidden layers of the object branch; more cost time
+    object_width: Width = 128  # channels of the object branch; wider costs time
+    instances: Annotated[int, between(1, 256)] = 64  # instances that there is room for, labels 0 to one below
+    code: CodeWidth = 64  # numbers of an instance's code
+    object_colour_weight: NonNegative = 1.0  # weight of an instance's colours, eq. 6
+    object_opacity_weight: NonNegative = 10.0  # weight of an instance's opacity against its mask, eq. 6
+    outside_weight: Share = 0.05  # weight of pixels outside a mask in that, section 3.3
+    guided: bool = True  # samples behind the scene's surface teach an object nothing, section 3.4; off: they do
+    guard_margin: PositiveShare = 0.05  # distance behind that surface from which on they do not, scene units
+    huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
+    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-5  # learning rate at the end of the budget, reached exponentially
+    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
+    hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of both tables, towards a density of 1
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+CODE_DEVIATION = 1.0  # of codes at first
+OWN_SHARE = 0.5  # of rays that teach the instance they show; the others teach one at random what it does not cover
+COUNT_AFTER = 0.3  # share of the budget from which on surfaces count for boxes
+REGION_CELLS = 96  # of the grid that says what goes with an instance, along the longest side of its box
+REGION_THICKNESS = 0.05  # optical thickness of the object branch over a cell, from which on it belongs to it
+REGION_DILATION = 2  # cells around, whose soft edge goes along
+
+
+class ObjectNeRF(FieldMethod):
+    """A scene that can be taken apart by the instances of its photographs' masks."""
+
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    network: HashField | CoordinateField
+    branch: ObjectTable | ObjectNetwork
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        space = space_of(frame)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            if c.field == "hash":
+                self.network = HashField(c.table, c.hidden_width, space, frame.reach)
+                self.branch = ObjectTable(c.table, c.hidden_width, space, frame.reach, c.code)
+                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
+            else:
+                shape = c.network, c.hidden_width, space
+                coarse = CoordinateField(*shape, keep_input=True)
+                self.network = CoordinateField(*shape, keep_input=True, coarse=coarse)
+                self.branch = ObjectNetwork(c.network, c.object_layers, c.object_width, space, c.code)
+                self.sampler = HierarchicalSampler(space, c.rays)
+        self.codes = InstanceCodes(c.instances, c.code)
+        self.boxes = InstanceBoxes(c.instances, frame.bounds)
+        self.counting = False
+        self._regions: dict[tuple[int, int], Tensor] = {}
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """Two hash tables with Instant-NGP's numbers."""
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, code=8, huber_delta=0.3)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, hash_weight_decay=0.3)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Two tiny tables with tiny networks, within some twenty quick steps."""
+        c = Config(**TINY_HASH, field="hash", hidden_width=16, instances=4, code=4, huber_delta=0.1)
+        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3)
+
+    # Learning
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        check_labels(data)
+        super().begin(data, seconds)
+        self.codes.begin(torch.arange(self.config.instances), CODE_DEVIATION, self.random(1))
+
+    def before_step(self, step: int, progress: float) -> None:
+        super().before_step(step, progress)
+        self.counting = progress >= COUNT_AFTER
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        return data.sample_rays(self.sampler.batch_size, generator, layers=layers_of(data)).to(self.device)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """Colours of the scene (eq. 2); of one instance along each ray colour, and opacity against its mask (eq. 6)."""
+        c, generator = self.config, self.random(step)
+        passes, terms = self.learn(batch.rays, generator)
+        target = batch.before(self.background)
+        for each in passes:
+            look = each.look(self.network)
+            seen = composite(look.samples, look.density, look.rgb, self.background)
+            terms[each.name] = huber(seen.rgb - target, c.huber_delta)
+        self.figures["mse"] = float((seen.rgb - target).detach().square().mean())
+        labels, known = labels_of(batch.extra, batch.alpha, c.instances)
+        if self.counting:
+            solid = (labels >= 0) & seen.depth.isfinite() & (seen.opacity > 0.5)
+            self.boxes.add(batch.rays.at(seen.depth.detach())[solid], labels[solid])
+        return terms | self.object_terms(batch.rays, target, labels, known, seen, generator)
+
+    def object_terms(
+        self,
+        rays: Rays,
+        target: Float[Tensor, "ray 3"],
+        labels: Int[Tensor, " ray"],
+        known: Bool[Tensor, " ray"],
+        seen: Rendering,
+        generator: torch.Generator,
+    ) -> dict[str, Tensor]:
+        """L_obj = sum_k lambda_1 M |C_k - C|^2 + lambda_2 w (O_k - M)^2, of the instance that each ray asks about."""
+        c = self.config
+        asked = self.asked(labels, generator)
+        mask = (labels == asked).float()
+        look = self.instance_look(rays, asked, generator)
+        if c.guided:  # the visible instance itself may lie behind the depth that the scene branch has so far
+            guard = torch.where(mask > 0, torch.inf, seen.depth.detach() + c.guard_margin)
+            look = kept(look, look.samples.t < guard[look.samples.ray_index])
+        own = composite(look.samples, look.density, look.rgb)
+        weight = known * torch.where(mask > 0, 1.0, c.outside_weight)
+        colour = (known * mask)[:, None] * (own.rgb - target).square()
+        opacity = weight * (own.opacity - mask).square()
+        return {
+            "object colour": c.object_colour_weight * colour.mean(),
+            "object opacity": c.object_opacity_weight * opacity.mean(),
+        }
+
+    def asked(self, labels: Int[Tensor, " ray"], generator: torch.Generator) -> Int[Tensor, " ray"]:
+        """The instance that each ray teaches: its own, or for half of the rays one of those in the batch."""
+        there = labels[labels >= 0].unique()
+        if not len(there):
+            return torch.zeros_like(labels)
+        other = there[torch.randint(len(there), (len(labels),), generator=generator).to(labels.device)]
+        own = (torch.rand(len(labels), generator=generator) < OWN_SHARE).to(labels.device)
+        return torch.where(own & (labels >= 0), labels, other)
+
+    def instance_look(self, rays: Rays, numbers: Int[Tensor, " ray"], generator: torch.Generator | None = None) -> Look:
+        """Samples of the object branch, with the code of an instance for each ray."""
+        codes = self.codes(numbers)
+        return self.sampler.sample(rays, self.branch, codes, generator)[-1].look(self.branch, codes)
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        c = self.config
+        if isinstance(self.network, CoordinateField) or isinstance(self.branch, ObjectNetwork):
+            every = [*self.network.parameters(), *self.branch.parameters(), *self.codes.parameters()]
+            return [torch.optim.Adam(every, c.learning_rate, eps=1e-7), *super().optimizers()]
+        codes = {"params": [*self.codes.parameters()], "scale": CODES_RATE}
+        tables = [
+            *self.network.optimizers_at(c.learning_rate, c.hash_weight_decay),
+            *self.branch.optimizers_at(c.learning_rate, c.hash_weight_decay, groups=[codes]),
+        ]
+        return [*tables, *super().optimizers()]
+
+    # Editing
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return (*super().controls, *edit_controls(self.boxes.learnt, self.frame.reach))
+
+    def looks(self, rays: Rays) -> list[Look]:
+        edit = edit_of(self)
+        return super().looks(rays) if edit is None else [self.edited(rays, edit)]
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        edit = edit_of(self)
+        if edit is None:
+            return super().render_rays(rays, background)
+        look = self.edited(rays, edit)
+        return composite(look.samples, look.density, look.rgb, background)
+
+    def edited(self, rays: Rays, edit: Edit) -> Look:
+        """The scene without the instance, the instance at its new place, or both in one."""
+        if edit.kind == ALONE:
+            return self.instance_at(rays, edit.number, Similarity.make(1.0))
+        looks = [super().looks(rays)[-1]]
+        if edit.leaves:
+            points, _ = looks[0].samples.along(rays)
+            looks = [kept(looks[0], ~self.belongs(points, edit.number))]
+        if edit.appears:
+            place = edit.place(self.boxes.box(edit.number).mean(0))
+            looks.append(self.instance_at(rays, edit.number, place))
+        return union(looks)
+
+    def instance_at(self, rays: Rays, number: int, place: Similarity) -> Look:
+        """The object branch of one instance, inside its box, moved to a place."""
+        back = place.inverse
+        local = replace(rays, origins=back.points(rays.origins), directions=back.directions(rays.directions))
+        numbers = torch.full((len(rays),), number, device=rays.origins.device)
+        look = self.instance_look(local, numbers)
+        points, _ = look.samples.along(local)
+        low, high = self.boxes.box(number)
+        return kept(look, ((points >= low) & (points <= high)).all(-1))
+
+    @torch.no_grad()
+    def belongs(self, points: Float[Tensor, "point 3"], number: int) -> Bool[Tensor, " point"]:
+        """True for points that go with an instance: in cells of its box that its branch fills, and in those beside."""
+        low, high = self.boxes.box(number)
+        sides = ((high - low) / (high - low).max() * REGION_CELLS).ceil().long().clamp_min(1)
+        region = self._region(number, low, high, sides)
+        cell = ((points - low) / (high - low) * sides).floor().long()
+        inside = ((cell >= 0) & (cell < sides)).all(-1)
+        x, y, z = torch.where(inside[:, None], cell, 0).unbind(-1)
+        return inside & region[x, y, z]
+
+    def _region(self, number: int, low: Tensor, high: Tensor, sides: Tensor) -> Bool[Tensor, "x y z"]:
+        """Cells of an instance, remembered until it changes."""
+        state = int(self.branch.density_network.weights[0]._version) if isinstance(self.branch, ObjectTable) else 0
+        if (found := self._regions.get((number, state))) is not None:
+            return found
+        axes = [(torch.arange(int(n), device=self.device) + 0.5) / n for n in sides]
+        points = low + (high - low) * torch.cartesian_prod(*axes)
+        code = self.codes.rows[number][None]
+        parts = [self.branch.density(x, code.expand(len(x), -1)) for x in points.split(1 << 16)]
+        edge = float(((high - low) / sides).max())
+        filled = (torch.cat(parts).view(*sides.tolist()) * edge > REGION_THICKNESS).float()
+        size = 2 * REGION_DILATION + 1
+        found = max_pool3d(filled[None, None], size, 1, REGION_DILATION)[0, 0] > 0
+        self._regions = {(number, state): found}
+        return found
+
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
+        """Density and colour of the scene, without an instance that was removed."""
+        density, rgb = super().field(points, directions)
+        edit = edit_of(self)
+        return (density, rgb) if edit is None else (self._left(density, points, edit), rgb)
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        density, edit = super().density(points), edit_of(self)
+        return density if edit is None else self._left(density, points, edit)
+
+    def _left(self, density: Densities, points: Points, edit: Edit) -> Densities:
+        """Density after an edit, but for an instance at another place."""
+        belongs = self.belongs(points, edit.number)
+        if edit.kind == ALONE:
+            return torch.where(belongs, density, 0.0)
+        return torch.where(belongs, 0.0, density) if edit.leaves else density

@@ -1,0 +1,108 @@
+"""Object branches: density and colour of one instance, by its code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from ...components.fields.coordinate_field import NetworkNumbers
+from ...components.fields.coordinate_network import CoordinateNetwork
+from ...components.fields.encodings import FrequencyEncoding
+from ...components.fields.hash_field import HashField, HashNumbers, side_by_side
+from ...components.fields.layers import MLP, in_chunks
+from ...components.sampling.spaces import Space
+from ...method import Field
+from ...method.field import Codes, Colours, Densities, Directions, Points
+
+BINS = 64  # of each axis of the box of interest, in which seen surfaces are counted
+BOX_SHARE = 0.02  # of an instance's seen surface that may lie outside its box, on each side
+BOX_MARGIN = 0.03  # of the box of interest's sides, around an instance's box
+
+
+class ObjectNetwork(Field):
+    """The paper's object branch: a coordinate network on position and code (section 3.2).
+
+    coarse: branch of the coarse pass; None for this one
+    """
+
+    deforms, coarse = True, None
+
+    def __init__(self, numbers: NetworkNumbers, layers: int, width: int, space: Space, code: int):
+        super().__init__()
+        self.space = space
+        self.encode_position = FrequencyEncoding(3, numbers.position_frequencies, True)
+        self.encode_direction = FrequencyEncoding(3, numbers.direction_frequencies, True)
+        sizes = layers, width, max(1, layers // 2), not numbers.bfloat16
+        self.network = CoordinateNetwork(self.encode_position.width + code, self.encode_direction.width, *sizes)
+
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
+        assert code is not None
+
+        def answer(x: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+            raw, feature = self.network.geometry(torch.cat([self.encode_position(x), code], -1))
+            return nn.functional.softplus(raw), feature
+
+        density, features = in_chunks(answer, self.space.warp(points), code)
+        return density * self.space.stretch(points), features
+
+    def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
+        def answer(feature: Tensor, direction: Tensor) -> tuple[Tensor]:
+            return (self.network.seen(feature, self.encode_direction(direction)).sigmoid(),)
+
+        return in_chunks(answer, features, directions)[0]
+
+
+class ObjectTable(HashField):
+    """The same in a hash table of its own, read together with the code."""
+
+    deforms = True
+
+    def __init__(self, numbers: HashNumbers, hidden_width: int, space: Space, reach: float, code: int):
+        super().__init__(numbers, hidden_width, space, reach)
+        layers = [hidden_width] * numbers.density_layers
+        self.density_network = MLP(numbers.width + code, *layers, numbers.geometry_features)
+
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
+        assert code is not None
+        return self.decode(points, side_by_side(self.encode(points), code))
+
+    def colour(self, features: Tensor, directions: Directions, code: Codes | None = None) -> Colours:
+        return super().colour(features, directions)
+
+
+class InstanceBoxes(nn.Module):
+    """Boxes of instances, from the surfaces that photographs show of them: a histogram along each axis."""
+
+    counts: Tensor
+
+    def __init__(self, instances: int, bounds: tuple[Any, Any]):
+        super().__init__()
+        self.bounds = bounds
+        self.register_buffer("counts", torch.zeros(instances, 3, BINS))
+
+    @torch.no_grad()
+    def add(self, points: Float[Tensor, "point 3"], labels: Int[Tensor, " point"]) -> None:
+        """Count points of surfaces."""
+        low, high = points.new_tensor(self.bounds)
+        bins = (BINS * (points - low) / (high - low)).floor().long()
+        inside = ((bins >= 0) & (bins < BINS)).all(-1)
+        bins, labels = bins[inside], labels[inside]
+        axis = torch.arange(3, device=bins.device)
+        place = ((labels[:, None] * 3 + axis) * BINS + bins).flatten()
+        self.counts.view(-1).index_add_(0, place, torch.ones_like(place, dtype=self.counts.dtype))
+
+    @property
+    def learnt(self) -> Bool[Tensor, " label"]:
+        """Instances with a box."""
+        return self.counts[:, 0].sum(-1) > 0
+
+    def box(self, number: int) -> Float[Tensor, "2 3"]:
+        """Lower and upper corner around all but a share of an instance's surface."""
+        low, high = self.counts.new_tensor(self.bounds)
+        shares = self.counts[number].cumsum(-1) / self.counts[number].sum(-1, keepdim=True).clamp_min(1)
+        first, last = (shares <= BOX_SHARE).sum(-1), (shares < 1 - BOX_SHARE).sum(-1) + 1
+        side = high - low
+        return torch.stack([low + side * (first / BINS - BOX_MARGIN), low + side * (last / BINS + BOX_MARGIN)])
