@@ -87,11 +87,14 @@ class EnvironmentLight:
         return EnvironmentLight(torch.full((SKY_ROWS, 2 * SKY_ROWS, 3), radiance))
 
     @staticmethod
-    def outdoors(azimuth: float, elevation: float, sun: float = 1.0, sky: float = 0.4) -> EnvironmentLight:
+    def outdoors(
+        azimuth: float, elevation: float, sun: float = 1.0, sky: float = 0.4, width: float = 0.0
+    ) -> EnvironmentLight:
         """A clear sky with a sun.
 
         azimuth, elevation: of the sun, degrees
         sun: radiance of a white matt surface that faces the sun, from it alone; sky: the same of level ground and sky
+        width: half of the sun's, degrees; above 0 it is seven suns, one in the middle of six
         """
         height = math.sin(math.radians(elevation))
         low = max(0.0, 1 - max(elevation, 0.0) / LOW_SUN)
@@ -101,10 +104,9 @@ class EnvironmentLight:
         gradient = torch.tensor(HORIZON) + (1 - (1 - z.clamp_min(0)) ** 3) * (torch.tensor(SKY) - torch.tensor(HORIZON))
         radiance = torch.where(z > 0, gradient, torch.tensor(GROUND))
         level = (radiance.mean(-1, keepdim=True) * z.clamp_min(0) * light.solid_angles[..., None]).sum() / math.pi
-        up = torch.tensor([[0.0, 0.0, 1.0]])
-        facing = direction(azimuth, elevation)[None] if height > 0 else up
-        power = math.pi * sun * (1.0 if height > 0 else 0.0)
-        return EnvironmentLight(radiance * (sky / level), facing, power * colour[None])
+        toward = disc(azimuth, elevation, width)
+        power = math.pi * sun / len(toward) if height > 0 else 0.0
+        return EnvironmentLight(radiance * (sky / level), toward, (power * colour).expand(len(toward), 3))
 
     # Geometry of the map
 
@@ -183,6 +185,17 @@ def direction(azimuth: float, elevation: float) -> Float[Tensor, " 3"]:
     """Unit vector of an azimuth and an elevation above the horizon, degrees."""
     a, e = math.radians(azimuth), math.radians(elevation)
     return torch.tensor([math.cos(e) * math.sin(a), math.cos(e) * math.cos(a), math.sin(e)])
+
+
+def disc(azimuth: float, elevation: float, width: float) -> Float[Tensor, "place 3"]:
+    """Directions to the middle of a disc and, if it has a width (degrees), to six places at two thirds of it."""
+    middle = direction(azimuth, elevation)
+    if width == 0:
+        return middle[None]
+    side, up = direction(azimuth + 90, 0), direction(azimuth, elevation + 90)
+    turn = math.pi / 3 * torch.arange(6)[:, None]
+    ring = middle + math.tan(math.radians(width)) * 2 / 3 * (turn.cos() * side + turn.sin() * up)
+    return torch.cat([middle[None], ring / ring.norm(dim=-1, keepdim=True)])
 
 
 def directions(rows: int, columns: int) -> Float[Tensor, "row column 3"]:

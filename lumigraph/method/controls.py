@@ -25,6 +25,7 @@ class Control:
     about:   what it does, in one sentence
     of_photographs: whether choices beside the default are numbers of photographs, which a command takes by name as well
     blends:  whether a value may lie between two choices: "A:B:0.3" is three tenths of the way from A to B
+    files:   endings of file names that are taken beside the choices
     """
 
     name: str
@@ -35,6 +36,7 @@ class Control:
     about: str = ""
     of_photographs: bool = False
     blends: bool = False
+    files: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         assert (self.range is None) != (not self.choices), f"{self.name} needs either a range or choices"
@@ -44,9 +46,12 @@ class Control:
         if self.choices:
             if str(value) in self.choices or (self.blends and self._is_blend(str(value))):
                 return str(value)
+            if self.files and str(value).lower().endswith(self.files):
+                return str(value)
             names = ", photographs' names" if self.of_photographs else ""
             between = ", and A:B:0.5 for halfway between two" if self.blends else ""
-            raise LumigraphError(f"{self.name}={value} is no choice; there are: {self.domain}{names}{between}")
+            file = f", a file that ends in {', '.join(self.files)}" if self.files else ""
+            raise LumigraphError(f"{self.name}={value} is no choice; there are: {self.domain}{names}{between}{file}")
         assert self.range is not None
         try:
             number = float(value)
