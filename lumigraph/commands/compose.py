@@ -100,7 +100,8 @@ class Compose:
             if any(given is not None for given in (self.at, self.scale, self.turn)):
                 spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
                 place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
-            box, probes = self.box and CropBox(*self.box), self.probes and relative(self.probes, self.output)
+            box = self.box and CropBox(*self.box)
+            probes = None if self.probes is None else relative(self.probes, self.output)
             named.append(CompositionPart(relative(self.part, self.output), place, box, probes))
         elif not self.edits.edits:
             raise LumigraphError(
