@@ -12,7 +12,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format bench clean
+.PHONY: help demo test check format bench package site clean
 
 help:
 	@echo 'make demo    photographs to a film and a report in a few minutes'
@@ -20,6 +20,8 @@ help:
 	@echo 'make check   formatting, lint, types, tests'
 	@echo 'make format  let the formatter have its way'
 	@echo 'make bench   throughput of every kernel on every engine'
+	@echo 'make package a wheel and a source archive, in dist/'
+	@echo 'make site    the documents as a site, in site/'
 	@echo 'make clean   remove the virtual environment and all caches'
 
 demo: .venv/.installed
@@ -41,8 +43,15 @@ format: .venv/.tools
 bench: .venv/.installed
 	$(BIN)/lumigraph bench kernels
 
+package: .venv/.made
+	$(PIP) build
+	$(BIN)/python -m build --outdir dist .
+
+site: .venv/.tools
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
 clean:
-	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build dist site *.egg-info
 	find lumigraph tests -name __pycache__ -prune -exec rm -rf {} +
 
 # Stamps: each step of the installation is done once, and again when pyproject.toml changes.
