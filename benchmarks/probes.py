@@ -49,7 +49,7 @@ GATHERED_RAYS = 512  # over a hemisphere, for the truth
 POINTS_PER_VIEW, VIEWS = 40, 16
 BARE = "#caption, #buttons, #wait { display: none !important } * { transition: none !important }"
 SOFTWARE = "--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
-BALL_COUNTS = (6, 6, 4)
+BALL_COUNTS, SIZE = (6, 6, 4), 320  # probes, and pixels of the picture
 ALBEDO = float(linear_from_srgb(BALL_WHITE / 255))
 # Where the balls are: middle, radius, and the camera's position.
 ROOM_BALL = ((-0.05, 0.05, -0.25), 0.14, (0.45, -0.4, -0.05))
@@ -202,8 +202,8 @@ def ball_rows(options: Options) -> list[dict[str, Any]]:
             place = tuple(scene.points(torch.tensor(middle)).tolist())
             seen_from = camera.transformed(scene.matrix)
             path = options.output / f"{name.replace(', ', '-').replace(' ', '-')}.html"
-            probes_page(path, method, seen_from, grid, name, place=(place, 2 * radius * length))
-            flat = flat_camera(camera)
+            probes_page(path, method, seen_from, grid, name, place=(place, 2 * radius * length), longest=SIZE)
+            flat = flat_camera(camera, SIZE)
             size = flat.size[0].tolist()
             page = browser.new_page(viewport={"width": size[0], "height": size[1]})
             page.goto(path.resolve().as_uri())
@@ -233,12 +233,12 @@ def truth_of(world: World, camera: Camera, middle: tuple, radius: float) -> tupl
     width, height = camera.size[0].tolist()
     mask = torch.from_numpy(seen.identity == inserted.names.index("inserted")).view(height, width)
     if world.environment is not None:
-        return encoded(shown(inserted, camera, 16).clamp(0, 1)), mask
+        return encoded(shown(inserted, camera, 4).clamp(0, 1)), mask
     picture = render(inserted, camera).rgb
     hit = mask.flatten()
     points = rays.at(torch.from_numpy(seen.depth).float())[hit]
     normals = torch.from_numpy(seen.normal).float()[hit]
-    light = [gathered(inserted, p, n, 128) for p, n in zip(points.split(4096), normals.split(4096), strict=True)]
+    light = [gathered(inserted, p, n, 256) for p, n in zip(points.split(4096), normals.split(4096), strict=True)]
     picture[mask] = encoded((ALBEDO / math.pi * torch.cat(light)).clamp(0, 1))
     return picture, mask
 

@@ -87,6 +87,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         "explain lightfield ball --size 32 --output told2",
         ("told2/lightfield.png", "told2/lightfield.svg", "told2/lightfield.json"),
     ),
+    "explain scattering": (
+        "explain scattering --steps 1 --size 8 --output fogged",
+        ("fogged/scattering.png", "fogged/lamps.svg", "fogged/phase.svg", "fogged/scattering.json"),
+    ),
     "explain activation": ("explain activation --steps 2 --output edge.png", ("edge.png",)),
     "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),

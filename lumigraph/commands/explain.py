@@ -243,6 +243,42 @@ class ExplainRay:
         return photograph.before(run.frame.background)
 
 
+@dataclass(frozen=True)
+class ExplainScattering:
+    """Fit fields of emission and absorption to fog that scatters the light of a lamp, and move the lamp.
+
+    Pictures beside the tracer's, PSNR against the lamp's movement for each degree of view-dependent colour, and the
+    fitted colour against the phase function.
+    """
+
+    output: Annotated[Path, option("FOLDER")] = Path("explained/scattering")
+    """Folder of scattering.png, lamps.svg, phase.svg and scattering.json."""
+    overwrite: Overwrite = False
+    anisotropy: Annotated[Annotated[float, between(0, 0.95)], option("G")] = 0.6
+    """Asymmetry of the phase function: 0 scatters evenly, a larger one more forward."""
+    steps: Annotated[Steps, option("N")] = 500
+    """Training steps of each field; more fit more closely."""
+    size: Annotated[Annotated[int, between(8, 256)], option("PIXELS")] = 64
+    """Side of each picture; larger is finer and slower."""
+    seed: SeedOption = 0
+
+    def run(self) -> int:
+        from ..explain.scattering import LAMPS, draw, measure
+        from ..files import claim
+
+        for file in ("scattering.png", "lamps.svg", "phase.svg", "scattering.json"):
+            claim(self.output / file, "figure", self.overwrite)
+        found, pictures = measure(self.anisotropy, self.steps, self.size, self.seed)
+        draw(self.output, found, pictures)
+        rows = {
+            f"degree {fit.degree}": f"{fit.moved[0]:.1f} dB; {fit.moved[LAMPS.index(45)]:.1f} dB with the lamp moved "
+            f"45 degrees; {fit.inside:.1f} dB from within"
+            for fit in found.fits
+        }
+        show(rows | {"files": str(self.output)})
+        return 0
+
+
 def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:
     """Name and Camera of a photograph, by its name or number in a split of a Run. LumigraphError if there is none."""
     names = run.view_names().get(split, [])
@@ -263,6 +299,7 @@ What = (
     | Annotated[ExplainFitting, subcommand("fitting")]
     | Annotated[ExplainLightField, subcommand("lightfield")]
     | Annotated[ExplainRay, subcommand("ray")]
+    | Annotated[ExplainScattering, subcommand("scattering")]
 )
 
 

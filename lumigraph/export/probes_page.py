@@ -44,14 +44,16 @@ def probes_page(
     title: str,
     mesh: Path | None = None,
     place: tuple[Vector, float] | None = None,
+    longest: int = LONGEST,
 ) -> None:
     """Write the page. The picture is what a camera sees, flat; the mesh begins in its middle.
 
     camera: in the scene's frame
     mesh:   its file; None for a white ball
     place:  position of the mesh's middle in the scene's frame, and length of its longest side, where they are given
+    longest: pixels of the picture's longer side
     """
-    flat = flat_camera(camera).to("cpu")
+    flat = flat_camera(camera, longest).to("cpu")
     seen = method.render(flat.to(method.device)).cpu()
     solid = (seen.opacity > MIN_SURFACE_OPACITY) & seen.depth.isfinite()
     if not solid.any():
@@ -100,9 +102,9 @@ def probes_page(
     write_bytes(path, page_bytes("probes", settings, gzip.compress(data, 9, mtime=0), HELP), "page")
 
 
-def flat_camera(camera: Camera) -> Camera:
+def flat_camera(camera: Camera, longest: int = LONGEST) -> Camera:
     """A pinhole camera in place of any, with the same position, heading and shape of picture."""
-    size = film_size(camera, LONGEST)
+    size = film_size(camera, longest)
     focal = 0.5 * min(size) / math.tan(0.5 * angle_of_view(camera))
     middle = torch.tensor([[size[0] / 2, size[1] / 2]])
     return Camera(camera.pose, Pinhole(torch.full((1, 2), focal), middle), torch.tensor([size]))

@@ -49,11 +49,13 @@ from .members import members_of as members_of
 from .rendering import eight_bits, open_sky, photograph, radiance, roughness
 from .rendering import lit as lit
 from .rendering import render as render
+from .rendering import scattered as scattered
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
 from .rendering import unoccluded as unoccluded
 from .stage import SyntheticStage as SyntheticStage
 from .stage import told
+from .world import Fog as Fog
 from .world import Lamp as Lamp
 from .world import Material as Material
 from .world import Object as Object

@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..color.srgb import srgb_from_linear
 from ..light import EnvironmentLight
-from . import environment, tracer
+from . import environment, scattering, tracer
 from .world import World
 
 RAYS_PER_TASK = 4096
@@ -65,6 +65,9 @@ def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) ->
     if world.environment is not None:
         light = lit(world, camera)
         return srgb_from_linear(light[..., :3].clip(0, 1)).astype(np.float32), light[..., 3]
+    if world.fog is not None:
+        rgb = srgb_from_linear(scattered(world, camera).clip(0, 1)).astype(np.float32)
+        return rgb, np.ones((height, width), np.float32)
     places = camera.pixels()
     pixels = _gather(world, camera, places, samples, aims=1)
     count = np.full((len(pixels), 1), samples)
@@ -81,6 +84,8 @@ def radiance(world: World, camera: Camera, samples: int = 12) -> np.ndarray:
     """The light of every pixel, linear sRGB (height, width, 3), without a film that bends what is bright."""
     if world.environment is not None:
         return lit(world, camera)[..., :3]
+    if world.fog is not None:
+        return scattered(world, camera)
     width, height = camera.size[0].tolist()
     dim = replace(world, sky=replace(world.sky, exposure=world.sky.exposure / FILM_HEADROOM))
     pixels = _gather(dim, camera, camera.pixels(), samples, aims=1)
@@ -109,6 +114,29 @@ def lit(world: World, camera: Camera, samples: int = 4, lights: int = 32) -> Flo
     pixels[..., :3] /= np.maximum(pixels[..., 3:], 1)
     pixels[..., 3] /= samples
     return pixels.astype(np.float32)
+
+
+def scattered(world: World, camera: Camera, samples: int = 4, along: int = 16) -> Float[np.ndarray, "height width 3"]:
+    """Radiance (linear sRGB) of every pixel of a world in fog, before black.
+
+    samples: rays per pixel; along: places on each ray for each lamp
+    """
+    assert world.fog is not None
+    width, height = camera.size[0].tolist()
+    offsets = torch.from_numpy(hammersley(samples)).to(camera.pose) - 0.5
+    rays = camera.rays((camera.pixels()[:, None] + offsets).reshape(-1, 2))
+    origins, directions, radius = _arrays(rays)
+    fog = world.fog
+    numbers = np.array([fog.scattering, fog.scattering + fog.absorption, fog.anisotropy, fog.reach])
+    seen = np.empty((len(rays), 3))
+
+    def work(first: int) -> None:
+        part = slice(first, first + RAYS_PER_TASK)
+        given = origins[part], directions[part], radius[part] / samples**0.5
+        scattering.light(world.arrays, numbers, *given, first, along, seen[part])
+
+    list(_workers().map(work, range(0, len(rays), RAYS_PER_TASK)))
+    return seen.reshape(height, width, samples, 3).mean(2).astype(np.float32)
 
 
 def unoccluded(

@@ -198,11 +198,27 @@ class Sky:
 
 
 @dataclass(frozen=True)
+class Fog:
+    """Haze in a ball around the origin that scatters the light of lamps once, and shows surfaces through it.
+
+    scattering, absorption: per scene unit
+    anisotropy: g of the phase function (Henyey and Greenstein 1941): 0 for even, towards 1 for forward scattering
+    reach:      radius of the ball
+    """
+
+    scattering: float
+    absorption: float
+    anisotropy: float = 0.0
+    reach: float = 1.0
+
+
+@dataclass(frozen=True)
 class World:
     """A scene to photograph. z points up, lengths in scene units.
 
     environment: an exact light from all sides in place of lights and sky; None where there is none
     bounces:     reflections of its light between surfaces, 0 or 1
+    fog:         what scatters the light of lamps; then there is no other light. None for clear air
     """
 
     objects: tuple[Object, ...]
@@ -210,6 +226,7 @@ class World:
     sky: Sky = Sky()
     environment: EnvironmentLight | None = None
     bounces: int = 0
+    fog: Fog | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
