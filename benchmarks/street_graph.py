@@ -45,7 +45,8 @@ from lumigraph.training import fit, loop
 
 NAME, BASELINE = "neural-scene-graph", "instant-ngp"
 EDITED_VIEWS = 3  # held-out frames that each edit is compared at
-PARKED = BoxTrack("parked", "car", (1.0, 1.0, 1.0), (0.0,), ((0.1, -0.65, 0.0),), ((1.0, 0.0, 0.0, 0.0),))
+PLACE = (0.1, -0.65, GROUND + 0.5)  # of a parked car's box of size 1, between the lanes
+PARKED = BoxTrack("parked", "car", (1.0, 1.0, 1.0), (0.0,), (PLACE,), ((1.0, 0.0, 0.0, 0.0),))
 EDITS = {
     "moved": (TrackEdit("car 1", shift=(0.06, -0.1, 0.0)),),
     "turned": (TrackEdit("car 2", turn=60.0),),
@@ -148,7 +149,7 @@ def edited(method: Method, scene: Scene, options: Options, seed: int) -> dict[st
     test = scene.splits["test"].tolist()
     chosen = [test[i] for i in np.linspace(1, len(test) - 2, EDITED_VIEWS).astype(int)]
     for name, changes in {"as it was": (), **EDITS}.items():
-        edits = TrackEdits(tuple(map(on_ground, changes)))
+        edits = TrackEdits(changes)
         here = edits.transformed(to_source.inverse)
         told = method.given(here)
         names = {edit.node for edit in changes} or {track.name for track in scene.frame.tracks}
@@ -168,15 +169,6 @@ def edited(method: Method, scene: Scene, options: Options, seed: int) -> dict[st
         sheet.append(np.concatenate(column))
     Image.fromarray(np.concatenate(sheet, 1)).save(options.output / f"{seed}.png")
     return scores
-
-
-def on_ground(edit: TrackEdit) -> TrackEdit:
-    """An edit whose new track, if it has one, is on the ground: boxes grow upwards from their lower sides."""
-    if edit.track is None:
-        return edit
-    half = 0.5 * edit.track.size[2]
-    places = tuple((x, y, GROUND + half) for x, y, _ in edit.track.positions)
-    return replace(edit, track=replace(edit.track, positions=places))
 
 
 def unseen(method: Method, options: Options, seed: int) -> dict[str, float]:
