@@ -41,6 +41,7 @@ from lumigraph.methods.neural_scene_graph.nodes import PoseTable, crossings
 from lumigraph.run import build
 from lumigraph.synthetic.rendering import photograph
 from lumigraph.synthetic.scenes.traffic import GROUND, with_edits
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit, loop
 
 NAME, BASELINE = "neural-scene-graph", "instant-ngp"
@@ -105,6 +106,7 @@ def trained(name: str, scene: Scene, seconds: float, numbers: dict) -> tuple[Met
     begin = time.process_time()
     with mock.patch.object(loop, "time", SimpleNamespace(perf_counter=time.process_time)):
         outcome = fit(method, scene, seconds=seconds, show=False)
+    go_on_unless(outcome.signal)
     return method.eval(), time.process_time() - begin, outcome.state.step
 
 

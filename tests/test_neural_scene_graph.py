@@ -20,6 +20,8 @@ from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene, read_capture
 from lumigraph.capture.tracks import read_tracks, write_tracks
 from lumigraph.commands.cli import main
+from lumigraph.components.fields.coordinate_field import NetworkNumbers
+from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.tracks import BoxTrack, TrackEdit, TrackEdits, nodes_of
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -178,6 +180,16 @@ def test_a_code_between_two():
         method.given(half="third")
 
 
+def test_the_papers_networks_learn():
+    """One step of the preset's fields, tiny: every parameter gets a gradient."""
+    network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=4)
+    method = graph(field="network", network=network, rays=RayNumbers(8, 8, 128), pose_input="location").train()
+    batch = method.batch(tiny.scene(), torch.Generator().manual_seed(0))
+    sum(method.loss(batch, 0).values()).backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in method.parameters())
+    assert method.eval().render(tiny.scene().cameras[0]).rgb.isfinite().all()
+
+
 def test_a_graph_of_a_scene_without_tracks_is_refused():
     with pytest.raises(LumigraphError, match="The scene has no tracks.*put tracks.json"):
         graph(tracks=())
@@ -283,6 +295,7 @@ def test_tracks_beside_photographs(tmp_path):
     ("change", "sentence"),
     [
         ({"times": [3.0, 1.0]}, "ends before it begins: its times go from 3 to 1"),
+        ({"name": "a:b"}, "has a colon in its name"),
         ({"times": [3.0]}, "1 times, 2 positions and 2 rotations"),
         ({"rotations": [[0, 0, 0, 0], [1, 0, 0, 0]]}, "rotation of four zeros"),
         ({"size": [1, 1, 0]}, "size"),
