@@ -20,6 +20,9 @@ from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene, read_capture
 from lumigraph.capture.tracks import read_tracks, write_tracks
 from lumigraph.commands.cli import main
+from lumigraph.components.fields.coordinate_field import NetworkNumbers
+from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
+from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.tracks import BoxTrack, TrackEdit, TrackEdits, nodes_of
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.geometry import Similarity, rotated, to_matrix
@@ -177,6 +180,16 @@ def test_a_code_between_two():
         method.given(half="third")
 
 
+def test_the_papers_networks_learn():
+    """One step of the preset's fields, tiny: every parameter gets a gradient."""
+    network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=4)
+    method = graph(field="network", network=network, rays=RayNumbers(8, 8, 128), pose_input="location").train()
+    batch = method.batch(tiny.scene(), torch.Generator().manual_seed(0))
+    sum(method.loss(batch, 0).values()).backward()
+    assert all(parameter.grad is not None and parameter.grad.any() for parameter in method.parameters())
+    assert method.eval().render(tiny.scene().cameras[0]).rgb.isfinite().all()
+
+
 def test_a_graph_of_a_scene_without_tracks_is_refused():
     with pytest.raises(LumigraphError, match="The scene has no tracks.*put tracks.json"):
         graph(tracks=())
@@ -224,29 +237,33 @@ def test_edits_of_what_is_no_graph_are_refused(ball_run, tmp_path):
 
 
 def test_the_code_of_an_unseen_thing_is_found_from_views(monkeypatch):
+    """Pictures of a graph with a thing of a known code: the code that is found shows them again."""
     monkeypatch.setattr(neural_scene_graph, "CODE_STEPS", 50)
     monkeypatch.setattr(neural_scene_graph, "CODE_RAYS", 64)
-    scene = tiny.scene()
-    known = replace(scene, frame=replace(scene.frame, tracks=tiny.TRACKS[:1]))
-    method = graph(tracks=tiny.TRACKS[:1])
-    fit(method, known, steps=24, show=False, rehearsal=False)
+    scene, method = tiny.scene(), graph(tracks=tiny.TRACKS[:1], symmetric=False)
+    with torch.no_grad():  # a class whose looks depend on the code
+        method.classes[0].table.uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+        for weight in method.classes[0].density_network.weights:
+            weight.mul_(2)
+    mean = method.codes.detach().mean(0, keepdim=True)
+    true, average = method.given(), method.given()
+    true.found = tiny.TRACKS[1:], mean + torch.tensor([[0.6, -0.5, 0.4, -0.6]])
+    average.found = tiny.TRACKS[1:], mean
+    for told in (true, average):
+        told.arrange()
+    pictures = [true.render(camera).rgb for camera in (scene.cameras[i] for i in range(len(scene)))]
+    images = ImageStore.from_arrays([(255 * picture.clamp(0, 1)).round().byte().numpy() for picture in pictures])
     before = {name: value.clone() for name, value in method.state_dict().items()}
-    told = method.given(scene)
-    assert [track.name for track in told.tracks] == ["half", "quarter"]
+    found = method.given(replace(scene, images=images, layers={}))
+    assert [track.name for track in found.tracks] == ["half", "quarter"]
     assert all(torch.equal(value, before[name]) for name, value in method.state_dict().items())
-    mean = told.given()
-    mean.found = told.found[0], method.codes.detach().mean(0, keepdim=True)
 
     def error(graph: NeuralSceneGraph) -> float:
-        """Of pixels whose rays cross the box of the unseen thing."""
-        camera, photograph = scene.cameras[5], scene.photograph(5).before((1.0, 1.0, 1.0))
-        inside = told.given(half="removed").crossings(camera.rays(camera.pixels())).ray
-        shown = graph.render(camera).rgb - photograph
-        return float(shown.flatten(0, 1)[inside].square().mean())
+        return float((graph.render(scene.cameras[5]).rgb - pictures[5]).square().mean())
 
-    assert error(told) < 0.98 * error(mean)
+    assert error(found) < 0.3 * error(average)
     with pytest.raises(LumigraphError, match="has no track of piece besides half, quarter"):
-        found_in(told, scene)
+        found_in(found, scene)
 
 
 # Files
@@ -278,6 +295,7 @@ def test_tracks_beside_photographs(tmp_path):
     ("change", "sentence"),
     [
         ({"times": [3.0, 1.0]}, "ends before it begins: its times go from 3 to 1"),
+        ({"name": "a:b"}, "has a colon in its name"),
         ({"times": [3.0]}, "1 times, 2 positions and 2 rotations"),
         ({"rotations": [[0, 0, 0, 0], [1, 0, 0, 0]]}, "rotation of four zeros"),
         ({"size": [1, 1, 0]}, "size"),

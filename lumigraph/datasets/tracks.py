@@ -50,6 +50,8 @@ class BoxTrack:
                 f"Track {self.name} has {counts[0]} times, {counts[1]} positions and {counts[2]} rotations; give as "
                 "many of each, and one at least"
             )
+        if ":" in self.name:
+            raise LumigraphError(f"Track {self.name} has a colon in its name, which is between two names; rename it")
         for a, b in zip(self.times, self.times[1:], strict=False):
             if a >= b:
                 raise LumigraphError(

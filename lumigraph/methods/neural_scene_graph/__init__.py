@@ -117,10 +117,8 @@ class NeuralSceneGraph(FieldMethod):
     def cpu_preset(cls) -> Any:
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
         c = Config(**CPU_HASH, field="hash", hidden_width=32, code_width=16, box_samples=16)
-        c = replace(c, class_log2_hashmap_size=15, class_max_resolution=96)
-        c = replace(
-            c, box_scale=1.1, pose_input="heading", symmetric=True, huber_delta=0.3, code_weight=1e-3, decay_start=0.3
-        )
+        c = replace(c, class_log2_hashmap_size=15, class_max_resolution=96, box_scale=1.1, pose_input="heading")
+        c = replace(c, symmetric=True, huber_delta=0.3, code_weight=1e-3)
         return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
 
     @classmethod
@@ -151,7 +149,14 @@ class NeuralSceneGraph(FieldMethod):
         there = {node.name for node in nodes_of(self.tracks, self.edits)}
         own = tuple(edit for edit in chosen if edit.node in there)
         self.shown_nodes: tuple[GraphNode, ...] = nodes_of(self.tracks, TrackEdits((*self.edits.edits, *own)))
-        self.table = PoseTable(self.shown_nodes, self.frame.tracks)
+        self._table = PoseTable(self.shown_nodes, self.frame.tracks)
+
+    @property
+    def table(self) -> PoseTable:
+        """Given poses of the nodes that are shown, on the method's device."""
+        if self._table.times.device != self.device:
+            self._table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
+        return self._table
 
     @property
     def instances(self) -> dict[str, str]:
@@ -191,10 +196,8 @@ class NeuralSceneGraph(FieldMethod):
 
     def crossings(self, rays: Rays) -> BoxStretches:
         """Stretches of rays inside the boxes of their moments."""
-        if self.table.times.device != self.device:
-            self.table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
-        scale, near = self.config.box_scale, 0.5 * self.frame.near
-        return crossings(rays, self.moments(rays), self.table, self.nodes.twist, scale, near)
+        moments, twist = self.moments(rays), self.nodes.twist
+        return crossings(rays, moments, self.table, twist, self.config.box_scale, self.frame.near)
 
     def instance_looks(self, rays: Rays, generator: torch.Generator | None = None) -> list[Look]:
         """Density and colour in boxes: one look for the first box of each ray, one for the second, and so on."""
@@ -244,19 +247,17 @@ class NeuralSceneGraph(FieldMethod):
     def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Background and instances at the moment of the control `time`; densities add, colours mix by density."""
         density, rgb = super().field(points, directions)
-        rays = Rays(points[:1], directions[:1], points.new_zeros(1))
-        moments = self.moments(rays) if len(points) else points.new_zeros(1)
-        table = PoseTable(self.shown_nodes, self.frame.tracks, self.device)
-        poses = table.at(moments, self.nodes.twist)
-        point, node, local = inside(points, poses, table.size, self.config.box_scale)
+        if not len(points):
+            return density, rgb
+        poses = self.table.at(self.moments(Rays(points, directions, points[:, 0]))[:1], self.nodes.twist)
+        point, node, local = inside(points, poses, self.table.size, self.config.box_scale)
         if not len(point):
             return density, rgb
         rotation, position = poses.rotation[node, 0], poses.position[node, 0]
         seen = torch.einsum("pij,pi->pj", rotation, directions[point])
         zero = local.new_zeros(len(point))
         found = BoxStretches(point, node, zero, zero, local, seen, rotation[:, :, 0], position)
-        half = 0.5 * self.config.box_scale * table.size[node]
-        self.table = table
+        half = 0.5 * self.config.box_scale * self.table.size[node]
         more, colour = self.evaluate(local * half, found, torch.arange(len(point), device=point.device))
         total = density.index_add(0, point, more)
         mixed = (density[:, None] * rgb).index_add(0, point, more[:, None] * colour)
