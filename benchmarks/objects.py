@@ -47,6 +47,7 @@ STROKES = 3
 INNER = 2.5  # pixels from the edge of a region at which a stroke keeps, where there is room
 WORTH = 2.0  # pixels: half the thickness of a region that is worth a stroke
 BEHIND = 1e-3  # scene units in front of a surface, from where a ray sees it lit as it is
+FINER = 4  # rays across a pixel of the truth
 MIN_PIXELS = 60  # of a thing in the photograph for its strokes
 
 
@@ -195,7 +196,7 @@ class RemovalOptions:
 
 def truth_behind(world: Any, name: str, scene: Any, image: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Picture without a thing, lit as with it, over the background; and the pixels at which it was seen."""
-    camera = scene.cameras[image]
+    camera = scene.cameras[image].resized(FINER)
     width, height = camera.size[0].tolist()
     rays = camera.rays(camera.pixels())
     empty = replace(world, objects=tuple(x for x in world.objects if x.name != name))
@@ -205,8 +206,8 @@ def truth_behind(world: Any, name: str, scene: Any, image: int) -> tuple[torch.T
     moved = replace(rays, origins=rays.at(begin))
     light = torch.from_numpy(srgb_from_linear(procedural.trace(world, moved).radiance)).float()
     rgb = torch.where(torch.from_numpy(hit)[:, None], light, torch.tensor(scene.frame.background))
-    seen = true_mask(scene, image, world.names.index(name))
-    return rgb.view(height, width, 3), torch.from_numpy(seen)
+    small = rgb.view(height // FINER, FINER, width // FINER, FINER, 3).mean((1, 3))
+    return small, torch.from_numpy(true_mask(scene, image, world.names.index(name)))
 
 
 def hole_psnr(pictures: list[torch.Tensor], truths: list[tuple[torch.Tensor, torch.Tensor]]) -> float:

@@ -157,7 +157,9 @@ class Viewer:
         self._server = start_server(address, subject.title, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
-        names = ["View", "Crop", "Measure", "Path", *(["Export"] if subject.exporter else [])]
+        selects = subject.open_scene is not None and not training
+        more = [*(["Select"] if selects else []), "Measure", "Path", *(["Export"] if subject.exporter else [])]
+        names = ["View", "Crop", *more]
         own_tabs = {name: tabs.add_tab(name) for name in names}
         self._panel: TrainingPanel | None = None
         if subject.rows or training:

@@ -37,6 +37,7 @@ from .painter import MOVING_SECONDS, Pace, Painter
 from .path_panel import PathPanel
 from .ruler_panel import RulerPanel
 from .shared import Shared
+from .strokes_panel import StrokesPanel
 from .turns import NotWantedError
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
@@ -70,6 +71,10 @@ class Visitor:
         self.method_controls = MethodControls(client, shared, self.painter.request)
         keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
         self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify, self.locate)
+        self.strokes: StrokesPanel | None = None
+        if "Select" in shared.tabs:
+            kept = shared.subject.keep if keep is not None else None
+            self.strokes = StrokesPanel(client, shared, self.request, self.painter.request, kept, self.notify)
         self.ruler = RulerPanel(client, shared, self.locate, self.painter.request, self.notify)
         self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
         if shared.subject.exporter is not None:
@@ -170,11 +175,16 @@ class Visitor:
             controls.background,
             controls.exact,
             self.crop.crop,
-            controls.surrounded or self.path.drawn or self.crop.drawn or self.ruler.drawn,
+            controls.surrounded or self.path.drawn or self.crop.drawn or self.ruler.drawn or self.selected,
             self.method_controls.values,
             self.crop.strength,
             self.crop.cleaned,
         )
+
+    @property
+    def selected(self) -> bool:
+        """True if a part that strokes select is shown."""
+        return self.strokes is not None and self.strokes.drawn
 
     def locate(self, origin: Vector, direction: Vector) -> Vector | None:
         """The point of the visible scene that a ray meets first: the median depth of a few pixels around it."""

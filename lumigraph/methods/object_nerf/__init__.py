@@ -35,7 +35,7 @@ from ...method import FieldMethod
 from ...method.controls import Control
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .fields import InstanceBoxes, ObjectNetwork, ObjectTable
+from .fields import InstanceBoxes, ObjectNetwork, ObjectTable, SceneWithout
 
 
 @dataclass(frozen=True)
@@ -218,14 +218,20 @@ class ObjectNeRF(FieldMethod):
         """The scene without the instance, the instance at its new place, or both in one."""
         if edit.kind == ALONE:
             return self.instance_at(rays, edit.number, Similarity.make(1.0))
-        looks = [super().looks(rays)[-1]]
-        if edit.leaves:
-            points, _ = looks[0].samples.along(rays)
-            looks = [kept(looks[0], ~self.belongs(points, edit.number))]
+        looks = [self.without(rays, edit.number) if edit.leaves else super().looks(rays)[-1]]
         if edit.appears:
             place = edit.place(self.boxes.box(edit.number).mean(0))
             looks.append(self.instance_at(rays, edit.number, place))
         return union(looks)
+
+    def without(self, rays: Rays, number: int) -> Look:
+        """The scene branch, without what goes with an instance."""
+        if isinstance(self.network, HashField):  # its samplers end rays at the first surface, which may be the instance
+            scene = SceneWithout(self.network, lambda points: self.belongs(points, number))
+            return self.sampler.sample(rays, scene)[-1].look(scene)
+        look = super().looks(rays)[-1]
+        points, _ = look.samples.along(rays)
+        return kept(look, ~self.belongs(points, number))
 
     def instance_at(self, rays: Rays, number: int, place: Similarity) -> Look:
         """The object branch of one instance, inside its box, moved to a place."""

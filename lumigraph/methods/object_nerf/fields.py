@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -71,6 +72,30 @@ class ObjectTable(HashField):
 
     def colour(self, features: Tensor, directions: Directions, code: Codes | None = None) -> Colours:
         return super().colour(features, directions)
+
+
+class SceneWithout(Field):
+    """A scene branch without an instance, so that a sampler looks past where it was.
+
+    belongs: true for points that go with the instance
+    """
+
+    def __init__(self, scene: HashField, belongs: Callable[[Tensor], Tensor]):
+        super().__init__()
+        self._held = scene, belongs  # in a tuple: the parameters are the scene's
+        self.space = scene.space
+
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Any]:
+        scene, belongs = self._held
+        density, features = scene.geometry(points)
+        return torch.where(belongs(points), 0.0, density), features
+
+    def density(self, points: Points, code: Codes | None = None) -> Densities:
+        scene, belongs = self._held
+        return torch.where(belongs(points), 0.0, scene.density(points))
+
+    def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
+        return self._held[0].colour(features, directions)
 
 
 class InstanceBoxes(nn.Module):
