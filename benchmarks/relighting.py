@@ -12,8 +12,10 @@ pictures: of whole ones before white, and of the pixels that the still life cove
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -29,7 +31,7 @@ from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
 from lumigraph.light import EnvironmentLight
 from lumigraph.methods.nerfactor import NeRFactor
-from lumigraph.run import build
+from lumigraph.run import Run, State, build, open_any
 from lumigraph.synthetic import lit, scenes
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
@@ -49,6 +51,7 @@ class Options:
     seconds: float | None = None
     views: int = 4  # held-out ones
     bounces: int = 0
+    geometry: Path | None = None  # a trained run of the same scene whose field is taken over; None learns it anew
     baselines: bool = True
     picture: Path | None = None
     output: Path | None = None
@@ -92,8 +95,16 @@ def main(options: Options) -> None:
 
 def trained(scene: Scene, o: Options, visibility: Literal["traced", "none"]) -> NeRFactor:
     config = replace(NeRFactor.cpu_preset(), visibility=visibility, light=o.light, seed=o.seed)
+    config = replace(config, geometry_share=0.0) if o.geometry else config
     method = build(NeRFactor, scene.frame, config, torch.device("cpu"), o.seed)
-    go_on_unless(fit(method, scene, steps=o.steps, seconds=o.seconds, show=False).signal)
+    with TemporaryDirectory() as folder:
+        run = Run.create(Path(folder) / "run", method, scene)
+        if o.geometry:
+            method.from_field(open_any(o.geometry).method(torch.device("cpu")), scene.cameras)
+            run.save(State(), method, method.optimizers(), torch.Generator().manual_seed(0))
+        begin = time.process_time()
+        go_on_unless(fit(method, scene, run, steps=o.steps, seconds=o.seconds, show=False, rehearsal=False).signal)
+        print(f"visibility {visibility}: learnt in {time.process_time() - begin:.0f} processor seconds", flush=True)
     return method.eval()
 
 
