@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ import tiny
 import torch
 from budgets import budget
 from PIL import Image
+from test_house import ROOT
+from test_paper_presets import NAMES
 
 from lumigraph import methods
 from lumigraph.camera import Camera
@@ -362,6 +365,14 @@ def test_every_method_that_refines_cameras_is_evaluated_with_its_poses(name):
     pairs = method.colour_pairs(left_half(scene.photograph(0)))
     (gradient,) = torch.autograd.grad(colour_error(*pairs(poses, torch.Generator().manual_seed(0))), [poses.twist])
     assert gradient[0].isfinite().all() and gradient[0].any() and not gradient[1:].any()
+
+
+def test_the_page_lists_the_methods_that_refine_cameras():
+    page = (ROOT / "docs" / "pose-refinement.md").read_text("utf-8")
+    (listed,) = re.findall(r"(?m)^(`.+`) have it\.", page)
+    assert set(re.findall(r"`([\w-]+)`", listed)) == {
+        name for name in NAMES if holds(methods.find(name).Config(), "refine_cameras")
+    }
 
 
 # Captures

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 import threading
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tiny
 from budgets import budget
+from captures import WRITERS, Tiny
 from PIL import Image
+from test_depth_readers import write_polycam, write_record3d, write_replica, write_scannet
 
 from lumigraph import files
 from lumigraph.capture import open_scene
@@ -64,10 +70,6 @@ def write_tum(folder: Path) -> Path:
     return folder
 
 
-def write_blender(folder: Path) -> Path:
-    return tiny.write_blender(folder, 4)
-
-
 def write_seven(folder: Path) -> Path:
     folder.mkdir()
     for i, pose in enumerate(tiny.poses(4)):
@@ -78,15 +80,29 @@ def write_seven(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("make", [zeros, os.mkfifo], ids=["device", "pipe"])
-@pytest.mark.parametrize("write", [write_blender, write_tum, write_seven])
-def test_no_capture_waits_for_a_file_that_never_ends(tmp_path, write, make):
-    folder = write(tmp_path / "capture")
+LAYOUTS: dict[str, Callable[[Path], object]] = {
+    **{name: partial(write, tiny=Tiny(4)) for name, write in WRITERS.items()},
+    "tum": write_tum,
+    "7-scenes": write_seven,
+    "replica": write_replica,
+    "scannet": write_scannet,
+    "polycam": write_polycam,
+    "record3d": write_record3d,
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_no_capture_waits_for_a_file_that_never_ends(tmp_path, name, monkeypatch):
+    """Files of a folder whose names differ in more than a number, each in turn replaced by a device or a pipe."""
+    monkeypatch.setitem(sys.modules, "liblzfse", SimpleNamespace(decompress=lambda data: data, error=RuntimeError))
+    folder = tmp_path / "capture"
+    LAYOUTS[name](folder)
     assert outcome(lambda: open_scene(folder)) == ""
-    for place in sorted(folder.iterdir()):
+    every = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    for number, place in enumerate({(path.parent, re.sub(r"\d+", "", path.name)): path for path in every}.values()):
         data = place.read_bytes()
         place.unlink()
-        make(place)
+        (zeros, os.mkfifo)[number % 2](place)
         said = outcome(lambda: open_scene(folder))  # refused, or left out as a missing one is
         assert "\n" not in said
         place.unlink()
@@ -101,6 +117,10 @@ def test_no_capture_waits_for_a_file_that_never_ends(tmp_path, write, make):
         ("composition.json", open_any),
         ("cloud.ply", open_any),
         ("cloud.spz", read_gaussians),
+        ("cloud.splat", read_gaussians),
+        ("cloud.sog", read_gaussians),
+        ("cloud.glb", read_gaussians),
+        ("cloud.4dgs", open_any),
         ("path.json", CameraPath.load),
         ("text", files.read_bytes),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -14,7 +15,9 @@ import tiny
 import torch
 
 from lumigraph.commands.cli import main
+from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
+from lumigraph.export.points import extract_points
 from lumigraph.system import threads, work
 from lumigraph.system.allocation import USER_SETTINGS
 from lumigraph.system.work import OPT_OUT
@@ -170,7 +173,7 @@ def test_the_watch_outlives_short_work_and_ends_after_it(watch, monkeypatch):
 
 
 @pytest.mark.skipif(not threads.TASKS_FOLDER.exists(), reason="tells what threads wait for by /proc")
-@pytest.mark.parametrize("way", ["fit", "render", "evaluate", "cli"])
+@pytest.mark.parametrize("way", ["fit", "render", "evaluate", "export", "cli"])
 def test_python_works_as_the_command_line_does(watch, monkeypatch, way, ball_run):
     """Every way enters the same watch and settles memory, so that steps take equally long."""
     settled = list[str]()
@@ -185,6 +188,9 @@ def test_python_works_as_the_command_line_does(watch, monkeypatch, way, ball_run
         method.render(scene.cameras[0])
     elif way == "evaluate":
         evaluate(method, scene, views=1)
+    elif way == "export":
+        with contextlib.suppress(LumigraphError):  # nothing of an untrained method is solid
+            extract_points(method, scene.cameras, count=10, size=8, views=2)
     else:
         assert main(["eval", str(ball_run.folder), "--views", "1"]) == 2  # its photographs are in memory alone
         assert main(["render", str(ball_run.folder), "--frames", "1", "--overwrite"]) == 0

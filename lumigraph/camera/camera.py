@@ -48,11 +48,13 @@ class Camera:
         return Camera(self.pose[keep], self.lens[keep], self.size[keep], time, image_index)
 
     def to(self, device: torch.device | str) -> Camera:
+        """The same cameras on a device; tensors that are there already are not copied."""
         time, image_index = (None if x is None else x.to(device) for x in (self.time, self.image_index))
         return Camera(self.pose.to(device), self.lens.to(device), self.size.to(device), time, image_index)
 
     @property
     def position(self) -> Float[Tensor, "camera 3"]:
+        """Centre of each camera in the world, in scene units."""
         return self.pose[:, :, 3]
 
     @property

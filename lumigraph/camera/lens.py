@@ -108,10 +108,12 @@ class Lens(ABC):
         return self._map(lambda x: x[one_or_more(index)])
 
     def to(self, device: torch.device | str) -> Lens:
+        """The same lenses on a device; tensors that are there already are not copied."""
         return self._map(lambda x: x.to(device))
 
     @property
     def device(self) -> torch.device:
+        """Device of the intrinsics."""
         return next(iter(self._numbers().values())).device
 
     def to_json(self) -> dict[str, Any]:

@@ -39,6 +39,7 @@ class Rays:
         return self._map(lambda x: x[index])
 
     def to(self, device: torch.device | str) -> Rays:
+        """The same rays on a device; tensors that are there already are not copied."""
         return self._map(lambda x: x.to(device))
 
     def at(self, t: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:

@@ -176,6 +176,11 @@ def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:
 def make_cameras(
     shots: list[Shot], poses: Float[np.ndarray, "camera 3 4"], lenses: list[Lens], sizes: Int[Tensor, "camera 2"]
 ) -> Camera:
+    """One batch of cameras, numbered as the shots. They have times only if all shots have one.
+
+    poses: camera-to-world, in the frame that the cameras shall have
+    sizes: (width, height) in pixels, to which the lenses are fitted
+    """
     times = [shot.time for shot in shots]
     time = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float32)
     return Camera(torch.from_numpy(poses).float(), Lens.cat(lenses), sizes, time, torch.arange(len(shots)))
@@ -220,6 +225,8 @@ def masked_by_lens(pictures: list[ImageSource], lenses: list[Lens]) -> list[Imag
 
 
 def with_mask(picture: ImageSource, trusted: np.ndarray, why: str) -> ImageSource:
+    """The picture with fewer trusted pixels. trusted: true where it may be; why: its part of the cache's key"""
+
     def read() -> tuple[np.ndarray, np.ndarray | None]:
         image, mask = picture.read()
         return image, trusted if mask is None else mask & trusted

@@ -20,30 +20,30 @@ HOLD_OUT = 8  # every so many members by name, the first one among them, as with
 class Dataset(Protocol):
     """Interface of training data for the trainer, the run and the evaluation.
 
-    kind:     what it holds, in a user's words: "photographs", "shapes", "a collection"
-    source:   the path that it came from, or "procedural:<name>"
-    frame:    bounds, and the way back to the source's frame; all that a method must know to be built
-    splits:   numbers of what it holds by purpose: "train", "test", maybe "val"
-    names:    what each of these is called
-    warnings: what the user should know about it, one sentence each
+    kind: contents in a user's words: "photographs", "shapes", "a collection"
     """
 
     kind: ClassVar[str]
 
     @property
-    def source(self) -> str: ...
+    def source(self) -> str:
+        """Path that it came from, or "procedural:<name>"."""
 
     @property
-    def frame(self) -> Frame: ...
+    def frame(self) -> Frame:
+        """Bounds, and the way back to the source's frame; all that a method must know to be built."""
 
     @property
-    def splits(self) -> Mapping[str, Int[Tensor, " item"]]: ...
+    def splits(self) -> Mapping[str, Int[Tensor, " item"]]:
+        """Numbers of its items by purpose: "train", "test", maybe "val"."""
 
     @property
-    def names(self) -> Sequence[str]: ...
+    def names(self) -> Sequence[str]:
+        """Names of its items, by number."""
 
     @property
-    def warnings(self) -> Sequence[str]: ...
+    def warnings(self) -> Sequence[str]:
+        """Sentences that a user should know about it."""
 
     def preview(self) -> Camera | None:
         """A camera whose picture shows how far training has come; None where there is nothing to look at."""

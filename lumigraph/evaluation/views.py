@@ -96,10 +96,12 @@ class Evaluation:
 
     @property
     def psnr(self) -> float:
+        """Mean PSNR in dB over the views; of a collection, over its members' means."""
         return mean(each.psnr for each in self._averaged)
 
     @property
     def ssim(self) -> float:
+        """Mean SSIM, likewise."""
         return mean(each.ssim for each in self._averaged)
 
     @property
@@ -136,6 +138,7 @@ class Evaluation:
 
     @property
     def seconds_per_view(self) -> float:
+        """Mean time to render a view."""
         return mean(view.seconds for view in self.views)
 
     @property
@@ -159,12 +162,14 @@ class Evaluation:
         return replace(self, views=views, members=members)
 
     def means(self) -> dict[str, Any]:
+        """PSNR, SSIM, LPIPS and the further means that are known, by the names of `eval.json`."""
         further = {name: getattr(self, name) for name in ("clean_psnr", "moving_psnr", "moving_ssim", "depth_error")}
         known = {name: value for name, value in further.items() if value is not None}
         return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
 
     @property
     def scores(self) -> list[Score]:
+        """The means as scores, then the errors of poses."""
         return [*scores_of(self.means()), *self.poses]
 
     @property

@@ -132,6 +132,7 @@ class Run(Trained):
         self.settings.write(self._config)
 
     def set_scale(self, scale: float) -> None:
+        """Remember the unit of exports. scale: see `Frame.scale`"""
         self.frame = replace(self.frame, scale=scale)
         self.settings = replace(self.settings, frame=self.frame)
         self.settings.write(self._config)
@@ -256,6 +257,7 @@ class Run(Trained):
 
     @property
     def has_state(self) -> bool:
+        """True if it has a checkpoint, so that it renders and resumes."""
         return bool(self._checkpoints)
 
     @property
@@ -376,6 +378,7 @@ def is_leftover(path: Path) -> bool:
 
 
 def versions() -> dict[str, str]:
+    """Versions of Python, the platform and the packages that results depend on, by name."""
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for package in ("lumigraph", "torch", "numba", "triton"):
         try:
