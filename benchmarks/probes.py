@@ -17,7 +17,7 @@ import dataclasses
 import io
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -49,7 +49,7 @@ GATHERED_RAYS = 512  # over a hemisphere, for the truth
 POINTS_PER_VIEW, VIEWS = 40, 16
 BARE = "#caption, #buttons, #wait { display: none !important } * { transition: none !important }"
 SOFTWARE = "--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --ignore-gpu-blocklist"
-BALL_COUNTS, SIZE = (6, 6, 4), 320  # probes, and pixels of the picture
+SIZE = 320  # pixels of a page's picture
 ALBEDO = float(linear_from_srgb(BALL_WHITE / 255))
 # Where the balls are: middle, radius, and the camera's position.
 ROOM_BALL = ((-0.05, 0.05, -0.25), 0.14, (0.45, -0.4, -0.05))
@@ -60,7 +60,11 @@ MATERIALS_BALL = ((0.05, 0.02, 0.1), 0.2, (1.0, -2.6, 1.4))
 class Options:
     output: Path = Path("probes")
     runs: tuple[Path, ...] = ()  # trained on procedural:room
+    parts: tuple[Literal["balls", "irradiance"], ...] = ("balls", "irradiance")
     counts: tuple[tuple[int, int, int], ...] = ((4, 4, 3), (8, 7, 5), (14, 12, 8))  # of grids
+    ball_counts: tuple[int, int, int] = (6, 6, 4)  # of the grids that light the balls
+    face_size: int = 32  # pixels along a side of the six pictures of each probe
+    scenes: str = ""  # beginning of the names of those with balls
     chromium: Path = Path("/usr/bin/chromium")
     webgl: str = SOFTWARE
 
@@ -153,7 +157,7 @@ def irradiance_rows(options: Options) -> list[dict[str, Any]]:
         found = [cut(g, order).irradiance(p[None], n[None]) for g, p, n in
                  zip(alone, raised[some], normals[some], strict=True)]  # fmt: skip
         rows.append({"probes": "at the points", "order": order, "error": error(torch.cat(found), near)})
-    sources = [("tracer", exact, stage.cameras["train"], None)]
+    sources = [("tracer", exact, stage.cameras["train"][::2], None)]
     for folder in options.runs:
         run = Run(folder)
         sources.append((run.method_name, run.method(), run.cameras()["train"], run.frame.to_export))
@@ -191,12 +195,15 @@ def ball_rows(options: Options) -> list[dict[str, Any]]:
     for folder in options.runs:
         run = Run(folder)
         cases.append((f"room, {run.method_name}", run.method(), room, ROOM_BALL))
+    cases = [case for case in cases if case[0].startswith(options.scenes)]
     rows = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=options.chromium, args=options.webgl.split())
         for name, method, stage, (middle, radius, eye) in cases:
             camera = pinhole(np.stack([look_at(eye, middle)]), 240, 50.0)
-            grid = bake_probes(method, None, method.frame.bounds, counts=BALL_COUNTS)
+            grid = bake_probes(
+                method, None, method.frame.bounds, counts=options.ball_counts, face_size=options.face_size
+            )
             scene = method.frame.to_source.inverse
             length = scene.scale
             place = tuple(scene.points(torch.tensor(middle)).tolist())
@@ -245,12 +252,12 @@ def truth_of(world: World, camera: Camera, middle: tuple, radius: float) -> tupl
 
 def main(options: Options) -> None:
     options.output.mkdir(parents=True, exist_ok=True)
-    balls = ball_rows(options)
+    balls = ball_rows(options) if "balls" in options.parts else []
     table = Table("scene", "ball, PSNR", "picture, PSNR")
     for row in balls:
         table.add_row(row["scene"], f"{row['ball']:.1f} dB", f"{row['picture']:.1f} dB")
     console().print(table)
-    rows = irradiance_rows(options)
+    rows = irradiance_rows(options) if "irradiance" in options.parts else []
     table = Table("probes", "order", "rms error", "median error")
     for row in rows:
         table.add_row(row["probes"], str(row["order"]), *(f"{100 * x:.1f} %" for x in row["error"]))

@@ -222,7 +222,7 @@ def draw(folder: Path, found: Scattering, pictures: Sequence[Sequence[Float[Tens
     and scattering.json, the figures."""
     names = ["truth", *(f"degree {fit.degree}" for fit in found.fits)]
     rows = [Row(name, [enlarged(shown(x)) for x in row]) for name, row in zip(names, pictures, strict=True)]
-    columns = ["the lamp as photographed", "the lamp moved 45 degrees", "from within the fog"]
+    columns = ["first lamp", "lamp moved 45°", "within the fog"]
     sheet = contact_sheet("Fog: a field of emission and absorption", columns, rows)
     save_picture(folder / "scattering.png", sheet, "figure")
     lamps = [Series(f"degree {fit.degree}", LAMPS, fit.moved) for fit in found.fits]
