@@ -154,6 +154,7 @@ class RemovalOptions:
     things: tuple[str, ...] = ("castle", "checks", "ball", "abacus")
     steps: int = 1500
     held_out: int = 8
+    samples: int = 1 << 15  # of a step of object-nerf
     identities: bool = False  # gaussian-splatting with identity codes as well
     output: Path = Path("objects-removal.json")
 
@@ -172,6 +173,8 @@ class RemovalOptions:
             config = kind_of.cpu_preset()
             if "splatting" in label:
                 config = replace(config, groups=replace(config.groups, objects="yes"))
+            else:
+                config = replace(config, occupancy=replace(config.occupancy, samples_per_step=self.samples))
             method = build(kind_of, scene.frame, replace(config, **changed), torch.device("cpu"), 0)
             begin = time.process_time()
             go_on_unless(fit(method, scene, steps=self.steps, show=False, rehearsal=False).signal)
