@@ -78,10 +78,8 @@ class Identities(Addition):
         """Random codes for a new cloud."""
         count = len(method.cloud)
         chance = method.random(5)
-        drawn = FIRST_DEVIATION * torch.randn(count, self.numbers.identity_code, generator=chance).to(
-            self.places.device
-        )
-        self._set(drawn, method.cloud.means.detach().clone())
+        drawn = FIRST_DEVIATION * torch.randn(count, self.numbers.identity_code, generator=chance)
+        self._set(drawn.to(self.places.device), method.cloud.means.detach().clone())
 
     def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
         """Codes for a cloud whose Gaussians were cloned, split or pruned: of the nearest old one."""
