@@ -2,7 +2,7 @@
 
     python benchmarks/objects.py strokes --scene procedural:still-life,size=200,views=60 --run RUN
     python benchmarks/objects.py removal --scene procedural:still-life,size=100,views=40 --steps 1500
-    python benchmarks/objects.py film --run RUN --strokes PNG --view NAME --into OTHER_RUN
+    python benchmarks/objects.py film --part can.ply --run RUN --into OTHER_RUN
 
 strokes: intersection over union of each thing of a procedural scene with its true mask over held-out views, after one,
 two and three strokes on one photograph. A stroke follows the longest path inside a region, as a hand would: the first
@@ -14,7 +14,7 @@ removal: things are removed, and held-out views compared with the scene traced w
 thing was seen. Photographs keep its shadow on the floor, so the truth behind has that shadow: the surface behind, lit
 as it was. `psnr without` has no removal at all. object-nerf learns with guidance and without it.
 
-film: what strokes select is lifted off its run, set into another one and filmed.
+film: what strokes have selected and `lumigraph segment` has extracted, set on the floor of another run.
 """
 
 from __future__ import annotations
@@ -35,8 +35,11 @@ from lumigraph import methods
 from lumigraph import synthetic as procedural
 from lumigraph.capture import open_scene
 from lumigraph.color.srgb import srgb_from_linear
+from lumigraph.composition import PickedCloud
+from lumigraph.exchange import read_gaussians
 from lumigraph.figures import Row, contact_sheet
-from lumigraph.geometry import evenly
+from lumigraph.gaussians import joined
+from lumigraph.geometry import Similarity, evenly
 from lumigraph.run import build, open_any
 from lumigraph.selection import Selection, Strokes, describe, distil_features, feature_network
 from lumigraph.synthetic.stage import told
@@ -44,6 +47,7 @@ from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 STROKES = 3
+STRIP = 6  # frames
 INNER = 2.5  # pixels from the edge of a region at which a stroke keeps, where there is room
 WORTH = 2.0  # pixels: half the thickness of a region that is worth a stroke
 BEHIND = 1e-3  # scene units in front of a surface, from where a ray sees it lit as it is
@@ -154,6 +158,7 @@ class RemovalOptions:
     things: tuple[str, ...] = ("castle", "checks", "ball", "abacus")
     steps: int = 1500
     held_out: int = 8
+    samples: int = 1 << 15  # of a step of object-nerf
     identities: bool = False  # gaussian-splatting with identity codes as well
     output: Path = Path("objects-removal.json")
 
@@ -172,6 +177,8 @@ class RemovalOptions:
             config = kind_of.cpu_preset()
             if "splatting" in label:
                 config = replace(config, groups=replace(config.groups, objects="yes"))
+            else:
+                config = replace(config, occupancy=replace(config.occupancy, samples_per_step=self.samples))
             method = build(kind_of, scene.frame, replace(config, **changed), torch.device("cpu"), 0)
             begin = time.process_time()
             go_on_unless(fit(method, scene, steps=self.steps, show=False, rehearsal=False).signal)
@@ -218,31 +225,35 @@ def hole_psnr(pictures: list[torch.Tensor], truths: list[tuple[torch.Tensor, tor
 
 @dataclass(frozen=True)
 class FilmOptions:
-    """A selected object of one run in another scene, as a strip of a film."""
+    """An extracted object on the floor of another scene, as a strip of a film."""
 
-    run: Path
-    strokes: Path
-    view: str
-    into: Path
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    scale: float = 1.0
-    frames: int = 6
-    output: Path = Path("objects-film")
+    part: Path  # splat file that `lumigraph segment` has written
+    run: Path  # the run that it was cut from
+    into: Path  # a run of Gaussians
+    view: int = 8  # photograph of that run in which the place is named
+    place: tuple[float, float] = (0.72, 0.88)  # of the object's foot on it, shares of width and height
+    height: float = 0.25  # of the object, in distances from that camera
+    output: Path = Path("objects-film.png")
 
     def conduct(self) -> None:
-        from lumigraph.commands.calls import call
-
-        self.output.mkdir(parents=True, exist_ok=True)
-        part, both = self.output / "part.ply", self.output / "both.json"
-        call("segment", self.run, strokes=self.strokes, view=self.view, output=part, overwrite=True)
-        call("compose", self.into, part, at=self.at, scale=self.scale, output=both, overwrite=True)
-        opened = open_any(both)
-        method, cameras = opened.method(), opened.cameras()["train"]
-        shown = [method.render(cameras[i].resized(300 / int(cameras[i].size.max()))).rgb for i in self.chosen(cameras)]
-        contact_sheet("", ("",) * len(shown), [Row("", shown)], 300).save(self.output / "strip.png")
-
-    def chosen(self, cameras: Any) -> list[int]:
-        return [int(i) for i in evenly(range(len(cameras)), self.frames)]
+        own, other = open_any(self.run), open_any(self.into)
+        part = read_gaussians(self.part).transformed(own.frame.to_source.inverse.matrix)
+        solid = part.means[part.opacities.sigmoid() > 0.3]
+        low, high = torch.quantile(solid, torch.tensor([0.05, 0.95]), dim=0)
+        foot = torch.tensor([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]).double()
+        cameras, method = other.cameras()["train"], other.method()
+        camera = cameras[self.view]
+        depth = method.render(camera).depth
+        row, column = (int(share * n) for share, n in zip(reversed(self.place), depth.shape, strict=True))
+        rays = camera.rays(camera.pixels())
+        goal = rays.at(depth.flatten().nan_to_num(1, 1))[row * depth.shape[1] + column].double()
+        scale = self.height * float(depth[row, column]) / float(high[2] - low[2])
+        moved = part.transformed(Similarity.make(scale, None, goal - scale * foot).matrix)
+        both = PickedCloud(other.frame, joined([method.gaussians(), moved]))
+        order = evenly(cameras.position[:, 0].argsort().tolist(), STRIP)
+        shown = [both.render(cameras[i]).rgb for i in order]
+        rows = [Row("", shown[i : i + STRIP // 2]) for i in range(0, STRIP, STRIP // 2)]
+        contact_sheet("", ("",) * (STRIP // 2), rows, 360).save(self.output)
 
 
 Chosen = (

@@ -19,7 +19,7 @@ from lumigraph.methods.object_nerf.fields import InstanceBoxes
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 
-pytestmark = budget("methods", 8)
+pytestmark = budget("methods", 12)
 
 
 def new(frame=None, **numbers):

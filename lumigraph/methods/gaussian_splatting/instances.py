@@ -23,6 +23,7 @@ from ...gaussians import Gaussians, joined
 from ...method.controls import Control
 
 CHANNELS = 4  # numbers that one pass of the rasteriser composites: three colours and a depth
+FIRST_DEVIATION = 0.1  # of the numbers of codes at first
 MIN_SHARE = 0.4  # probability from which on a Gaussian belongs to the instance that it most likely shows
 
 
@@ -77,8 +78,8 @@ class Identities(Addition):
         """Random codes for a new cloud."""
         count = len(method.cloud)
         chance = method.random(5)
-        drawn = torch.randn(count, self.numbers.identity_code, generator=chance).to(self.places.device)
-        self._set(drawn, method.cloud.means.detach().clone())
+        drawn = FIRST_DEVIATION * torch.randn(count, self.numbers.identity_code, generator=chance)
+        self._set(drawn.to(self.places.device), method.cloud.means.detach().clone())
 
     def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
         """Codes for a cloud whose Gaussians were cloned, split or pruned: of the nearest old one."""

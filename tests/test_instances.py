@@ -1,0 +1,128 @@
+"""Instances of clouds: identity codes by the rasteriser, neighbours that agree, codes that follow the cloud, edits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+from balls import BLUE, RED, WHITE, Splatted, eye
+from budgets import budget
+
+from lumigraph.components.clouds.addition import Step
+from lumigraph.components.instances import edit_of
+from lumigraph.datasets.scene import Photograph
+from lumigraph.gaussians import joined
+from lumigraph.gaussians.splatting import splat, view_of
+from lumigraph.methods.gaussian_splatting import GaussianSplatting
+from lumigraph.methods.gaussian_splatting.instances import Identities, InstanceNumbers
+from lumigraph.run import build
+from lumigraph.selection.distilled import CloudWeigher
+
+pytestmark = budget("methods", 5)
+
+NUMBERS = InstanceNumbers(
+    "yes", instances=2, identity_code=4, identity_lr=0.1, classifier_lr=0.1, neighbour_samples=512
+)
+EYES = (-3.0, 0.3, 0.8), (0.2, -3.0, 0.5), (3.0, 0.2, 0.3), (-0.3, 3.0, 0.9)
+
+
+def method_of(cloud, numbers=NUMBERS):
+    config = replace(GaussianSplatting.smallest(), groups=numbers, sh_degree=0)
+    method = build(GaussianSplatting, WHITE, config, torch.device("cpu"), 0)
+    method.begin_with(cloud, eye(EYES[0]))
+    return method
+
+
+def two_balls():
+    return joined([Splatted(RED, 0.3, (0.0, -0.4, 0.0)).cloud, Splatted(BLUE, 0.3, (0.0, 0.4, 0.0)).cloud])
+
+
+def step_at(method, camera):
+    """A training step on a photograph whose labels are 0 on the red ball, 1 on the blue one."""
+    cloud = method.cloud.gaussians()
+    picture = splat(cloud, view_of(camera, 0.01), 1)
+    seen, red = picture.opacity > 0.5, picture.rgb[..., 0] > picture.rgb[..., 2]
+    labels = torch.where(seen, torch.where(red, 0, 1), -1)
+    photograph = Photograph(camera, picture.rgb, seen.float(), extra={"labels": labels})
+    step = Step(photograph, torch.Generator().manual_seed(0), cloud, cloud, camera)
+    step.picture = picture
+    return step
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    method = method_of(two_balls())
+    optimizers = method.identities.optimizers()
+    for turn in range(60):
+        step = step_at(method, eye(EYES[turn % 4]))
+        method.identities.regularize(method, step)
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        sum(step.terms.values()).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+    return method.eval()
+
+
+def test_masks_teach_each_gaussian_its_instance(learnt):
+    labels = learnt.identities.labels(learnt.cloud.gaussians())
+    truth = torch.arange(3000) // 1500
+    weigher, ones = CloudWeigher(learnt.cloud.gaussians(), 0.01), torch.ones(33, 33, 1)
+    seen = sum(weigher.sums(eye(place), ones)[:, 0] for place in EYES) > 0.05
+    assert (labels == truth)[seen].float().mean() > 0.97 and (labels == truth).float().mean() > 0.9
+
+
+def test_identities_change_nothing_else():
+    """Gradients reach codes and classifier alone."""
+    method = method_of(two_balls())
+    step = step_at(method, eye(EYES[0]))
+    method.identities.regularize(method, step)
+    sum(step.terms.values()).backward()
+    assert method.identities.codes.grad.abs().sum() > 0 and method.identities.classifier.weight.grad.abs().sum() > 0
+    assert all(p.grad is None or not p.grad.any() for p in method.cloud.parameters())
+
+
+def test_neighbours_agree_when_their_codes_do():
+    identities = Identities(NUMBERS, 200)
+    identities._set(torch.ones(200, 4), torch.randn(200, 3, generator=torch.Generator().manual_seed(0)))
+    chance = torch.Generator().manual_seed(1)
+    assert float(identities.disagreement(chance).detach()) == pytest.approx(0, abs=1e-6)
+    identities._set(torch.randn(200, 4, generator=chance) * 5, identities.places)
+    assert float(identities.disagreement(chance).detach()) > 0.1
+
+
+def test_codes_follow_a_cloud_that_changes():
+    cloud = two_balls()
+    method = method_of(cloud)
+    codes = method.identities.codes.detach().clone()
+    order = torch.tensor([5, 5, 2000])
+    method.identities.follow(cloud.means[order])
+    assert torch.equal(method.identities.codes.detach(), codes[order])
+    method.identities.prune(torch.tensor([True, False, True]))
+    assert torch.equal(method.identities.codes.detach(), codes[order[[0, 2]]])
+
+
+def test_an_instance_is_removed_moved_copied_and_alone(learnt):
+    camera = eye(EYES[0])
+    whole = learnt.render(camera)
+    assert [x.name for x in learnt.controls][-5:] == ["edit", "shift_x", "shift_y", "shift_z", "turn"]
+    gone = learnt.given(edit="remove 0")
+    assert len(gone.gaussians()) < 1600 and gone.render(camera).opacity.sum() < 0.7 * whole.opacity.sum()
+    alone = learnt.given(edit="alone 0").render(camera)
+    assert (alone.rgb[alone.opacity > 0.9][:, 0] > 0.7).float().mean() > 0.95
+    assert len(learnt.given(edit="copy 0", shift_z=0.5).gaussians()) > 4300
+    moved = learnt.given(edit="move 0", shift_z=0.5).gaussians()
+    assert len(moved) == 3000 and moved.means[:, 2].max() > 0.7
+    assert edit_of(learnt.given(edit="move 0")) is None
+    assert torch.equal(learnt.given(edit="move 0").render(camera).rgb, whole.rgb)
+
+
+def test_alpha_is_a_mask_where_there_are_no_labels():
+    assert tiny.scene().images.has_alpha
+    method = method_of(two_balls())
+    step = step_at(method, eye(EYES[0]))
+    step.photograph.extra.clear()
+    method.identities.regularize(method, step)
+    assert method.identities.seen.tolist() == [True, False]
