@@ -75,17 +75,19 @@ def main(options: Options) -> None:
         truth_of(scene, i, o) for i in scene.splits["test"].tolist()[:: max(1, len(scene.splits["test"]) // o.views)]
     ]
     truths = truths[: o.views]
+    found, pictures = dict[str, Any](), dict[str, dict[int, Tensor]]()
+
+    def note(title: str, method: NeRFactor, ambient: bool = False) -> None:
+        figures = measured(method, truths, o, ambient)
+        pictures[title] = figures.pop("pictures")
+        found[title] = figures
+        print(f"{title:20} " + "  ".join(f"{key} {value:.2f}" for key, value in figures.items()), flush=True)
+
     full = trained(scene, o, "traced")
-    found = {"nerfactor": measured(full, truths, o)}
-    pictures = {"nerfactor": found["nerfactor"].pop("pictures")}
+    note("nerfactor", full)
     if o.baselines:
-        flat = trained(scene, o, "none")
-        found["without visibility"] = measured(flat, truths, o)
-        pictures["without visibility"] = found["without visibility"].pop("pictures")
-        found["ambient light alone"] = measured(full, truths, o, ambient=True)
-        pictures["ambient light alone"] = found["ambient light alone"].pop("pictures")
-    for title, values in found.items():
-        print(f"{title:20} " + "  ".join(f"{key} {value:.2f}" for key, value in values.items()))
+        note("ambient light alone", full, ambient=True)
+        note("without visibility", trained(scene, o, "none"))
     if o.picture:
         rows = [Row(f"light {k}", [truths[0].relit[k], *(pictures[title][k] for title in pictures)]) for k in o.lights]
         save_picture(o.picture, contact_sheet(name, ["truth", *pictures], rows))

@@ -1,6 +1,7 @@
 """A film strip of a real capture under a moving sun, from a trained run.
 
-    lumigraph train instant-ngp banana --downscale 2 --seconds 90 --output RUN
+    lumigraph capture banana --output SCENE
+    lumigraph train instant-ngp SCENE --downscale 2 --seconds 90 --output RUN
     python benchmarks/relighting_film.py RUN --steps 600 --picture sun.jpg
 
 NeRFactor takes over the run's field, learns materials and light from the photographs, and shows one camera's view in

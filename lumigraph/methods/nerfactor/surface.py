@@ -62,7 +62,7 @@ class SurfaceGrid(Part):
         return 8 * math.prod(math.ceil((b - a) / side) + 2 * MARGIN for a, b in zip(low, high, strict=True))
 
     @torch.no_grad()
-    def fill(self, density: Callable[[Tensor], Tensor], chance: torch.Generator, samples: int = 4) -> None:
+    def fill(self, density: Callable[[Tensor], Tensor], chance: torch.Generator, samples: int = 2) -> None:
         """Take a field's density at random places of each cell."""
         index = torch.stack(torch.meshgrid(*(torch.arange(n) for n in self.extinction.shape), indexing="ij"), -1)
         for part, cells in zip(
