@@ -366,11 +366,8 @@ def trained(ball_folder, tmp_path, monkeypatch):
 
 def test_segment_cuts_a_field_into_a_composition(trained, capsys):
     run, scene = trained
-    name = scene.names[1]
-    assert (
-        main(["segment", "ball", "--strokes", "s.png", "--view", name, "--output", "rest.json", "--action", "delete"])
-        == 0
-    )
+    name, said = scene.names[1], ["segment", "ball", "--strokes", "s.png"]
+    assert main([*said, "--view", name, "--output", "rest.json", "--action", "delete"]) == 0
     part = json.loads(Path("rest.json").read_text())["parts"][0]
     assert part["keep"] == "outside" and part["mask"] == "rest.mask.safetensors"
     whole, rest = run.method(), open_any("rest.json").method()

@@ -23,9 +23,9 @@ from lumigraph.run import Run, build
 
 SIZE, FOCAL, DISTANCE = 24, 32.0, 3.0
 # Boxes around a half and a quarter of the ball, for methods that need some.
+HALF, QUARTER = ("half", (0.7, 1.3, 1.3), (0.35, 0.0, 0.0)), ("quarter", (0.7, 0.65, 1.3), (-0.35, 0.33, 0.0))
 TRACKS = tuple(
-    BoxTrack(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),))
-    for name, size, place in (("half", (0.7, 1.3, 1.3), (0.35, 0, 0)), ("quarter", (0.7, 0.65, 1.3), (-0.35, 0.33, 0)))
+    BoxTrack(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),)) for name, size, place in (HALF, QUARTER)
 )
 
 # What a user would do by putting a file into lumigraph/methods/.

@@ -1,5 +1,6 @@
 """Composition: several methods in one picture with mutual occlusion, and parts of one method."""
 
+from ..system import kernel_cache as kernel_cache
 from .composed import Composed as Composed
 from .composed import PickedCloud as PickedCloud
 from .composed import compose as compose

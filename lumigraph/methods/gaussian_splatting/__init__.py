@@ -111,5 +111,4 @@ class GaussianSplatting(CloudMethod):
             adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
             poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
             photographs=AppearanceNumbers(appearance="no"),
-            groups=InstanceNumbers(objects="yes", instances=4, identity_code=4, identity_lr=0.05, neighbour_samples=32),
         )
