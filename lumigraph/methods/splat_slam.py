@@ -250,7 +250,7 @@ class SplatSlam(Method):
         points = frame.rays[pixels].at(frame.depth[pixels])
         deviation = sensor_deviation(frame.depth[pixels] / self.unit) / TRUNCATION
         rgb, steps = frame.rgb[pixels], t.alignment_iterations
-        return aligned(field, pose, points, rgb, deviation, COLOUR_DEVIATION, steps).pose
+        return aligned(field, pose, points, rgb, deviation, COLOUR_DEVIATION, self.unit, steps).pose
 
     # Densification (section 3.3)
 

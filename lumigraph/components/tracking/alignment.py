@@ -21,6 +21,8 @@ GREY = (0.299, 0.587, 0.114)  # of red, green, blue in luminance
 MIN_POINTS = 50  # in the band of the field, below which a pose is not determined
 SENSOR_DEVIATION = 0.005, 0.0025  # metres: of depth, and of its square by the metre (Khoshelham and Elberink 2012)
 COLOUR_DEVIATION = 0.08  # of luminance
+MOTION_DEVIATION = 0.01, 0.02  # of a frame's motion from the first estimate: radians, metres
+INDEPENDENT_SHARE = 0.01  # of the points, whose errors count as independent beside that
 SMALL_TURN, SMALL_SHIFT = 1e-5, 1e-5  # radians and scene units of a last step
 
 
@@ -42,6 +44,7 @@ def aligned(
     rgb: Float[Tensor, "point 3"],
     deviation: Float[Tensor, " point"],
     colour_deviation: float,
+    unit: float,
     iterations: int,
 ) -> Aligned:
     """The pose at which points lie on the field's surface.
@@ -50,9 +53,14 @@ def aligned(
     points:    in the camera's frame
     deviation: standard deviation of each point's distance, over the truncation
     colour_deviation: of luminance; 0: distance alone
-    Luminance is compared after a gain and an offset by least squares, for the camera's exposure changes.
+    unit:      scene units of a metre
+    Luminance is compared after a gain and an offset by least squares, for the camera's exposure changes. A prior keeps
+    the pose near the first one in directions that points and colours do not determine, as along a bare wall.
     """
     grey, share = rgb @ rgb.new_tensor(GREY), 0.0
+    turn, shift = MOTION_DEVIATION
+    known = torch.tensor([turn] * 3 + [shift * unit] * 3, dtype=torch.float64, device=points.device).pow(-2)
+    known, motion = known * INDEPENDENT_SHARE * len(points), torch.zeros_like(known)
     for _ in range(iterations):
         world = (points @ pose[:, :3].T + pose[:, 3]).requires_grad_()
         distance, colour = field(world)
@@ -69,9 +77,10 @@ def aligned(
             gain, error = exposed(lum.detach(), grey, band)
             more = normal_equations(error / colour_deviation, gain * slope / colour_deviation, arm, band)
             hessian, gradient = hessian + more[0], gradient + more[1]
+        hessian, gradient = hessian + known.diag(), gradient + known * motion
         damped = hessian + DAMPING * hessian.diagonal().diag() + 1e-9 * torch.eye(6).to(hessian)
         step = -torch.linalg.solve(damped, gradient)
-        pose = moved(pose[None], step[None].to(pose))[0]
+        pose, motion = moved(pose[None], step[None].to(pose))[0], motion + step
         if step[:3].norm() < SMALL_TURN and step[3:].norm() < SMALL_SHIFT:
             break
     return Aligned(pose, share)

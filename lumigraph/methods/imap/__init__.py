@@ -239,7 +239,7 @@ class IMap(FieldMethod):
             return field.distance_of(features), field.colour(features, world)  # the direction does not matter
 
         rgb = frame.rgb[pixels]
-        return aligned(seen, pose, points, rgb, deviation, COLOUR_DEVIATION, t.alignment_iterations).pose
+        return aligned(seen, pose, points, rgb, deviation, COLOUR_DEVIATION, self.unit, t.alignment_iterations).pose
 
     # Mapping (section 3.3)
 
