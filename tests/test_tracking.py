@@ -109,7 +109,7 @@ def test_velocity_is_constant():
 @pytest.mark.parametrize("colours", [0.0, 0.05])
 def test_alignment_finds_the_motion(colours):
     """A corner of three planes, whose colours vary: rotation and shift are found from points on it. With two planes
-    alone, colours find the shift along both."""
+    alone, colours find the shift along both. The prior holds so large a motion back by 0.0046 and 0.0023."""
     chance = torch.Generator().manual_seed(0)
     points = torch.rand(3000, 3, generator=chance)
     planes = 2 if colours else 3
@@ -123,9 +123,9 @@ def test_alignment_finds_the_motion(colours):
     truth = rigid(moved(torch.eye(3, 4)[None], torch.tensor([[0.03, -0.05, 0.02, 0.04, -0.03, 0.02]])))[0]
     rgb = field(points)[1] * 0.8 + 0.05  # another exposure
     local = (points - truth[:, 3]) @ truth[:, :3]
-    found = aligned(field, torch.eye(3, 4), local, rgb, torch.full((3000,), 0.03), colours, 25)
+    found = aligned(field, torch.eye(3, 4), local, rgb, torch.full((3000,), 0.03), colours, 100.0, 25)
     turn, shift = relative(truth, found.pose)
-    assert shift.norm() < 2e-3 and (turn - torch.eye(3)).norm() < 4e-3 and found.share > 0.99
+    assert shift.norm() < 2.5e-3 and (turn - torch.eye(3)).norm() < 5e-3 and found.share > 0.99
 
 
 def corner(count: int, seed: int) -> torch.Tensor:

@@ -22,7 +22,7 @@ MIN_POINTS = 50  # in the band of the field, below which a pose is not determine
 SENSOR_DEVIATION = 0.005, 0.0025  # metres: of depth, and of its square by the metre (Khoshelham and Elberink 2012)
 COLOUR_DEVIATION = 0.08  # of luminance
 MOTION_DEVIATION = 0.01, 0.02  # of a frame's motion from the first estimate: radians, metres
-INDEPENDENT_SHARE = 0.01  # of the points, whose errors count as independent beside that
+INDEPENDENT_SHARE = 0.003  # of the points, whose errors count as independent beside that
 SMALL_TURN, SMALL_SHIFT = 1e-5, 1e-5  # radians and scene units of a last step
 
 
