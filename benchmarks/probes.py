@@ -209,7 +209,7 @@ def ball_rows(options: Options) -> list[dict[str, Any]]:
             place = tuple(scene.points(torch.tensor(middle)).tolist())
             seen_from = camera.transformed(scene.matrix)
             path = options.output / f"{name.replace(', ', '-').replace(' ', '-')}.html"
-            probes_page(path, method, seen_from, grid, name, place=(place, 2 * radius * length), longest=SIZE)
+            probes_page(path, method, seen_from, grid, name, place=(place, 2 * radius * length), side=SIZE)
             flat = flat_camera(camera, SIZE)
             size = flat.size[0].tolist()
             page = browser.new_page(viewport={"width": size[0], "height": size[1]})

@@ -39,8 +39,8 @@ class Segment:
     view: UseAppendAction[Annotated[tuple[str, ...], needed("NAME")]]
     """Photograph that the strokes were drawn on, by its name."""
     output: Annotated[Path, needed("NEW")]
-    """Of Gaussians, a splat file such as .ply, or with extract and delete a folder for a run; of a field, a composition
-    (.json); with --action masks, a folder."""
+    """The new file: for Gaussians a splat file such as .ply (with extract and delete also a folder, a run), for a field
+    a composition (.json); with --action masks a folder."""
     action: Action = "extract"
     """extract: the part alone; delete: all else; recolour: the part in another colour; move: the part elsewhere;
     masks: a label picture for each photograph, 1 on the part, to train object-nerf on."""

@@ -28,7 +28,7 @@ from ..paths.opening import opening_of_scene
 from ..probes import FREE, ProbeGrid
 from .page import page_bytes, webp
 
-LONGEST = 960  # pixels of the picture's longer side
+PICTURE_SIDE = 960  # pixels of the picture's longer side
 PROBES_ACROSS = 32  # probes in a row of a texture
 MESH_SHARE = 0.22  # longest side of the mesh, as a share of the box's shortest one
 BALL_WHITE = 230  # of the default ball, sRGB-encoded
@@ -44,16 +44,16 @@ def probes_page(
     title: str,
     mesh: Path | None = None,
     place: tuple[Vector, float] | None = None,
-    longest: int = LONGEST,
+    side: int = PICTURE_SIDE,
 ) -> None:
     """Write the page. The picture is what a camera sees, flat; the mesh begins in its middle.
 
     camera: in the scene's frame
     mesh:   its file; None for a white ball
     place:  position of the mesh's middle in the scene's frame, and length of its longest side, where they are given
-    longest: pixels of the picture's longer side
+    side:   pixels of the picture's longer side
     """
-    flat = flat_camera(camera, longest).to("cpu")
+    flat = flat_camera(camera, side).to("cpu")
     seen = method.render(flat.to(method.device)).cpu()
     solid = (seen.opacity > MIN_SURFACE_OPACITY) & seen.depth.isfinite()
     if not solid.any():
@@ -63,8 +63,8 @@ def probes_page(
     shown = ball() if mesh is None else ShadedMesh.of(read_shape(mesh, mesh.stem).mesh)
     extent = shown.vertices.amax(0) - shown.vertices.amin(0)
     low, high = torch.tensor(method.frame.bounds)
-    side = MESH_SHARE * float((high - low).min()) if place is None else place[1]
-    scale = side / float(extent.max())
+    length = MESH_SHARE * float((high - low).min()) if place is None else place[1]
+    scale = length / float(extent.max())
     lift = 0.5 * float(extent.max())
     position = middle_of(points, normals, solid, lift * scale) if place is None else torch.tensor(place[0])
     a, b, c = shown.vertices[shown.faces].unbind(1)
@@ -102,9 +102,9 @@ def probes_page(
     write_bytes(path, page_bytes("probes", settings, gzip.compress(data, 9, mtime=0), HELP), "page")
 
 
-def flat_camera(camera: Camera, longest: int = LONGEST) -> Camera:
+def flat_camera(camera: Camera, side: int = PICTURE_SIDE) -> Camera:
     """A pinhole camera in place of any, with the same position, heading and shape of picture."""
-    size = film_size(camera, longest)
+    size = film_size(camera, side)
     focal = 0.5 * min(size) / math.tan(0.5 * angle_of_view(camera))
     middle = torch.tensor([[size[0] / 2, size[1] / 2]])
     return Camera(camera.pose, Pinhole(torch.full((1, 2), focal), middle), torch.tensor([size]))
