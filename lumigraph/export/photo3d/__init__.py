@@ -78,9 +78,10 @@ def photo3d(scene: Scene, size: int, views: int = MAX_PHOTOGRAPHS) -> Photo3D:
     share = sum(float(seen.solid.float().mean()) for seen in maps) / len(maps)
     distance = float(sure.median()) if len(sure) else scene.frame.near * 4
     flat = share < MIN_SURE or 2 * spread < MIN_PARALLAX * distance
+    blind = [scene.names[number] for number, seen in zip(numbers, maps, strict=True) if not seen.solid.any()]
     if flat:
         inverse = [torch.full_like(seen.depth, 1 / distance) for seen in maps]
-    elif blind := [scene.names[int(seen.camera.image_index)]  # type: ignore[arg-type] for seen in maps if not seen.solid.any()]:
+    elif blind:
         raise LumigraphError(
             f"{scene.source}: {', '.join(blind)} shares too little with the others for any depth; a 3-D photograph "
             "needs neighbouring photographs, so name a folder of those alone, or train a method for a walk around"
