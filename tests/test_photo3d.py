@@ -17,6 +17,7 @@ from lumigraph.depth_maps import DepthMap
 from lumigraph.errors import LumigraphError
 from lumigraph.export import photo3d as room
 from lumigraph.export.photo3d import layers, stitching
+from lumigraph.geometry import evenly
 
 pytestmark = budget("exports", 6)
 
@@ -101,13 +102,23 @@ def given_depth(monkeypatch):
 
 
 def test_a_burst_from_one_place_becomes_a_panorama(given_depth):
-    assert not room.photo3d(ball(), 90).flat
+    assert not room.photo3d(ball(), 90, views=3).flat
     given_depth[:] = [0.0, 0.001, 0.002]
-    assert room.photo3d(ball(), 90).flat
+    assert room.photo3d(ball(), 90, views=3).flat
+
+
+def test_a_photograph_without_any_depth_is_named(given_depth, monkeypatch):
+    maps = [seen_from(x) for x in given_depth]
+    maps[1] = DepthMap.measured(maps[1].camera, torch.full_like(maps[1].depth, torch.nan), maps[1].rgb)
+    monkeypatch.setattr(room, "depth_of", lambda *_: maps)
+    scene = ball()
+    name = scene.names[evenly(scene.splits["train"].tolist(), 3)[1]]
+    with pytest.raises(LumigraphError, match=f"{name} shares too little with the others"):
+        room.photo3d(scene, 90, views=3)
 
 
 def test_a_page_holds_the_picture_and_the_reach(given_depth, tmp_path):
-    found = room.photo3d(ball(), 90)
+    found = room.photo3d(ball(), 90, views=3)
     assert found.reach == pytest.approx(0.3, abs=1e-3)
     room.write_page(tmp_path / "photo.html", found, "A square")
     page = (tmp_path / "photo.html").read_text()
