@@ -132,6 +132,20 @@ def test_one_photograph_is_a_fault():
         room.photo3d(alone, 90)
 
 
+def test_photographs_without_poses_are_captured_first(tmp_path, monkeypatch, ball_folder, capsys):
+    (bare := tmp_path / "burst").mkdir()
+    for picture in sorted(ball_folder.rglob("*.png"))[:3]:
+        (bare / picture.name).write_bytes(picture.read_bytes())
+
+    def refused(photographs, *_):
+        raise LumigraphError(f"no features in {photographs[0]}")
+
+    monkeypatch.setattr("lumigraph.commands.capture.find_cameras", refused)
+    monkeypatch.chdir(tmp_path)
+    assert main(["photo3d", str(bare), str(tmp_path / "photo.html")]) == 2
+    assert f"no features in {bare}" in capsys.readouterr().err
+
+
 def test_an_ending_that_is_neither_page_nor_mesh_is_a_fault(ball_folder, tmp_path, capsys):
     assert main(["photo3d", str(ball_folder), str(tmp_path / "photo.png")]) == 2
     assert "ends in .html or .glb" in capsys.readouterr().err
