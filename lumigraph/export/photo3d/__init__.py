@@ -39,7 +39,7 @@ MAX_LATITUDE = 80.0  # degrees
 TEXELS = 2  # of the texture along each side of a pixel of the panorama
 ZOOM = 0.85  # of a page's angle of view to a photograph's, so that borders stay outside
 NEAR_SHARE, FAR_SHARE = 0.02, 100.0  # of the distance to the focus: what a page draws
-MAX_REACH = 0.15  # of a page's camera from the middle: share of its distance to the focus, beyond which edges open too wide
+MAX_REACH = 0.15  # of a page's camera from the middle: share of its distance to the focus; farther, edges open wide
 
 
 @dataclass(frozen=True)
