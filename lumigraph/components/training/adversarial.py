@@ -18,8 +18,8 @@ DEVIATION_GROUP = 4  # pictures over which the minibatch deviation is taken (Kar
 SMALLEST = 4  # pixels across, at which the discriminator decides
 EPSILON = 1e-8
 
-Pictures = Float[Tensor, "picture channel height width"]
-Logits = Float[Tensor, "picture"]
+Pictures = Float[Tensor, "picture _ _ _"]
+Logits = Float[Tensor, " picture"]
 
 
 # Losses
@@ -30,7 +30,7 @@ def generator_loss(fake: Float[Tensor, "*logits"]) -> Tensor:
     return softplus(-fake).mean()
 
 
-def discriminator_loss(real: Float[Tensor, "*logits"], fake: Float[Tensor, "*logits"]) -> Tensor:
+def discriminator_loss(real: Float[Tensor, "*real"], fake: Float[Tensor, "*fake"]) -> Tensor:
     """-log sigmoid(D(x)) - log(1 - sigmoid(D(G(z)))) (Goodfellow 2014, eq. 1)."""
     return softplus(-real).mean() + softplus(fake).mean()
 

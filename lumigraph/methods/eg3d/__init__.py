@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from ...budget import Effort, Efforts
 from ...camera import Camera
+from ...camera.lens import Pinhole
 from ...camera.rays import Rays, Rendering, Samples
 from ...components.fields.appearance import fitted
-from ...components.fields.kept_photographs import Kept, chance, photographed
+from ...components.fields.kept_photographs import Kept, chance, photographed, square
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
 from ...components.sampling.spaces import Box
 from ...components.training.adversarial import (
@@ -191,11 +192,11 @@ class EG3D(Method):
     def cpu_preset(cls) -> Any:
         """The same design for pictures of 64 pixels."""
         c = Config(picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2)
-        c = replace(c, super_widths=(32, 16), plane_size=64, plane_channels=16, features=16, decoder_width=32)
-        c = replace(c, film_width=64, film_layers=4, coarse_samples=12, fine_samples=8)
+        c = replace(c, super_widths=(32, 16), plane_size=64, plane_channels=16, features=8, decoder_width=32)
+        c = replace(c, film_width=64, film_layers=4, coarse_samples=8, fine_samples=6)
         c = replace(c, density_scale=10.0, density_shift=-3.0, code=64, style=128)
-        c = replace(c, channel_base=2048, channel_most=128, pictures_per_step=8, r1_weight=1.0)
-        c = replace(c, swap_pictures=10_000, blur_deviation=1.0, blur_pictures=5000, average_pictures=2000)
+        c = replace(c, channel_base=1024, channel_most=128, pictures_per_step=4, r1_weight=2.0)
+        c = replace(c, swap_pictures=10_000, blur_deviation=1.0, blur_pictures=2000, average_pictures=1000)
         return replace(c, code_steps=150, tune_steps=150)
 
     @classmethod
@@ -328,16 +329,16 @@ class EG3D(Method):
         cameras: Camera,
         random: torch.Generator | None = None,
     ) -> tuple[Pictures, Pictures]:
-        """Pictures of fields, each through a camera of its own, and their volume renderings."""
-        c, size = self.config, int(self.size)
-        small = cameras.resized(size / c.picture_size)
+        """Pictures of fields, each through a camera of its own, and their volume renderings. All cameras have one size."""
+        small = cameras.resized(int(self.size) / self.config.picture_size)
+        (columns, rows), (width, height) = small.size[0].tolist(), cameras.size[0].tolist()
         pixels = small[0].pixels()
         index = torch.arange(len(cameras), device=self.device).repeat_interleave(len(pixels))
         rays = small.rays(pixels.repeat(len(cameras), 1), index)
         seen = self._seen(generator.field, made, rays, random)
         features = torch.cat([seen.rgb, seen.extra["features"]], -1)
-        features = features.view(len(cameras), size, size, -1).permute(0, 3, 1, 2)
-        return self._upscaled(generator, features, style, (c.picture_size,) * 2), features[:, :3]
+        features = features.view(len(cameras), rows, columns, -1).permute(0, 3, 1, 2)
+        return self._upscaled(generator, features, style, (height, width)), features[:, :3]
 
     def _upscaled(
         self, generator: ObjectGenerator, features: Pictures, style: Style, size: tuple[int, int]
@@ -454,8 +455,8 @@ class EG3D(Method):
     @at_work()
     @torch.no_grad()
     def pictures(self, cameras: Camera, random: torch.Generator) -> Float[Tensor, "camera height width 3"]:
-        """Pictures of random objects, one for each camera, conditioned on its pose, as the published figures are
-        computed. All are of the Config's size."""
+        """Pictures of random objects, one for each camera, conditioned on its pose, as for the published figures. All
+        cameras have one size."""
         found, count = [], self.config.pictures_per_step
         for i in range(0, len(cameras), count):
             some = cameras[slice(i, i + count)].to(self.device)
@@ -464,6 +465,15 @@ class EG3D(Method):
             made = self.averaged.field.made(self.averaged.repeated(style))
             found.append(self._pictures(self.averaged, made, style, some)[0].permute(0, 2, 3, 1).cpu())
         return torch.cat(found)
+
+    @property
+    def viewpoint(self) -> Camera:
+        """The camera whose pose renderings are conditioned on, of a picture of the Config's size."""
+        pose, intrinsics = (x.cpu().view(1, n, n) for x, n in zip(self.label.split([16, 9]), (4, 3), strict=True))
+        side = self.config.picture_size
+        focal = torch.stack([intrinsics[:, 0, 0], intrinsics[:, 1, 1]], -1)
+        lens = Pinhole(side * focal, side * intrinsics[:, :2, 2])
+        return Camera(pose[:, :3], lens, torch.tensor([[side, side]]))
 
     @property
     def evidence_views(self) -> int | None:
@@ -561,20 +571,6 @@ def labels(cameras: Camera) -> Label:
     intrinsics[:, 0, 0], intrinsics[:, 1, 1] = (lens.focal / size).unbind(-1)
     intrinsics[:, :2, 2] = lens.centre / size
     return torch.cat([pose, intrinsics.flatten(1)], -1)
-
-
-def square(photograph: Photograph, frame: Frame, size: int) -> tuple[Float[Tensor, "3 size size"], Camera]:
-    """The middle square of a photograph before its background, at a size, and its camera."""
-    rgb, camera = photograph.before(frame.background).permute(2, 0, 1), photograph.camera
-    height, width = rgb.shape[1:]
-    side = min(height, width)
-    top, left = (height - side) // 2, (width - side) // 2
-    if (height, width) != (side, side):
-        lens: Any = camera.lens
-        lens = replace(lens, centre=lens.centre - torch.tensor([float(left), float(top)]))
-        camera = replace(camera, lens=lens, size=torch.full_like(camera.size, side))
-        rgb = rgb[:, top : top + side, left : left + side]
-    return resized(rgb[None], (size, size))[0], camera.resized(size / side)
 
 
 def bounded(scene: Scene) -> Scene:

@@ -14,7 +14,7 @@ from ...components.training.adversarial import EPSILON, SMALLEST, EqualisedLinea
 
 Style = Float[Tensor, "picture style"]
 Styles = Float[Tensor, "picture layer style"]
-Pictures = Float[Tensor, "picture channel height width"]
+Pictures = Float[Tensor, "picture _ _ _"]
 
 
 class ModulatedConvolution(nn.Module):
