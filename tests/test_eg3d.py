@@ -1,4 +1,4 @@
-"""EG3D: its layers, three different planes, the adversaries' step, swapped poses, truncation, drawings, an inversion."""
+"""EG3D: its layers, three different planes, the adversaries' step, swapped poses, drawings, an inversion."""
 
 from __future__ import annotations
 

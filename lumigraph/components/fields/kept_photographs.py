@@ -142,9 +142,8 @@ def square(photograph: Photograph, frame: Frame, size: int) -> tuple[Float[Tenso
         lens = replace(lens, centre=lens.centre - torch.tensor([float(left), float(top)]))
         camera = replace(camera, lens=lens, size=torch.full_like(camera.size, side))
         rgb = rgb[:, top : top + side, left : left + side]
-    return nn.functional.interpolate(rgb[None], (size, size), mode="bilinear", antialias=True)[0], camera.resized(
-        size / side
-    )
+    picture = nn.functional.interpolate(rgb[None], (size, size), mode="bilinear", antialias=True)[0]
+    return picture, camera.resized(size / side)
 
 
 def chance(count: int, generator: torch.Generator) -> int:

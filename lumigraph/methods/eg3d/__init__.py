@@ -33,7 +33,7 @@ from ...components.training.adversarial import (
     widths_of,
 )
 from ...datasets.collection import Collection
-from ...datasets.scene import Frame, Photograph, Scene
+from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Positive, RaySamples, Seed, Share, Width, between
 from ...method import Descend, Method
@@ -227,17 +227,17 @@ class EG3D(Method):
         return len(data.splits["train"]) / self.config.pictures_per_step
 
     def batch(self, data: Collection, generator: torch.Generator) -> AdversarialLesson:
-        """Random photographs, and the cameras of other ones."""
+        """Random photographs, and the cameras of others of the same objects."""
         c = self.config
 
-        def random() -> tuple[Photograph, Frame]:
-            scene = bounded(photographed(data.sample_member(generator)[1], "eg3d"))
+        def one_of(scene: Scene) -> tuple[Float[Tensor, "3 _ _"], Camera]:
             there = scene.splits["train"]
-            return scene.photograph(int(there[chance(len(there), generator)])), scene.frame
+            return square(scene.photograph(int(there[chance(len(there), generator)])), scene.frame, c.picture_size)
 
-        real = [square(*random(), c.picture_size) for _ in range(c.pictures_per_step)]
-        views = [square(*random(), c.picture_size)[1] for _ in range(c.pictures_per_step)]
-        cameras = (Camera.cat([camera for _, camera in real]), Camera.cat(views))
+        members = [data.sample_member(generator)[1] for _ in range(c.pictures_per_step)]
+        scenes = [bounded(photographed(member, "eg3d")) for member in members]
+        real, others = [one_of(scene) for scene in scenes], [one_of(scene) for scene in scenes]
+        cameras = (Camera.cat([camera for _, camera in both]) for both in (real, others))
         pictures = torch.stack([picture for picture, _ in real])
         return AdversarialLesson(pictures.to(self.device), *(camera.to(self.device) for camera in cameras))
 
@@ -329,7 +329,10 @@ class EG3D(Method):
         cameras: Camera,
         random: torch.Generator | None = None,
     ) -> tuple[Pictures, Pictures]:
-        """Pictures of fields, each through a camera of its own, and their volume renderings. All cameras have one size."""
+        """Pictures of fields, each through a camera of its own, and their volume renderings.
+
+        cameras: of one size
+        """
         small = cameras.resized(int(self.size) / self.config.picture_size)
         (columns, rows), (width, height) = small.size[0].tolist(), cameras.size[0].tolist()
         pixels = small[0].pixels()
