@@ -104,6 +104,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("bench/shapes.json", "bench/shapes.md"),
     ),
     "infer": ("infer prior photographs --output found", ("found/", "found", "found/lock.json")),
+    "draw": (
+        "draw drawing --seeds 0:1 --views 1 --output drawn.png --film drawn.gif --frames 1 --score 2",
+        ("drawn.png", "drawn.json", "drawn.gif"),
+    ),
     "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
     "track": (
         "track imap procedural:room,depth,views=300,size=32 --frames 2 --downscale 1 --output found",
@@ -132,6 +136,7 @@ def template(ball_run, ball_folder, tmp_path_factory) -> Path:
     gs_run(folder / "gs")
     octree_run(folder / "octree")
     prior_run(folder / "prior")
+    prior_run(folder / "drawing", "eg3d")
     Image.new("RGB", (16, 16)).save(folder / "one.png")
     return folder
 

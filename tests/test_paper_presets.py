@@ -601,6 +601,43 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "points_per_step": 512,
         "learning_rate": 1e-3,
     },
+    "eg3d": {  # NVlabs/eg3d, train.py and training/triplane.py for FFHQ at 512; the paper's sections 4 and 5
+        "picture_size": 512,
+        "rendering_size": 64,
+        "final_rendering_size": 128,
+        "growth_start": 25 / 27.5,  # 25 million pictures, then 2.5 million more
+        "super_resolution": 4,
+        "super_widths": (256, 128),  # SuperresolutionHybrid8XDC
+        "field": "planes",
+        "plane_size": 256,
+        "plane_channels": 32,
+        "features": 32,
+        "decoder_width": 64,
+        "film_width": 256,  # marcoamonteiro/pi-GAN, siren.py
+        "film_layers": 8,
+        "coarse_samples": 48,
+        "fine_samples": 48,
+        "density_scale": 1.0,
+        "density_shift": -1.0,  # softplus(sigma - 1)
+        "code": 512,
+        "style": 512,
+        "mapping_layers": 2,  # map-depth
+        "channel_base": 32_768,
+        "channel_most": 512,
+        "pictures_per_step": 32,
+        "learning_rate": 0.0025,
+        "discriminator_rate": 0.002,
+        "r1_weight": 1.0,
+        "r1_interval": 16,
+        "density_weight": 0.25,
+        "density_distance": 0.004,
+        "density_interval": 4,
+        "swap_probability": 0.5,
+        "swap_pictures": 1_000_000,
+        "blur_deviation": 10.0,
+        "blur_pictures": 200_000,
+        "average_pictures": 10_000,
+    },
     "srn": {  # vsitzmann/scene-representation-networks, srns.py, custom_layers.py, train.py, train_configs/chairs.yml
         "code": 256,
         "code_deviation": 0.01,

@@ -41,6 +41,7 @@ from .compress import Compress
 from .convert import Convert
 from .demo import Demo
 from .depth import Depth
+from .draw import Draw
 from .eval import Eval
 from .explain import Explain
 from .export import Export
@@ -119,6 +120,7 @@ COMMANDS: dict[str, type] = {
     "track": Track,
     "resume": Resume,
     "infer": Infer,
+    "draw": Draw,
     "eval": Eval,
     "render": Render,
     "view": ViewCommand,

@@ -179,6 +179,19 @@ class CanDraw(Protocol):
         """The method as it shows an object that nobody has photographed, drawn at random by a seed."""
 
 
+class HasViewpoint(Protocol):
+    """Knows where its objects are usually seen from."""
+
+    viewpoint: Camera
+
+
+class DrawsPictures(Protocol):
+    """Draws pictures of many objects at once, each through a camera of its own."""
+
+    def pictures(self, cameras: Camera, random: torch.Generator) -> Float[Tensor, "camera height width 3"]:
+        """Pictures of random objects. cameras: of one size"""
+
+
 LACKING = {
     HasDensity: "holds no density at points; what is made of it comes from its renderings instead",
     HasField: "holds no density and colour at points, so it can be neither baked nor converted",
@@ -195,7 +208,7 @@ LACKING = {
     HasAppearance: "learns no appearance of its photographs; block-nerf does",
     CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
-    CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of hyp-nerf",
+    CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of eg3d",
     CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
     RendersRays: "renders whole pictures, so single rays have no colour",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",

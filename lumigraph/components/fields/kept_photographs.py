@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -15,7 +15,7 @@ from ...camera import Camera
 from ...camera.lens import Lens
 from ...camera.rays import Rays
 from ...datasets.dataset import Dataset
-from ...datasets.scene import Batch, Photograph, Scene, Vector
+from ...datasets.scene import Batch, Frame, Photograph, Scene, Vector
 from ...errors import LumigraphError
 from ...files import from_json
 from ...files.ranges import Row, Side, typed
@@ -129,6 +129,21 @@ def pixels_of(photograph: Photograph, boxed: bool) -> Int[Tensor, "pixel 2"]:
         box[int(rows.min()) : int(rows.max()) + 1, int(columns.min()) : int(columns.max()) + 1] = True
         there = there & box if (there & box).any() else there
     return there.nonzero().flip(-1)
+
+
+def square(photograph: Photograph, frame: Frame, size: int) -> tuple[Float[Tensor, "3 size size"], Camera]:
+    """The middle square of a photograph before its background, at a size, and its camera."""
+    rgb, camera = photograph.before(frame.background).permute(2, 0, 1), photograph.camera
+    height, width = rgb.shape[1:]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    if (height, width) != (side, side):
+        lens: Any = camera.lens
+        lens = replace(lens, centre=lens.centre - torch.tensor([float(left), float(top)]))
+        camera = replace(camera, lens=lens, size=torch.full_like(camera.size, side))
+        rgb = rgb[:, top : top + side, left : left + side]
+    picture = nn.functional.interpolate(rgb[None], (size, size), mode="bilinear", antialias=True)[0]
+    return picture, camera.resized(size / side)
 
 
 def chance(count: int, generator: torch.Generator) -> int:
