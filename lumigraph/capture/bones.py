@@ -33,7 +33,7 @@ def scene_skeleton(capture: Capture, to_scene: Similarity, cameras: Camera) -> S
         return None
     if len(skeleton.times) > 1 and cameras.time is None:
         raise LumigraphError(
-            f"{capture.source}: the bones have {len(skeleton.times)} moments, and photographs lack theirs; give each its "
+            f"{capture.source}: the bones have {len(skeleton.times)} moments, and photographs have none; give each its "
             "time"
         )
     return skeleton.transformed(to_scene)

@@ -84,7 +84,7 @@ class Skeleton:
                 )
         if not self.times or len(self.times) != len(self.poses):
             raise LumigraphError(
-                f"A skeleton has {len(self.times)} times and {len(self.poses)} poses; give as many of each, one at least"
+                f"A skeleton has {len(self.times)} times and {len(self.poses)} poses; give as many of each"
             )
         if any(a >= b for a, b in zip(self.times, self.times[1:], strict=False)):
             raise LumigraphError("The times of a skeleton's poses do not rise; sort them, and leave out doubles")

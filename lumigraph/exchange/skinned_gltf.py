@@ -1,4 +1,4 @@
-"""Skinned characters as glTF, one .glb file: a mesh, the bones that move it, and their animations (sections 3.7.3, 3.11).
+"""Skinned characters as glTF, one .glb file: a mesh, the bones that move it, their animations (sections 3.7.3, 3.11).
 
 Vertices and bones are turned to +z up and placed as the root joint is at the first moment of the first animation. A
 skeleton here is rigid, so bones whose scale is animated are refused.
@@ -67,8 +67,8 @@ class SkinnedCharacter:
         return self.nodes.joints(chosen, seconds % chosen.seconds if chosen.seconds else 0.0)
 
     def clip(self, number: int) -> Skeleton:
-        """The skeleton with the poses of an animation at its keyframes, times in seconds. Raises LumigraphError if there
-        is none of that number."""
+        """The skeleton with the poses of an animation at its keyframes, times in seconds. Raises LumigraphError if
+        there is none of that number."""
         if number >= len(self.clips):
             raise LumigraphError(
                 f"{self.nodes.file.path} has {len(self.clips)} animations and none of number {number}; choose another"

@@ -33,7 +33,7 @@ MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the iso
 
 @dataclass(frozen=True)
 class Config:
-    """Numbers of MANUS from memory, with Kerbl's (2023) of the cloud; `ArticulatedSplatting.preset` has a plain CPU's."""
+    """Numbers of MANUS from memory, and Kerbl's (2023) of the cloud; `cpu_preset` has those of a plain CPU."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
     sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner

@@ -112,7 +112,7 @@ def photographed(character: Character, size: int, views: int, seed: int, rig: in
 
     cameras = {name: _taken(places, size) for name, places in stops.items()}
     bounds = tuple(low.tolist()), tuple(high.tolist())
-    reach = float(max(np.abs(low).max(), np.abs(high).max()))
+    reach = 0.5 * float((high - low).max())
     return SyntheticStage(
         moving(0.0), _numbered(cameras), bounds, reach, near=1.2, moving=moving, skeleton=skeleton,
         called=_called(character, cameras, times, poses),

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 
 from ..datasets.skeleton import Skeleton
-from ..exchange.skinned_gltf import SkinnedCharacter, read_character, subdivided
+from ..exchange.skinned_gltf import read_character, subdivided
 from ..geometry import Similarity
 from .characters import FILL, KEY, SKY, Joints
 from .shapes import TRIANGLE

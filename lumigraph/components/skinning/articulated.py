@@ -23,8 +23,8 @@ class Articulated(Method):
         return float(self.settings.get("time", first))
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError for
-        a file that holds none of this character."""
+        """The same in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError
+        for a file that holds none of this character."""
         told = super().given(*evidence, **controls)
         if (path := str(controls.get("pose", CAPTURED))) != CAPTURED:
             clip_of(path, self.frame)

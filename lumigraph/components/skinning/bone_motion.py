@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -16,8 +16,8 @@ from ...datasets.scene import Frame
 from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
 from ...errors import LumigraphError
 from ...exchange.bones import SUFFIXES, read_motion
-from ...files.ranges import Layers, LearningRate, NonNegative, Share, Width, between
-from ...geometry import Similarity, multiply, to_matrix, to_quaternion
+from ...files.ranges import Layers, LearningRate, NonNegative, Share, Width
+from ...geometry import multiply, to_matrix, to_quaternion
 from ...method import Part
 from ...method.controls import Control, moment
 from ..training.pose_refinement import PoseAdam
@@ -28,8 +28,6 @@ FALL = 0.05  # of the rate of corrections that is left at the end of the budget
 MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
 MIN_ANGLE = 1e-8  # radians, squared, against division by zero
 KEPT_CLIPS = 8  # files of poses that are kept in memory
-
-BoneTransforms = Float[Tensor, "*batch bone 3 4"]  # rest to posed, in the scene's frame
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,8 @@ class BoneMotion(Part):
     positions: Tensor
     quaternions: Tensor
     home: Tensor
+    back: Tensor
+    given_angles: Tensor
 
     def __init__(self, frame: Frame, numbers: BoneNumbers):
         super().__init__()
@@ -68,14 +68,15 @@ class BoneMotion(Part):
             ("positions", local[..., 3].float()),
             ("quaternions", to_quaternion(local[..., :3]).float()),
             ("home", rigid_inverse(skeleton.rest.matrices).float()),
+            ("back", to_quaternion(local_of(skeleton.parents, skeleton.rest.matrices)[..., :3].mT).float()),
         ):
             self.register_buffer(name, value, persistent=False)
-        self.active = False
+        self.register_buffer("given_angles", self.angles_of(self.quaternions), persistent=False)
         bones, n = len(skeleton), numbers
         self.turns = nn.Parameter(torch.zeros(len(skeleton.times), 3 * bones)) if n.pose_correction == "table" else None
         self.network: nn.Sequential | None = None
         if n.pose_correction == "network":
-            widths = [3 * bones, *[n.pose_width] * n.pose_depth]
+            widths = [self.given_angles.shape[1], *[n.pose_width] * n.pose_depth]
             layers = [x for a, b in zip(widths, widths[1:], strict=False) for x in (nn.Linear(a, b), nn.ReLU())]
             last = nn.Linear(widths[-1], 3 * bones)
             nn.init.uniform_(last.weight, -MIN_OUTPUT, MIN_OUTPUT)
@@ -84,19 +85,17 @@ class BoneMotion(Part):
 
     # Corrections
 
-    @property
-    def angles(self) -> Float[Tensor, "moment angle"]:
-        """Omega: rotation vectors of joints from their pose at rest, radians, at all moments."""
-        rest = local_of(self.skeleton.parents, self.skeleton.rest.matrices)[..., :3]
-        back = to_quaternion(rest.mT).to(self.quaternions)
-        turned = multiply(back.expand_as(self.quaternions).flatten(0, 1), self.quaternions.flatten(0, 1))
-        return rotation_vectors(turned).view(len(self.times), -1)
+    def angles_of(self, turns: Float[Tensor, "moment bone 4"]) -> Float[Tensor, "moment angle"]:
+        """Omega: rotation vectors of joints in their parents from their pose at rest, radians, but for roots."""
+        moved = multiply(self.back.expand_as(turns).flatten(0, 1), turns.flatten(0, 1))
+        vectors = rotation_vectors(moved).view(len(turns), -1, 3)
+        return vectors[:, [parent >= 0 for parent in self.skeleton.parents]].flatten(1)
 
     def corrections(self) -> Float[Tensor, "moment bone 3"] | None:
         """Learnt rotation vectors of all joints, radians; None without any."""
         if self.turns is not None:
             return self.turns.view(len(self.times), -1, 3)
-        return None if self.network is None else self.network(self.angles).view(len(self.times), -1, 3)
+        return None if self.network is None else self.network(self.given_angles).view(len(self.times), -1, 3)
 
     def corrected(self) -> Float[Tensor, "moment bone 4"]:
         """Rotations of joints in their parents, with corrections."""
@@ -105,34 +104,42 @@ class BoneMotion(Part):
             return self.quaternions
         return multiply(self.quaternions.flatten(0, 1), exponential(turns.flatten(0, 1))).view_as(self.quaternions)
 
-    # Transforms
+    # At moments
 
-    def at(self, times: Float[Tensor, " time"]) -> Float[Tensor, "time bone 3 4"]:
-        """Transforms of the bones at moments of the capture."""
+    def local(self, times: Float[Tensor, " time"]) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
+        """Rotations and positions of joints in their parents at moments of the capture."""
         before, after, share = between_moments(self.times, times.to(self.times))
         turns, share = self.corrected(), share[:, None, None]
         first, second = turns[before], turns[after]
         second = torch.where((first * second).sum(-1, keepdim=True) < 0, -second, second)
-        turn = to_matrix(torch.lerp(first, second, share).flatten(0, 1)).view(len(times), -1, 3, 3)
-        place = torch.lerp(self.positions[before], self.positions[after], share)
-        joints = posed(self.skeleton.parents, torch.cat([turn, place[..., None]], -1))
-        return rigid_product(joints, self.home.expand_as(joints))
+        return torch.lerp(first, second, share), torch.lerp(self.positions[before], self.positions[after], share)
 
-    def shown(self, method: Any, time: float) -> Float[Tensor, "bone 3 4"]:
-        """Transforms at a moment under the method's settings: of the capture, or of a user's poses."""
+    def shown(
+        self, method: Any, times: Float[Tensor, " time"]
+    ) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
+        """The same under the method's settings: of the capture, or of a user's poses."""
         if (path := str(method.settings.get("pose", CAPTURED))) == CAPTURED:
-            return self.at(torch.tensor([time], device=self.times.device))[0]
+            return self.local(times)
         clip = clip_of(path, self.frame)
         first, last = self.frame.times or (0.0, 1.0)
-        share = (time - first) / (last - first)
-        asked = torch.tensor([clip.times[0] + share * (clip.times[-1] - clip.times[0])], dtype=torch.float64)
-        known = BoneMotion(given_poses(self.frame, clip), BoneNumbers("no"))
-        return known.at(asked)[0].to(self.times)
+        share = (times.cpu() - first) / (last - first)
+        known = BoneMotion(replace(self.frame, skeleton=clip), BoneNumbers("no"))
+        turns, places = known.local(clip.times[0] + share * (clip.times[-1] - clip.times[0]))
+        return turns.to(times.device), places.to(times.device)
+
+    def transforms(
+        self, turns: Float[Tensor, "time bone 4"], places: Float[Tensor, "time bone 3"]
+    ) -> Float[Tensor, "time bone 3 4"]:
+        """Transforms of the bones from rest to poses that are given in their parents."""
+        matrices = to_matrix(turns.flatten(0, 1)).view(len(turns), -1, 3, 3)
+        joints = posed(self.skeleton.parents, torch.cat([matrices, places[..., None]], -1))
+        return rigid_product(joints, self.home.expand_as(joints))
+
+    def at(self, method: Any, time: float) -> Float[Tensor, "bone 3 4"]:
+        """Transforms of the bones at a moment under the method's settings."""
+        return self.transforms(*self.shown(method, torch.tensor([time], device=self.times.device)))[0]
 
     # Learning
-
-    def before_step(self, method: Any, step: int, progress: float) -> None:
-        self.active = progress >= self.numbers.pose_from
 
     def penalty(self) -> dict[str, Tensor]:
         """The term that keeps corrections small."""
@@ -166,13 +173,6 @@ def skeleton_of(frame: Frame) -> Skeleton:
             "docs/datasets.md says"
         )
     return frame.skeleton
-
-
-def given_poses(frame: Frame, clip: Skeleton) -> Frame:
-    """The frame with other poses of its skeleton."""
-    from dataclasses import replace
-
-    return replace(frame, skeleton=clip)
 
 
 @lru_cache(KEPT_CLIPS)

@@ -41,15 +41,14 @@ class SkinnedCloud(Addition):
         return torch.lerp(starts[chosen], ends[chosen], share) + radius * torch.randn(count, 3, generator=generator)
 
     def before_raster(self, method: Any, step: Step) -> None:
-        time = torch.tensor([method.moment_of(step.camera)], device=step.cloud.means.device)
-        step.cloud = skinned(step.cloud, self.weights(step.cloud.means), self.bones.at(time)[0])
+        step.cloud = self.at(method, step.cloud, method.moment_of(step.camera))
 
     def regularize(self, method: Any, step: Step) -> None:
         step.terms |= self.bones.penalty()
 
     def at(self, method: Any, cloud: Gaussians, time: float) -> Gaussians:
         """The cloud at a moment under the method's settings."""
-        return skinned(cloud, self.weights(cloud.means), self.bones.shown(method, time))
+        return skinned(cloud, self.weights(cloud.means), self.bones.at(method, time))
 
 
 def skinned(

@@ -32,8 +32,8 @@ class WeightNumbers:
 
 
 class WeightVolume(Part):
-    """Shares w_c of bones, and of what is no body, in a box around the body at rest: the softmax over bones of a prior's
-    logarithm, Gaussians around them, and a learnt volume.
+    """Shares w_c of bones, and of what is no body, in a box around the body at rest: the softmax of a learnt volume and
+    the logarithm of a prior, Gaussians around the bones.
 
     box: lowest and highest corner of the volume
     """
