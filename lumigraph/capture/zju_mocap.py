@@ -1,6 +1,6 @@
 """Captures of a person in a ring of cameras, as ZJU-MoCap publishes them (Peng et al. 2021).
 
-annots.npy has cameras (K, D, R, T in millimetres) and the names of all photographs; new_params/N.npy or params/N.npy the
+annots.npy has cameras (K, D, R, T in millimetres) and names of photographs; new_params/N.npy or params/N.npy the
 pose of frame N: rotation vectors of 24 joints in their parents, Rh and Th from the body to the world. lbs/joints.npy
 and lbs/parents.npy (Peng 2021, Animatable NeRF) have the joints at rest; no body model is read. The first camera's
 photographs train; every 30th frame of the others tests. Masks are in mask_cihp/ or mask/: labels, 0 is the background.

@@ -6,6 +6,7 @@ frame, so that a point x of the body at rest, which belongs to bone k alone, goe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -158,9 +159,9 @@ def disturbed(
 ) -> Float[np.ndarray, "bone 3 4"]:
     """The pose after every joint turned by an angle about an axis of its own; lengths of bones stay."""
     axes = random.normal(size=(len(parents), 3))
-    axes = torch.from_numpy(axes / np.linalg.norm(axes, axis=1, keepdims=True))
-    half = 0.5 * np.radians(degrees)
-    turn = torch.cat([torch.full((len(parents), 1), float(np.cos(half))).double(), float(np.sin(half)) * axes], 1)
+    turned = torch.from_numpy(axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    half = 0.5 * math.radians(degrees)
+    turn = torch.cat([torch.full_like(turned[:, :1], math.cos(half)), math.sin(half) * turned], 1)
     local = local_of(parents, torch.from_numpy(np.ascontiguousarray(pose)))
     local[:, :, :3] = local[:, :, :3] @ to_matrix(turn)
     return posed(parents, local).numpy()

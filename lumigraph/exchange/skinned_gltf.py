@@ -128,8 +128,9 @@ def read_character(path: Path) -> SkinnedCharacter:
     index = next((i for i, node in enumerate(about.nodes) if node.mesh is not None and node.skin is not None), None)
     if index is None:
         raise LumigraphError(f"{path} holds no character, for no mesh in it has a skin; name another file")
-    node = about.nodes[index]
-    skin = file.one(about.skins, node.skin, "skin")
+    mesh, number = about.nodes[index].mesh, about.nodes[index].skin
+    assert mesh is not None and number is not None
+    skin = file.one(about.skins, number, "skin")
     if skin.inverse_bind_matrices is None:
         raise LumigraphError(f"{path} has a skeleton without a bind pose; export it with inverse bind matrices")
     order, parents = tree(file, skin.joints)
@@ -150,7 +151,7 @@ def read_character(path: Path) -> SkinnedCharacter:
     names = unique([about.nodes[i].name or f"joint {number}" for number, i in enumerate(bones)])
     pose = BonePose.of(torch.from_numpy(rest))
     skeleton = Skeleton(names, parents, pose, (0.0,), (pose,))
-    vertices, faces, weights, colours = mesh_of(file, node.mesh, np.argsort(order))
+    vertices, faces, weights, colours = mesh_of(file, mesh, np.argsort(order))
     vertices = vertices @ place[:3, :3].T + place[:3, 3]
     return SkinnedCharacter(vertices, faces, weights, colours, skeleton, clips, nodes)
 

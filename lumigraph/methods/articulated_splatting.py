@@ -44,7 +44,7 @@ class Config:
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
     isotropy_weight: NonNegative = 0.01  # weight of long Gaussians, which tear at joints; higher: rounder
-    bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-3)
+    bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-2)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
     rates: RateNumbers = RateNumbers()
     refine: RefineNumbers = RefineNumbers()

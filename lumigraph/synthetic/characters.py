@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -51,13 +51,15 @@ class Posed(Pictures):
     jitter_bones: Annotated[int, between(0, 45)] = 0
 
 
+@runtime_checkable
 class Character(Protocol):
     """Something that a skeleton moves.
 
     skeleton: with the pose at rest, in the world
     """
 
-    skeleton: Skeleton
+    @property
+    def skeleton(self) -> Skeleton: ...
 
     def pose(self, share: float) -> Joints:
         """Joints at a share of the capture, 0 to 1."""
@@ -123,7 +125,7 @@ def _called(
     character: Character, cameras: dict[str, Camera], times: np.ndarray, poses: list[Joints]
 ) -> Callable[[int], str]:
     """A name for the character in the pose of each photograph."""
-    every = torch.cat([camera.time for camera in cameras.values()]).tolist()
+    every = torch.cat([camera.time for camera in cameras.values() if camera.time is not None]).tolist()
 
     def name(index: int) -> str:
         pose = poses[int(np.abs(times - every[index]).argmin())]

@@ -100,7 +100,7 @@ class Pictures:
 
 
 def told(kind: type[Options], request: str) -> tuple[str, Options]:
-    """The name, and the options as a dataclass of numbers and texts. Raises LumigraphError for one that does not exist."""
+    """The name and the options as a dataclass. Raises LumigraphError for an option that does not exist."""
     name, *rest = request.split(",")
     return name, typed(kind, dict(parse(kind, request, text) for text in rest), f"procedural:{request}")
 

@@ -47,7 +47,7 @@ class BoneMotion(Part):
 
     Every joint turns in its parent by the capture's rotation and a learnt one (Weng 2022, eq. 6); lengths of bones
     stay. Between two moments of the capture joints are interpolated.
-    turns:    learnt rotation vectors of each moment's joints, radians, with "table"
+    turns:    learnt rotation vectors of each moment's joints, radians, one after another, with "table"
     network:  angles of all joints to these, with "network"
     """
 
@@ -73,7 +73,7 @@ class BoneMotion(Part):
             self.register_buffer(name, value, persistent=False)
         self.register_buffer("given_angles", self.angles_of(self.quaternions), persistent=False)
         bones, n = len(skeleton), numbers
-        self.turns = nn.Parameter(torch.zeros(len(skeleton.times), 3 * bones)) if n.pose_correction == "table" else None
+        self.turns = nn.Parameter(torch.zeros(len(skeleton.times) * bones, 3)) if n.pose_correction == "table" else None
         self.network: nn.Sequential | None = None
         if n.pose_correction == "network":
             widths = [self.given_angles.shape[1], *[n.pose_width] * n.pose_depth]
@@ -123,8 +123,7 @@ class BoneMotion(Part):
         clip = clip_of(path, self.frame)
         first, last = self.frame.times or (0.0, 1.0)
         share = (times.cpu() - first) / (last - first)
-        known = BoneMotion(replace(self.frame, skeleton=clip), BoneNumbers("no"))
-        turns, places = known.local(clip.times[0] + share * (clip.times[-1] - clip.times[0]))
+        turns, places = clip.local(clip.times[0] + share * (clip.times[-1] - clip.times[0]))
         return turns.to(times.device), places.to(times.device)
 
     def transforms(
@@ -176,12 +175,13 @@ def skeleton_of(frame: Frame) -> Skeleton:
 
 
 @lru_cache(KEPT_CLIPS)
-def _clip(path: Path, changed: int, frame: Frame) -> Skeleton:
-    return read_motion(path, skeleton_of(frame), frame.to_source.inverse)
+def _clip(path: Path, changed: int, frame: Frame) -> BoneMotion:
+    poses = read_motion(path, skeleton_of(frame), frame.to_source.inverse)
+    return BoneMotion(replace(frame, skeleton=poses), BoneNumbers("no"))
 
 
-def clip_of(path: str, frame: Frame) -> Skeleton:
-    """The poses in a file for the bones of a scene. Raises LumigraphError for a file without any."""
+def clip_of(path: str, frame: Frame) -> BoneMotion:
+    """Poses in a file for the bones of a scene, at its moments. Raises LumigraphError for a file without any."""
     file = Path(path).expanduser()
     return _clip(file, file.stat().st_mtime_ns if file.is_file() else 0, frame)
 

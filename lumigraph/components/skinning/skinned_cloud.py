@@ -32,8 +32,8 @@ class SkinnedCloud(Addition):
     def first_means(self, count: int, generator: torch.Generator) -> Float[Tensor, "gaussian 3"]:
         """Random places about the bones at rest, evenly along them, as far from them as their first weights reach."""
         skeleton = self.bones.skeleton
-        ends = segments(skeleton.parents, skeleton.rest.matrices[:, :, 3].float())
-        starts, ends = (torch.cat(side) for side in zip(*ends, strict=True))
+        bones = segments(skeleton.parents, skeleton.rest.matrices[:, :, 3].float())
+        starts, ends = (torch.cat(side) for side in zip(*bones, strict=True))
         size = float((torch.cat([starts, ends]).amax(0) - torch.cat([starts, ends]).amin(0)).max())
         radius = self.weights.numbers.bone_radius * size
         chosen = torch.multinomial((ends - starts).norm(dim=1) + radius, count, True, generator=generator)

@@ -12,8 +12,8 @@ from torch import Tensor
 from ...camera.rays import Rays
 from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ...components.fields.hash_field import HashField, HashNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, OccupancySampler, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, NGP_SCHEDULE, TINY_HASH, sampling_bytes
+from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampling_bytes
 from ...components.sampling.spaces import Box
 from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
@@ -78,7 +78,7 @@ class HumanNeRF(Articulated, FieldMethod):
         c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
         c = replace(c, table=replace(c.table, sh_bands=1), decay_start=0.3)
         c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        c = replace(c, bones=BoneNumbers("table", pose_lr=1e-3, pose_from=0.05))
+        c = replace(c, bones=BoneNumbers("table", pose_lr=1e-2, pose_from=0.05))
         c = replace(c, weights=WeightNumbers(24, 0, 1e-2))
         return replace(c, nonrigid=NonRigidNumbers(2, 32, 1, 4, 0.3, 0.7, 1e-3))
 
