@@ -7,6 +7,7 @@ from functools import partial
 from typing import Annotated, Any
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from ..camera import Camera
@@ -20,6 +21,7 @@ from ..components.clouds.initialization import Initialization, round_gaussians
 from ..components.clouds.tidying import Tidying, TidyingNumbers
 from ..components.skinning.articulated import Articulated
 from ..components.skinning.bone_motion import BoneNumbers
+from ..components.skinning.contact import PICTURE, bodies_of, contact_control, contact_map
 from ..components.skinning.skinned_cloud import SkinnedCloud
 from ..components.skinning.weight_volume import WeightNumbers
 from ..datasets.scene import Frame, Photograph, Scene
@@ -27,6 +29,7 @@ from ..files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, S
 from ..gaussians import Gaussians
 from ..gaussians.moving import MovingGaussians, fitted
 from ..gaussians.splatting import render
+from ..method.controls import Control
 
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
 
@@ -44,7 +47,8 @@ class Config:
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
     isotropy_weight: NonNegative = 0.01  # weight of long Gaussians, which tear at joints; higher: rounder
-    bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-2)
+    contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
+    bones: BoneNumbers = BoneNumbers("table", pose_lr=2e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
     rates: RateNumbers = RateNumbers()
     refine: RefineNumbers = RefineNumbers()
@@ -99,17 +103,35 @@ class ArticulatedSplatting(Articulated, CloudMethod):
             terms["isotropy"] = self.config.isotropy_weight * (ratio - MAX_RATIO).clamp_min(0).mean()
         return terms
 
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        several = len(set(bodies_of(self.bones.skeleton.parents).tolist())) > 1
+        return (*super().controls, *((contact_control(),) if several else ()))
+
+    def body_of(self, canonical: Gaussians) -> Int[Tensor, " gaussian"]:
+        """Number of the body, a tree of bones, that each Gaussian of the canonical cloud moves with."""
+        trees = torch.from_numpy(bodies_of(self.bones.skeleton.parents)).to(self.device)
+        shares = self.skin.weights(canonical.means)
+        return shares.new_zeros(len(shares), int(trees.max()) + 1).index_add(1, trees, shares).argmax(1)
+
+    def at(self, canonical: Gaussians, time: float) -> Gaussians:
+        """A canonical cloud at a moment under the settings, as a picture or a map of contact."""
+        cloud = self.skin.at(self, canonical, time)
+        if self.settings.get("show", PICTURE) == PICTURE:
+            return cloud
+        return contact_map(cloud, self.body_of(canonical), self.config.contact_distance)
+
     def gaussians(self) -> Gaussians:
-        return self.skin.at(self, super().gaussians(), self.moment_of())
+        return self.at(super().gaussians(), self.moment_of())
 
     @torch.no_grad()
     def moving(self, duration: float) -> MovingGaussians:
         """The cloud with its motion, of the capture or of the poses of the settings, played in so many seconds."""
         first, last = self.frame.times or (0.0, 1.0)
-        at = partial(self.skin.at, self, super().gaussians())
+        at = partial(self.at, super().gaussians())
         return fitted(lambda share: at(first + share * (last - first)), duration)
 
     @torch.no_grad()
     def rasterized(self, camera: Camera) -> Rendering:
-        cloud = self.skin.at(self, self.filtered(), self.moment_of(camera))
+        cloud = self.at(self.filtered(), self.moment_of(camera))
         return render(cloud, camera, BLACK, self.near_plane)

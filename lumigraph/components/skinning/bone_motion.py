@@ -16,7 +16,7 @@ from ...datasets.scene import Frame
 from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
 from ...errors import LumigraphError
 from ...exchange.bones import SUFFIXES, read_motion
-from ...files.ranges import Layers, LearningRate, NonNegative, Share, Width
+from ...files.ranges import Layers, LearningRate, Share, Width
 from ...geometry import multiply, to_matrix, to_quaternion
 from ...method import Part
 from ...method.controls import Control, moment
@@ -37,7 +37,6 @@ class BoneNumbers:
     pose_correction: Literal["no", "table", "network"] = "network"  # corrections of joints: none, of each moment, a MLP
     pose_lr: LearningRate = 5e-5  # learning rate of the corrections; of a table in radians a step
     pose_from: Share = 0.0  # share of the budget before corrections are learnt; later: a better body first
-    pose_weight: NonNegative = 0.0  # weight of the corrections' squared angles; higher: closer to the given poses
     pose_width: Width = 256  # channels of the network's layers
     pose_depth: Layers = 4  # its hidden layers
 
@@ -92,9 +91,13 @@ class BoneMotion(Part):
         return vectors[:, [parent >= 0 for parent in self.skeleton.parents]].flatten(1)
 
     def corrections(self) -> Float[Tensor, "moment bone 3"] | None:
-        """Learnt rotation vectors of all joints, radians; None without any."""
+        """Learnt rotation vectors of all joints, radians; None without any. Those of a table have no mean over learnt
+        moments, for it would be another body at rest."""
         if self.turns is not None:
-            return self.turns.view(len(self.times), -1, 3)
+            turns = self.turns.view(len(self.times), -1, 3)
+            learnt = (turns.detach() != 0).any(-1, keepdim=True)
+            mean = turns.detach().sum(0) / learnt.sum(0).clamp_min(1)
+            return turns - learnt * mean
         return None if self.network is None else self.network(self.given_angles).view(len(self.times), -1, 3)
 
     def corrected(self) -> Float[Tensor, "moment bone 4"]:
@@ -139,11 +142,6 @@ class BoneMotion(Part):
         return self.transforms(*self.shown(method, torch.tensor([time], device=self.times.device)))[0]
 
     # Learning
-
-    def penalty(self) -> dict[str, Tensor]:
-        """The term that keeps corrections small."""
-        turns = self.corrections() if self.numbers.pose_weight else None
-        return {} if turns is None else {"pose": self.numbers.pose_weight * turns.square().mean()}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         rate = self.numbers.pose_lr

@@ -43,9 +43,6 @@ class SkinnedCloud(Addition):
     def before_raster(self, method: Any, step: Step) -> None:
         step.cloud = self.at(method, step.cloud, method.moment_of(step.camera))
 
-    def regularize(self, method: Any, step: Step) -> None:
-        step.terms |= self.bones.penalty()
-
     def at(self, method: Any, cloud: Gaussians, time: float) -> Gaussians:
         """The cloud at a moment under the method's settings."""
         return skinned(cloud, self.weights(cloud.means), self.bones.at(method, time))

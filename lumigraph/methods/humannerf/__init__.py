@@ -78,7 +78,7 @@ class HumanNeRF(Articulated, FieldMethod):
         c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
         c = replace(c, table=replace(c.table, sh_bands=1), decay_start=0.3)
         c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        c = replace(c, bones=BoneNumbers("table", pose_lr=1e-2, pose_from=0.05))
+        c = replace(c, bones=BoneNumbers("table", pose_lr=2e-3, pose_from=0.1))
         c = replace(c, weights=WeightNumbers(24, 0, 1e-2))
         return replace(c, nonrigid=NonRigidNumbers(2, 32, 1, 4, 0.3, 0.7, 1e-3))
 
@@ -130,7 +130,7 @@ class HumanNeRF(Articulated, FieldMethod):
     # Learning
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """The squared error of colours before random backgrounds, and what holds poses (section 3.4, without LPIPS)."""
+        """The squared error of colours before random backgrounds, without LPIPS (section 3.4)."""
         generator = self.random(step)
         (samples,), terms = self.learn(batch.rays, generator)
         background = backdrop(batch, self.background, generator, opaque=False)
@@ -138,7 +138,7 @@ class HumanNeRF(Articulated, FieldMethod):
         seen = composite(look.samples, look.density, look.rgb, background)
         error = (seen.rgb - batch.before(background)).square().mean()
         self.figures["mse"] = float(error.detach())
-        return {"colour": error, **terms, **self.bones.penalty()}
+        return {"colour": error, **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c, canonical = self.config, self.network.canonical
