@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.datasets.images import ImageStore, Layer, LayerSource
 from lumigraph.datasets.scene import Frame, Scene
+from lumigraph.datasets.skeleton import BonePose, Skeleton
 from lumigraph.datasets.tracks import BoxTrack
 from lumigraph.run import Run, build
 
@@ -27,6 +29,9 @@ HALF, QUARTER = ("half", (0.7, 1.3, 1.3), (0.35, 0.0, 0.0)), ("quarter", (0.7, 0
 TRACKS = tuple(
     BoxTrack(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),)) for name, size, place in (HALF, QUARTER)
 )
+# Two bones through the ball, of which the upper one bends, for methods of bodies.
+REST = BonePose(((0.0, 0.0, -0.4), (0.0, 0.0, 0.0)), ((1.0, 0.0, 0.0, 0.0),) * 2)
+SKELETON = Skeleton(("lower", "upper"), (-1, 0), REST, (0.0,), (REST,))
 
 # What a user would do by putting a file into lumigraph/methods/.
 if (folder := str(Path(__file__).parent / "methods")) not in lumigraph.methods.__path__:
@@ -86,6 +91,7 @@ def made(count: int, size: int, focal: float) -> Scene:
     lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
     cameras = Camera(pose, lens, torch.full((count, 2), size), image_index=index)
     frame = Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True, image_count=count, tracks=TRACKS)
+    frame = replace(frame, skeleton=SKELETON)
     splits = {"train": index[index % 4 != 0], "test": index[index % 4 == 0]}
     images = ImageStore.from_arrays([picture(p) for p in pose])
     planes = [LayerSource(partial(lambda p: ball(p)[0].numpy(), p)) for p in pose]

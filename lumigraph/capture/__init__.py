@@ -24,6 +24,7 @@ from ..files.readers import LISTED, NAMES
 from . import meshes, single_image
 from .assemble import Before as Before
 from .assemble import assemble as assemble
+from .bones import with_bones
 from .capture import Capture as Capture
 from .capture import Shot as Shot
 from .inner_depth import with_inner_depth
@@ -186,7 +187,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     if (request := requested(source)) is not None:
         return synthetic().read(request)
     path = expanded(source)
-    capture = with_tracks(choose_reader(path, reader).read(path), path)
+    capture = with_bones(with_tracks(choose_reader(path, reader).read(path), path), path)
     return with_inner_depth(with_raw(with_masks(capture, path), path))
 
 

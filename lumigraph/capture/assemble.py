@@ -21,6 +21,7 @@ from ..files.names import counted, natural
 from ..geometry import Similarity
 from ..system.progress import counting
 from .beside import make_about, make_layers
+from .bones import scene_skeleton
 from .capture import MAX_COORDINATE, Capture, Shot, checked_pose
 from .normalise import find_forward, find_place, similarity
 from .oddities import oddities
@@ -106,7 +107,9 @@ def assemble(
         origin=capture.origin,
     )
     tracks, unseen = seen_tracks(capture, Similarity(torch.from_numpy(matrix)), cameras[splits["train"]])
-    frame = replace(frame, tracks=tracks)
+    frame = replace(
+        frame, tracks=tracks, skeleton=scene_skeleton(capture, Similarity(torch.from_numpy(matrix)), cameras)
+    )
     if frame.is_open and capture.around is None:
         train = splits["train"]
         seen = [shots[i] for i in train.tolist()]

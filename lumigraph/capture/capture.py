@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
+from ..datasets.skeleton import Skeleton
 from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
@@ -101,6 +102,7 @@ class Capture:
     origin:   of the source's frame on Earth; its axes then point east, north and up, in metres
     notes:     what its user should know, one sentence each
     tracks:   boxes of rigid things that move, source's frame and units, moments as in `Shot.time`
+    skeleton: bones of a character at all moments, source's frame and units
     kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
 
@@ -119,6 +121,7 @@ class Capture:
     origin: GeographicOrigin | None = None
     notes: list[str] = field(default_factory=list)
     tracks: tuple[BoxTrack, ...] = ()
+    skeleton: Skeleton | None = None
     kept: bool = False
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:

@@ -21,6 +21,7 @@ from ..files.ranges import Coordinate, Point, Row, Share, between, typed
 from ..geometry import Similarity, is_similarity
 from ..geometry import Vector as Vector
 from .images import UNKNOWN_INDEX, ImageStore, Layer, cosines, resized
+from .skeleton import Skeleton
 from .tracks import BoxTrack
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
@@ -95,6 +96,7 @@ class Frame:
     origin:      of the capture's frame on Earth, where its photographs' GPS has determined it
     train_count: photographs to learn from; 0 where that is not known
     tracks:      boxes of rigid things that move, in the scene's frame
+    skeleton:    bones of a character at all moments, in the scene's frame
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -110,6 +112,7 @@ class Frame:
     origin: GeographicOrigin | None = None
     train_count: Annotated[int, between(0, 10**6)] = 0
     tracks: tuple[BoxTrack, ...] = ()
+    skeleton: Skeleton | None = None
 
     @property
     def is_open(self) -> bool:

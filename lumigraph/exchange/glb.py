@@ -88,13 +88,14 @@ def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
             raise LumigraphError(f"{file.path} has node {index} in two places, where nodes are trees; export it again")
         seen.add(index)
         node = file.one(about.nodes, index, "node")
-        matrix = above @ _matrix(file, node)
+        matrix = above @ node_matrix(file, node)
         if node.mesh is not None:
             yield node.mesh, matrix
         waiting += [(child, matrix) for child in reversed(node.children)]
 
 
-def _matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
+def node_matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
+    """From a node's frame to its parent's."""
     sizes = len(node.rotation), len(node.scale), len(node.translation), len(node.matrix or range(16))
     if sizes != (4, 3, 3, 16):
         raise LumigraphError(f"{file.path} has a node whose place is no place; export it again")

@@ -25,7 +25,7 @@ MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
 VERTICES, INDICES = 34962, 34963  # section 5.11.5: what a part of the buffer is for
 KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # 3.6.2.2
 NUMBERS = {np.dtype(kind): number for number, kind in KINDS.items()}
-SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 NAMES = {width: name for name, width in SHAPES.items()}
 
 Index = Annotated[int, between(0, 1 << 32)]
@@ -60,6 +60,8 @@ class Buffer(msgspec.Struct, rename="camel"):
 
 class Primitive(msgspec.Struct, rename="camel"):
     attributes: dict[str, Index]
+    indices: Index | None = None
+    material: Index | None = None
     mode: int = 4
     extensions: dict[str, Any] = {}
     extras: Any = None
@@ -72,12 +74,73 @@ class GltfMesh(msgspec.Struct, rename="camel"):
 class Node(msgspec.Struct, rename="camel"):
     """A place in the scene: a matrix, or a scale, a rotation (x, y, z, w) and a translation, in this order."""
 
+    name: str = ""
     mesh: Index | None = None
+    skin: Index | None = None
     children: list[Index] = []
     matrix: Matrix | None = None
     rotation: tuple[Coordinate, ...] = (0.0, 0.0, 0.0, 1.0)
     scale: tuple[Coordinate, ...] = (1.0, 1.0, 1.0)
     translation: tuple[Coordinate, ...] = (0.0, 0.0, 0.0)
+
+
+class Skin(msgspec.Struct, rename="camel"):
+    """Joints that move a mesh (section 3.7.3)."""
+
+    joints: list[Index]
+    inverse_bind_matrices: Index | None = None
+
+
+class Target(msgspec.Struct, rename="camel"):
+    """What a channel moves."""
+
+    path: str
+    node: Index | None = None
+
+
+class Channel(msgspec.Struct, rename="camel"):
+    sampler: Index
+    target: Target
+
+
+class KeyframeSampler(msgspec.Struct, rename="camel"):
+    """Keyframes: accessors of their moments and of their values."""
+
+    input: Index
+    output: Index
+    interpolation: str = "LINEAR"
+
+
+class Animation(msgspec.Struct, rename="camel"):
+    """Motion of nodes (section 3.11)."""
+
+    channels: list[Channel]
+    samplers: list[KeyframeSampler]
+    name: str = ""
+
+
+class TextureLink(msgspec.Struct, rename="camel", frozen=True):
+    index: Index
+    tex_coord: Index = 0
+
+
+class BaseColour(msgspec.Struct, rename="camel", frozen=True):
+    """Colour of a material: linear, times a texture's."""
+
+    base_color_factor: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    base_color_texture: TextureLink | None = None
+
+
+class GltfMaterial(msgspec.Struct, rename="camel"):
+    pbr_metallic_roughness: BaseColour = BaseColour()
+
+
+class GltfTexture(msgspec.Struct, rename="camel"):
+    source: Index | None = None
+
+
+class GltfImage(msgspec.Struct, rename="camel"):
+    buffer_view: Index | None = None
 
 
 class GltfScene(msgspec.Struct, rename="camel"):
@@ -92,6 +155,11 @@ class About(msgspec.Struct, rename="camel"):
     buffers: list[Buffer] = []
     meshes: list[GltfMesh] = []
     nodes: list[Node] = []
+    skins: list[Skin] = []
+    animations: list[Animation] = []
+    materials: list[GltfMaterial] = []
+    textures: list[GltfTexture] = []
+    images: list[GltfImage] = []
     scenes: list[GltfScene] = []
     scene: Index = 0
     extensions_used: list[str] = []
@@ -218,3 +286,11 @@ class File:
         if accessor.normalized and dtype.kind in "iu":
             found = np.maximum(found / np.float32(np.iinfo(dtype).max), -1)
         return found
+
+    def picture(self, index: int) -> bytes:
+        """Bytes of an image in the file. Raises LumigraphError if it lies in another one."""
+        image = self.one(self.about.images, index, "image")
+        if image.buffer_view is None:
+            raise LumigraphError(f"{self.path} leads to other files for its pictures; export it as one .glb")
+        view = self.one(self.about.buffer_views, image.buffer_view, "buffer view")
+        return self.buffer[view.byte_offset : view.byte_offset + view.byte_length]

@@ -16,6 +16,7 @@ READERS = (
     "nice_slam",
     "phones",
     "kitti",
+    "zju_mocap",
     "colmap",
     "llff",
     "light_field",

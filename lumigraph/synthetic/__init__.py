@@ -10,6 +10,8 @@
     write_blender(stage, folder)                          the same for other tools
 
     open_scene("procedural:city,crossings=6")             scenes may have options of their own
+    open_scene("procedural:walker,jitter_bones=5")        a character and its skeleton, its bones 5 degrees off
+    open_scene("procedural:character,file=fox.glb")       the same of a skinned mesh
     open_scene("procedural:room,depth,views=300")         a depth camera's film, in metres; `exact_depth` is the truth
 
     open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
@@ -126,6 +128,7 @@ def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None 
         near=stage.unit * stage.near,
         background=background,
         tracks=tuple(track.transformed(Similarity.make(stage.unit)) for track in stage.tracks),
+        skeleton=None if stage.skeleton is None else stage.skeleton.transformed(Similarity.make(stage.unit)),
         kept=kept,
     )
 

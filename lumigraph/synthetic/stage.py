@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 from ..camera import Camera
+from ..datasets.skeleton import Skeleton
 from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..files.ranges import Seed, between, typed
@@ -44,6 +45,7 @@ class SyntheticStage:
     depth_camera: measures depth beside the pictures, which the cameras' `image_index` counts; None where depth is exact
     unit:    of the source's frame to a unit of the world
     tracks:  boxes of the rigid things that move
+    skeleton: bones of a character at all moments, in the world
     error:   the length of which errors of poses are so many percent; None for the longest side of the bounds
     """
 
@@ -62,6 +64,7 @@ class SyntheticStage:
     depth_camera: DepthCamera | None = None
     unit: float = 1.0
     tracks: tuple[BoxTrack, ...] = ()
+    skeleton: Skeleton | None = None
     error: float | None = None
 
     @cached_property
@@ -97,19 +100,22 @@ class Pictures:
 
 
 def told(kind: type[Options], request: str) -> tuple[str, Options]:
-    """The name, and the options as a dataclass of whole numbers. Raises LumigraphError for one that does not exist."""
+    """The name and the options as a dataclass. Raises LumigraphError for an option that does not exist."""
     name, *rest = request.split(",")
     return name, typed(kind, dict(parse(kind, request, text) for text in rest), f"procedural:{request}")
 
 
-def parse(kind: type, request: str, text: str) -> tuple[str, int]:
-    """One option, "size=400", or a flag, "depth"."""
+def parse(kind: type, request: str, text: str) -> tuple[str, int | str]:
+    """One option, "size=400" or "file=fox.glb", or a flag, "depth"."""
     name, equals, value = text.strip().partition("=")
     known = [field.name for field in fields(kind)]
     if name not in known:
         raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(known)}")
-    if not equals and get_type_hints(kind, include_extras=True)[name] == Flag:
+    meant = get_type_hints(kind, include_extras=True)[name]
+    if not equals and meant == Flag:
         return name, 1
+    if meant is str:
+        return name, value
     if not value.isdecimal() or len(value) > MAX_DIGITS:
         raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
     return name, int(value)

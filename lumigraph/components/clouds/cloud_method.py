@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -27,7 +28,7 @@ from ..training.pose_refinement import PoseRefinement
 from .addition import Addition, Step
 from .appearance import SplatAppearance
 from .cloud import Cloud, picture_share, thinned
-from .dense_points import compile_sweep, seen_points
+from .dense_points import Points, compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl
 from .initialization import cloud_of, initial_cloud, random_cloud, surface_cloud
 from .interval_schedule import intervals
@@ -91,14 +92,17 @@ class CloudMethod(Method, ABC):
             compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        c, cap = self.config, self.density_control.max_count(self.cloud)
-        counts = min(c.initial_gaussians, cap), cap
         sweep = cache(partial(seen_points, data, SWEEP_SHARE * seconds))
-        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
-        self.begin_with(found, data.cameras[data.splits["train"]])
+        self.begin_with(self.first_cloud(data, sweep), data.cameras[data.splits["train"]])
         for part in self.additions:
             part.begin_scene(self, data, sweep)
         super().begin(data, seconds)
+
+    def first_cloud(self, data: Scene, sweep: Callable[[], Points]) -> Gaussians:
+        """The cloud to begin with, of the photographs. sweep: gives points that plane sweeps find"""
+        c, cap = self.config, self.density_control.max_count(self.cloud)
+        counts = min(c.initial_gaussians, cap), cap
+        return initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:

@@ -268,4 +268,5 @@ def sampling_bytes(frame: Frame, config: Any, learning: bool) -> int:
         return 0 if masked else kept * learning
     width = getattr(config, "table_width", config.hidden_width)
     kept = config.table.activation_bytes(config.occupancy.samples_per_step, width)
-    return kept * learning + sum(x.further_bytes(frame, learning) for x in (config.occupancy, config.proposals))
+    grids = [config.occupancy, *([config.proposals] if hasattr(config, "proposals") else [])]
+    return kept * learning + sum(x.further_bytes(frame, learning) for x in grids)

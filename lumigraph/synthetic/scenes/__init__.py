@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from types import ModuleType
+from typing import Any
 
 from ...errors import LumigraphError
 from .. import categories
@@ -20,7 +21,7 @@ def options(name: str) -> type[Pictures]:
     return getattr(scene(name), "Options", Pictures)
 
 
-def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: int) -> SyntheticStage:
+def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: Any) -> SyntheticStage:
     """Build a scene. size: of the pictures, pixels; views: for training; seed: fixes where cameras stand; further: what
     else its `Options` have. Raises LumigraphError for a name that nothing here has."""
     return scene(name).stage(size, views, seed, **further)

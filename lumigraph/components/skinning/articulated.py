@@ -1,0 +1,31 @@
+"""Articulated: what methods of bodies on bones share, their moment and a user's poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ...camera import Camera
+from ...method import Method
+from ...method.controls import Value
+from .bone_motion import CAPTURED, BoneMotion, clip_of
+
+
+class Articulated(Method):
+    """A Method with a BoneMotion as `bones`."""
+
+    bones: BoneMotion
+
+    def moment_of(self, camera: Camera | None = None) -> float:
+        """The shown moment: of the settings, else of the camera, else the first."""
+        if "time" not in self.settings and camera is not None and camera.time is not None:
+            return float(camera.time[0])
+        first, _ = self.frame.times or (0.0, 0.0)
+        return float(self.settings.get("time", first))
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError
+        for a file that holds none of this character."""
+        told = super().given(*evidence, **controls)
+        if (path := str(controls.get("pose", CAPTURED))) != CAPTURED:
+            clip_of(path, self.frame)
+        return told

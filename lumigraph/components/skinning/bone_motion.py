@@ -1,0 +1,197 @@
+"""Bones of a character at any moment, with learnt corrections of its pose (Weng 2022, section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from ...datasets.scene import Frame
+from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
+from ...errors import LumigraphError
+from ...exchange.bones import SUFFIXES, read_motion
+from ...files.ranges import Layers, LearningRate, Share, Width
+from ...geometry import multiply, to_matrix, to_quaternion
+from ...method import Part
+from ...method.controls import Control, moment
+from ..training.pose_refinement import PoseAdam
+from ..training.schedules import falling
+
+CAPTURED = "captured"  # value of the control `pose` for the bones of the capture
+FALL = 0.05  # of the rate of corrections that is left at the end of the budget
+MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
+MIN_ANGLE = 1e-8  # radians, squared, against division by zero
+KEPT_CLIPS = 8  # files of poses that are kept in memory
+
+
+@dataclass(frozen=True)
+class BoneNumbers:
+    """A Config's numbers of the corrections of poses."""
+
+    pose_correction: Literal["no", "table", "network"] = "network"  # corrections of joints: none, of each moment, a MLP
+    pose_lr: LearningRate = 5e-5  # learning rate of the corrections; of a table in radians a step
+    pose_from: Share = 0.0  # share of the budget before corrections are learnt; later: a better body first
+    pose_width: Width = 256  # channels of the network's layers
+    pose_depth: Layers = 4  # its hidden layers
+
+
+class BoneMotion(Part):
+    """Transforms of bones from rest to a moment: M_k = G_k G_k(rest)^-1.
+
+    Every joint turns in its parent by the capture's rotation and a learnt one (Weng 2022, eq. 6); lengths of bones
+    stay. Between two moments of the capture joints are interpolated.
+    turns:    learnt rotation vectors of each moment's joints, radians, one after another, with "table"
+    network:  angles of all joints to these, with "network"
+    """
+
+    times: Tensor
+    positions: Tensor
+    quaternions: Tensor
+    home: Tensor
+    back: Tensor
+    given_angles: Tensor
+
+    def __init__(self, frame: Frame, numbers: BoneNumbers):
+        super().__init__()
+        skeleton = skeleton_of(frame)
+        self.numbers, self.skeleton, self.frame = numbers, skeleton, frame
+        local = local_of(skeleton.parents, skeleton.track())
+        for name, value in (
+            ("times", torch.tensor(skeleton.times)),
+            ("positions", local[..., 3].float()),
+            ("quaternions", to_quaternion(local[..., :3]).float()),
+            ("home", rigid_inverse(skeleton.rest.matrices).float()),
+            ("back", to_quaternion(local_of(skeleton.parents, skeleton.rest.matrices)[..., :3].mT).float()),
+        ):
+            self.register_buffer(name, value, persistent=False)
+        self.register_buffer("given_angles", self.angles_of(self.quaternions), persistent=False)
+        bones, n = len(skeleton), numbers
+        self.turns = nn.Parameter(torch.zeros(len(skeleton.times) * bones, 3)) if n.pose_correction == "table" else None
+        self.network: nn.Sequential | None = None
+        if n.pose_correction == "network":
+            widths = [self.given_angles.shape[1], *[n.pose_width] * n.pose_depth]
+            layers = [x for a, b in zip(widths, widths[1:], strict=False) for x in (nn.Linear(a, b), nn.ReLU())]
+            last = nn.Linear(widths[-1], 3 * bones)
+            nn.init.uniform_(last.weight, -MIN_OUTPUT, MIN_OUTPUT)
+            nn.init.zeros_(last.bias)
+            self.network = nn.Sequential(*layers, last)
+
+    # Corrections
+
+    def angles_of(self, turns: Float[Tensor, "moment bone 4"]) -> Float[Tensor, "moment angle"]:
+        """Omega: rotation vectors of joints in their parents from their pose at rest, radians, but for roots."""
+        moved = multiply(self.back.expand_as(turns).flatten(0, 1), turns.flatten(0, 1))
+        vectors = rotation_vectors(moved).view(len(turns), -1, 3)
+        return vectors[:, [parent >= 0 for parent in self.skeleton.parents]].flatten(1)
+
+    def corrections(self) -> Float[Tensor, "moment bone 3"] | None:
+        """Learnt rotation vectors of all joints, radians; None without any. Those of a table have no mean over learnt
+        moments, for it would be another body at rest."""
+        if self.turns is not None:
+            turns = self.turns.view(len(self.times), -1, 3)
+            learnt = (turns.detach() != 0).any(-1, keepdim=True)
+            mean = turns.detach().sum(0) / learnt.sum(0).clamp_min(1)
+            return turns - learnt * mean
+        return None if self.network is None else self.network(self.given_angles).view(len(self.times), -1, 3)
+
+    def corrected(self) -> Float[Tensor, "moment bone 4"]:
+        """Rotations of joints in their parents, with corrections."""
+        turns = self.corrections()
+        if turns is None:
+            return self.quaternions
+        return multiply(self.quaternions.flatten(0, 1), exponential(turns.flatten(0, 1))).view_as(self.quaternions)
+
+    # At moments
+
+    def local(self, times: Float[Tensor, " time"]) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
+        """Rotations and positions of joints in their parents at moments of the capture."""
+        before, after, share = between_moments(self.times, times.to(self.times))
+        turns, share = self.corrected(), share[:, None, None]
+        first, second = turns[before], turns[after]
+        second = torch.where((first * second).sum(-1, keepdim=True) < 0, -second, second)
+        return torch.lerp(first, second, share), torch.lerp(self.positions[before], self.positions[after], share)
+
+    def shown(
+        self, method: Any, times: Float[Tensor, " time"]
+    ) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
+        """The same under the method's settings: of the capture, or of a user's poses."""
+        if (path := str(method.settings.get("pose", CAPTURED))) == CAPTURED:
+            return self.local(times)
+        clip = clip_of(path, self.frame)
+        first, last = self.frame.times or (0.0, 1.0)
+        share = (times.cpu() - first) / (last - first)
+        turns, places = clip.local(clip.times[0] + share * (clip.times[-1] - clip.times[0]))
+        return turns.to(times.device), places.to(times.device)
+
+    def transforms(
+        self, turns: Float[Tensor, "time bone 4"], places: Float[Tensor, "time bone 3"]
+    ) -> Float[Tensor, "time bone 3 4"]:
+        """Transforms of the bones from rest to poses that are given in their parents."""
+        matrices = to_matrix(turns.flatten(0, 1)).view(len(turns), -1, 3, 3)
+        joints = posed(self.skeleton.parents, torch.cat([matrices, places[..., None]], -1))
+        return rigid_product(joints, self.home.expand_as(joints))
+
+    def at(self, method: Any, time: float) -> Float[Tensor, "bone 3 4"]:
+        """Transforms of the bones at a moment under the method's settings."""
+        return self.transforms(*self.shown(method, torch.tensor([time], device=self.times.device)))[0]
+
+    # Learning
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        rate = self.numbers.pose_lr
+        if self.turns is not None:
+            return [PoseAdam([{"name": "bones", "params": [self.turns]}], rate)]
+        if self.network is None:
+            return []
+        return [torch.optim.Adam([{"name": "bones", "params": list(self.network.parameters())}], rate)]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        rate = self.numbers.pose_lr
+        return {"bones": falling(rate, FALL * rate, progress) if progress >= self.numbers.pose_from else 0.0}
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        about = "Bones that are shown: those of the capture, or of a file of poses; `time` then plays that file."
+        pose = Control("pose", CAPTURED, choices=(CAPTURED,), files=SUFFIXES, about=about)
+        return (*((moment(self.frame.times),) if self.frame.times else ()), pose)
+
+
+def skeleton_of(frame: Frame) -> Skeleton:
+    """The skeleton of a scene. Raises LumigraphError without one."""
+    if frame.skeleton is None:
+        raise LumigraphError(
+            "The scene has no skeleton, and this method moves a body by one; put bones.json beside the photographs, as "
+            "docs/datasets.md says"
+        )
+    return frame.skeleton
+
+
+@lru_cache(KEPT_CLIPS)
+def _clip(path: Path, changed: int, frame: Frame) -> BoneMotion:
+    poses = read_motion(path, skeleton_of(frame), frame.to_source.inverse)
+    return BoneMotion(replace(frame, skeleton=poses), BoneNumbers("no"))
+
+
+def clip_of(path: str, frame: Frame) -> BoneMotion:
+    """Poses in a file for the bones of a scene, at its moments. Raises LumigraphError for a file without any."""
+    file = Path(path).expanduser()
+    return _clip(file, file.stat().st_mtime_ns if file.is_file() else 0, frame)
+
+
+def exponential(omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 4"]:
+    """Quaternions of rotation vectors; differentiable at zero as well."""
+    half = 0.5 * omega.square().sum(-1, keepdim=True).clamp_min(MIN_ANGLE).sqrt()
+    return normalize(torch.cat([half.cos(), 0.5 * torch.sinc(half / torch.pi) * omega], -1), dim=-1)
+
+
+def rotation_vectors(quaternions: Float[Tensor, "row 4"]) -> Float[Tensor, "row 3"]:
+    """Rotation vectors of unit quaternions, at most half a turn."""
+    upright = torch.where(quaternions[:, :1] < 0, -quaternions, quaternions)
+    sine = upright[:, 1:].norm(dim=-1, keepdim=True)
+    return 2 * torch.atan2(sine, upright[:, :1]) * upright[:, 1:] / sine.clamp_min(1e-12)

@@ -1,0 +1,62 @@
+"""A cloud of Gaussians that bones move: linear blend skinning of centres and rotations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ...datasets.scene import Frame
+from ...gaussians import Gaussians
+from ...geometry import multiply, to_quaternion
+from ..clouds.addition import Addition, Step
+from .bone_motion import BoneMotion, BoneNumbers
+from .weight_volume import WeightNumbers, WeightVolume, segments
+
+
+class SkinnedCloud(Addition):
+    """The canonical cloud, posed to the moment of a photograph before it is rasterized.
+
+    bones:   transforms of the bones at a moment
+    weights: shares of the bones at the canonical centres
+    """
+
+    def __init__(self, frame: Frame, bones: BoneNumbers, weights: WeightNumbers):
+        super().__init__()
+        self.bones, self.weights = BoneMotion(frame, bones), WeightVolume(frame, weights)
+
+    def first_means(self, count: int, generator: torch.Generator) -> Float[Tensor, "gaussian 3"]:
+        """Random places about the bones at rest, evenly along them, as far from them as their first weights reach."""
+        skeleton = self.bones.skeleton
+        bones = segments(skeleton.parents, skeleton.rest.matrices[:, :, 3].float())
+        starts, ends = (torch.cat(side) for side in zip(*bones, strict=True))
+        size = float((torch.cat([starts, ends]).amax(0) - torch.cat([starts, ends]).amin(0)).max())
+        radius = self.weights.numbers.bone_radius * size
+        chosen = torch.multinomial((ends - starts).norm(dim=1) + radius, count, True, generator=generator)
+        share = torch.rand(count, 1, generator=generator)
+        return torch.lerp(starts[chosen], ends[chosen], share) + radius * torch.randn(count, 3, generator=generator)
+
+    def before_raster(self, method: Any, step: Step) -> None:
+        step.cloud = self.at(method, step.cloud, method.moment_of(step.camera))
+
+    def at(self, method: Any, cloud: Gaussians, time: float) -> Gaussians:
+        """The cloud at a moment under the method's settings."""
+        return skinned(cloud, self.weights(cloud.means), self.bones.at(method, time))
+
+
+def skinned(
+    cloud: Gaussians, weights: Float[Tensor, "gaussian bone"], transforms: Float[Tensor, "bone 3 4"]
+) -> Gaussians:
+    """The cloud moved by bones (Pokhariya 2024, section 4.1): m' = sum_k w_k M_k m, and q' = r q with the normalised
+    blend r of the bones' rotations, whose signs are those of the first bone."""
+    turns = to_quaternion(transforms[:, :, :3].detach()).to(transforms)
+    turns = torch.where(turns @ turns[:1].T < 0, -turns, turns)
+    blend = weights @ transforms.flatten(1)
+    moved = blend.view(-1, 3, 4)
+    means = (moved[:, :, :3] @ cloud.means[:, :, None])[:, :, 0] + moved[:, :, 3]
+    turn = normalize(weights @ turns, dim=-1)
+    return replace(cloud, means=means, quaternions=multiply(turn, cloud.quaternions))

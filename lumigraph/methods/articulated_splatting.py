@@ -1,0 +1,137 @@
+"""Articulated splatting: Gaussians that bones move with learnt weights (MANUS, Pokhariya et al. 2024)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from ..camera import Camera
+from ..camera.rays import Rendering
+from ..components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ..components.clouds.appearance import AppearanceNumbers
+from ..components.clouds.cloud import RateNumbers
+from ..components.clouds.cloud_method import BLACK, CloudMethod
+from ..components.clouds.density_control import RefineNumbers
+from ..components.clouds.initialization import Initialization, round_gaussians
+from ..components.clouds.tidying import Tidying, TidyingNumbers
+from ..components.skinning.articulated import Articulated
+from ..components.skinning.bone_motion import BoneNumbers
+from ..components.skinning.contact import PICTURE, bodies_of, contact_control, contact_map
+from ..components.skinning.skinned_cloud import SkinnedCloud
+from ..components.skinning.weight_volume import WeightNumbers
+from ..datasets.scene import Frame, Photograph, Scene
+from ..files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between
+from ..gaussians import Gaussians
+from ..gaussians.moving import MovingGaussians, fitted
+from ..gaussians.splatting import render
+from ..method.controls import Control
+
+MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
+
+
+@dataclass(frozen=True)
+class Config:
+    """Numbers of MANUS from memory, and Kerbl's (2023) of the cloud; `cpu_preset` has those of a plain CPU."""
+
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
+    sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
+    ssim_weight: Share = 0.2  # share of D-SSIM in the loss; higher gives structure more weight
+    initialization: Initialization = "random"  # first Gaussians: about the bones, whatever it says
+    initial_gaussians: CloudSize = 10_000  # random Gaussians about the bones at first
+    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
+    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
+    isotropy_weight: NonNegative = 0.01  # weight of long Gaussians, which tear at joints; higher: rounder
+    contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
+    bones: BoneNumbers = BoneNumbers("table", pose_lr=2e-2, pose_from=0.1)
+    weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
+    rates: RateNumbers = RateNumbers()
+    refine: RefineNumbers = RefineNumbers()
+    adaptive: AdaptiveNumbers = AdaptiveNumbers()
+    photographs: AppearanceNumbers = AppearanceNumbers(appearance="no")
+    tidying: TidyingNumbers = TidyingNumbers(limit_anisotropy=True)
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+class ArticulatedSplatting(Articulated, CloudMethod):
+    """A canonical cloud on bones, posed to the moment of a photograph before it is rasterized."""
+
+    Config = Config
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        self.poses = None
+        self.density_control = AdaptiveDensity(c.refine, c.adaptive, len(self.cloud))
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            self.skin = SkinnedCloud(frame, c.bones, c.weights)
+        self.bones = self.skin.bones
+        self.tidying = Tidying(c.tidying)
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """A smaller cloud without view dependence, a coarser volume, and higher rates for few steps."""
+        c = Config(sh_degree=0, initial_gaussians=6000, half_resolution_until=0.3)
+        c = replace(c, refine=RefineNumbers(30_000, cap_ramp=True), rates=RateNumbers(most_haste=4.0))
+        return replace(c, weights=replace(c.weights, weight_cells=24))
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some hundred Gaussians on bones, refined within some twenty quick steps."""
+        refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
+        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
+        c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, refine=refine, adaptive=adaptive)
+        return replace(c, weights=WeightNumbers(8, 0, 1e-2, 0.2))
+
+    def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
+        """Round Gaussians about the bones at rest, in random colours."""
+        generator, cap = self.random(1), self.density_control.max_count(self.cloud)
+        means = self.skin.first_means(min(self.config.initial_gaussians, cap), generator)
+        return round_gaussians(means, torch.rand(len(means), 3, generator=generator), self.config.sh_degree)
+
+    def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
+        """The cloud's terms, and the isotropy of its Gaussians: the mean excess of their ratios of deviations."""
+        terms = super().loss(batch, step)
+        if self.config.isotropy_weight:
+            ratio = (self.cloud.log_scales.amax(-1) - self.cloud.log_scales.amin(-1)).exp()
+            terms["isotropy"] = self.config.isotropy_weight * (ratio - MAX_RATIO).clamp_min(0).mean()
+        return terms
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        several = len(set(bodies_of(self.bones.skeleton.parents).tolist())) > 1
+        return (*super().controls, *((contact_control(),) if several else ()))
+
+    def body_of(self, canonical: Gaussians) -> Int[Tensor, " gaussian"]:
+        """Number of the body, a tree of bones, that each Gaussian of the canonical cloud moves with."""
+        trees = torch.from_numpy(bodies_of(self.bones.skeleton.parents)).to(self.device)
+        shares = self.skin.weights(canonical.means)
+        return shares.new_zeros(len(shares), int(trees.max()) + 1).index_add(1, trees, shares).argmax(1)
+
+    def at(self, canonical: Gaussians, time: float) -> Gaussians:
+        """A canonical cloud at a moment under the settings, as a picture or a map of contact."""
+        cloud = self.skin.at(self, canonical, time)
+        if self.settings.get("show", PICTURE) == PICTURE:
+            return cloud
+        return contact_map(cloud, self.body_of(canonical), self.config.contact_distance)
+
+    def gaussians(self) -> Gaussians:
+        return self.at(super().gaussians(), self.moment_of())
+
+    @torch.no_grad()
+    def moving(self, duration: float) -> MovingGaussians:
+        """The cloud with its motion, of the capture or of the poses of the settings, played in so many seconds."""
+        first, last = self.frame.times or (0.0, 1.0)
+        at = partial(self.at, super().gaussians())
+        return fitted(lambda share: at(first + share * (last - first)), duration)
+
+    @torch.no_grad()
+    def rasterized(self, camera: Camera) -> Rendering:
+        cloud = self.at(self.filtered(), self.moment_of(camera))
+        return render(cloud, camera, BLACK, self.near_plane)

@@ -1,0 +1,149 @@
+"""HumanNeRF: a person before one camera, as a canonical field under skeletal and non-rigid motion (Weng 2022)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...camera.rays import Rays
+from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
+from ...components.fields.hash_field import HashField, HashNumbers
+from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampling_bytes
+from ...components.sampling.spaces import Box
+from ...components.skinning.articulated import Articulated
+from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
+from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
+from ...components.training.photometric import backdrop
+from ...components.training.schedules import held_decay
+from ...datasets.scene import Batch, Frame
+from ...files.ranges import LearningRate, Seed, Width, between
+from ...method import FieldMethod
+from ...method.field import Densities, Points
+from ...method.sampler import Density
+from ...volume import composite
+from .fields import NonRigidNumbers, NonRigidOffset, PosedField
+
+PROBED_MOMENTS = 8  # at which an update of the occupancy grid asks for density
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers from memory; `HumanNeRF.preset` has those of a plain CPU."""
+
+    network: NetworkNumbers = NetworkNumbers()
+    table: HashNumbers = HashNumbers(sh_bands=1)
+    occupancy: OccupancyNumbers = OccupancyNumbers()
+    steps: StepNumbers = StepNumbers(256)
+    bones: BoneNumbers = BoneNumbers(pose_from=0.05)
+    weights: WeightNumbers = WeightNumbers()
+    nonrigid: NonRigidNumbers = NonRigidNumbers()
+    field: Literal["hash", "network"] = "network"  # canonical field: the paper's network, or a faster hash table
+    hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
+    learning_rate: LearningRate = 5e-4  # Adam's learning rate of the canonical field at first
+    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
+    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+
+
+class HumanNeRF(Articulated, FieldMethod):
+    """A canonical field, and the way to it from a body in any pose."""
+
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    network: PosedField
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        space = Box(frame.bounds, frame.near)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            self.bones = BoneMotion(frame, c.bones)
+            canonical: Any
+            if c.field == "hash":
+                canonical = HashField(c.table, c.hidden_width, space, max(frame.reach, 1.0))
+            else:
+                canonical = CoordinateField(c.network, c.hidden_width, space)
+            offset = NonRigidOffset(self.bones.given_angles.shape[1], c.nonrigid)
+            self.network = PosedField(canonical, WeightVolume(frame, c.weights), len(self.bones.skeleton), offset)
+        self.sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps=c.steps)
+
+    @classmethod
+    def cpu_preset(cls) -> Any:
+        """A hash table as canonical field, a learnt volume of weights, a small offset, and higher rates."""
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
+        c = replace(c, table=replace(c.table, sh_bands=1), decay_start=0.3)
+        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
+        c = replace(c, bones=BoneNumbers("table", pose_lr=2e-3, pose_from=0.1))
+        c = replace(c, weights=WeightNumbers(24, 0, 1e-2))
+        return replace(c, nonrigid=NonRigidNumbers(2, 32, 1, 4, 0.3, 0.7, 1e-3))
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A tiny table under tiny motions within some twenty quick steps."""
+        c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
+        c = replace(
+            c, bones=BoneNumbers(pose_lr=1e-3, pose_width=8, pose_depth=1), weights=WeightNumbers(8, 4, 1e-2, 0.2)
+        )
+        return replace(c, nonrigid=NonRigidNumbers(2, 8, 1, 2, 0.1, 0.5, 1e-3))
+
+    # Moments
+
+    def pose(self, times: Float[Tensor, " moment"]) -> None:
+        """Put the field into the poses of moments, under the settings."""
+        turns, places = self.bones.shown(self, times)
+        self.network.pose(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
+
+    def code(self, rays: Rays) -> Float[Tensor, "#ray code"]:
+        """The row of each ray's moment among the poses that the field is put into."""
+        times, rows = self.moments(rays).unique(return_inverse=True)
+        self.pose(times)
+        return rows[:, None].float()
+
+    @property
+    def shown_code(self) -> Float[Tensor, "1 code"]:
+        self.pose(torch.tensor([self.moment_of()], device=self.device))
+        return torch.zeros(1, 1, device=self.device)
+
+    def density(self, points: Points) -> Densities:
+        return self.network.density(points, self.shown_code.expand(len(points), -1))
+
+    def density_in_training(self, generator: torch.Generator) -> Density:
+        """Density of each point at one of some random moments of the capture."""
+        moments = self.bones.times[torch.randint(len(self.bones.times), (PROBED_MOMENTS,), generator=generator)]
+
+        @torch.no_grad()
+        def density(points: Points) -> Densities:
+            before = self.network.table, self.network.angles, self.network.weights
+            self.pose(moments.to(self.device))
+            rows = torch.randint(len(moments), (len(points), 1), generator=generator).to(self.device).float()
+            found = self.network.density(points, rows)
+            self.network.table, self.network.angles, self.network.weights = before
+            return found
+
+        return density
+
+    # Learning
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The squared error of colours before random backgrounds, without LPIPS (section 3.4)."""
+        generator = self.random(step)
+        (samples,), terms = self.learn(batch.rays, generator)
+        background = backdrop(batch, self.background, generator, opaque=False)
+        look = samples.look(self.network)
+        seen = composite(look.samples, look.density, look.rgb, background)
+        error = (seen.rgb - batch.before(background)).square().mean()
+        self.figures["mse"] = float(error.detach())
+        return {"colour": error, **terms}
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        c, canonical = self.config, self.network.canonical
+        if isinstance(canonical, HashField):
+            own = canonical.optimizers_at(c.learning_rate)
+        else:
+            own = [torch.optim.Adam(canonical.parameters(), c.learning_rate)]
+        return [*own, *super().optimizers()]

@@ -1,0 +1,157 @@
+"""Articulated splatting and HumanNeRF: skinning and its inverse, weights, corrections, poses of a user, motions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+from bodies import BEND, bent, frame, skeleton
+from budgets import budget
+
+from lumigraph.components.skinning.bone_motion import BoneMotion, BoneNumbers, exponential, rotation_vectors
+from lumigraph.components.skinning.skinned_cloud import skinned
+from lumigraph.components.skinning.weight_volume import WeightNumbers, WeightVolume, distance
+from lumigraph.datasets.skeleton import rigid_inverse, rigid_product
+from lumigraph.errors import LumigraphError
+from lumigraph.exchange.bones import write_bones
+from lumigraph.geometry import rotated, to_matrix
+from lumigraph.methods.articulated_splatting import ArticulatedSplatting
+from lumigraph.methods.humannerf import HumanNeRF
+
+pytestmark = budget("methods", 6)
+KINDS = (ArticulatedSplatting, HumanNeRF)
+SHARP = WeightNumbers(48, 0, 1e-2, 0.1)
+
+
+def moves(angle: float) -> torch.Tensor:
+    return rigid_product(bent(angle), rigid_inverse(bent(0.0))).float()
+
+
+def test_rotation_vectors_and_quaternions_are_inverses():
+    omega = 0.9 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0))
+    omega[0] = 0
+    torch.testing.assert_close(rotation_vectors(exponential(omega)), omega, atol=1e-4, rtol=1e-4)
+    x = torch.tensor([[0.0, 1.0, 2.0]]).expand(20, 3)
+    turned = (to_matrix(exponential(omega)) @ x[:, :, None])[:, :, 0]
+    torch.testing.assert_close(turned, rotated(x, omega), atol=1e-4, rtol=1e-4)
+
+
+def test_bones_at_moments_and_between():
+    motion = BoneMotion(frame(), BoneNumbers("no"))
+    found = motion.transforms(*motion.local(torch.tensor([1.0, 2.0, 3.0])))
+    torch.testing.assert_close(found, torch.stack([moves(a) for a in (0.0, BEND / 2, BEND)]), atol=1e-5, rtol=0)
+
+
+def test_a_correction_turns_a_joint_in_its_parent():
+    motion = BoneMotion(frame(), BoneNumbers("table"))
+    turns = motion.turns.data.view(2, 2, 3)  # moment, bone
+    turns[0, 1, 0], turns[1, 1, 0] = BEND, -BEND
+    (found,) = motion.transforms(*motion.local(torch.tensor([1.0])))
+    torch.testing.assert_close(found, moves(BEND), atol=1e-5, rtol=0)
+    turns[:, 1, 0] += 0.3  # a mean is another body at rest
+    torch.testing.assert_close(motion.transforms(*motion.local(torch.tensor([1.0])))[0], found, atol=1e-5, rtol=0)
+    network = BoneMotion(frame(), BoneNumbers("network", pose_width=4, pose_depth=1))
+    torch.testing.assert_close(network.corrected(), network.quaternions, atol=1e-3, rtol=0)  # hardly any at first
+
+
+def test_weights_begin_at_the_nearest_bone_and_sum_to_one():
+    volume = WeightVolume(frame(), SHARP)
+    points = torch.tensor([[0.0, 0.0, -0.3], [0.02, 0.0, 0.2], [0.0, 0.03, 0.0]])
+    weights = volume(points)
+    torch.testing.assert_close(weights.sum(1), torch.ones(3))
+    assert weights[0, 0] > 0.95 and weights[1, 1] > 0.95 and 0.2 < weights[2, 0] < 0.8
+    coded = WeightVolume(frame(), replace(SHARP, weight_code=4))
+    torch.testing.assert_close(coded.weights(), volume.weights())
+    away = distance(torch.tensor([[1.0, 0, 0.5], [0, 0, 2.0]]), torch.zeros(1, 3), torch.tensor([[0, 0, 1.0]]))
+    torch.testing.assert_close(away, torch.tensor([1.0, 1.0]))
+
+
+def test_one_bone_moves_its_gaussians_rigidly():
+    cloud = ArticulatedSplatting(frame(), ArticulatedSplatting.smallest()).cloud.gaussians()
+    weights = torch.zeros(len(cloud), 2)
+    weights[:, 1] = 1
+    found, (_, upper) = skinned(cloud, weights, moves(BEND)), moves(BEND)
+    torch.testing.assert_close(found.means, cloud.means @ upper[:, :3].T + upper[:, 3])
+    expected = upper[:, :3] @ to_matrix(cloud.quaternions)
+    torch.testing.assert_close(to_matrix(found.quaternions), expected, atol=1e-5, rtol=0)
+    still = skinned(cloud, torch.full((len(cloud), 2), 0.5), moves(0.0))
+    torch.testing.assert_close(still.means, cloud.means)
+
+
+def test_inverse_skinning_leads_back_to_rest():
+    method = HumanNeRF(frame(), replace(HumanNeRF.smallest(), weights=SHARP)).eval()
+    rest = torch.tensor([[0.01, 0.0, -0.3], [0.0, 0.02, 0.2], [0.0, 0.0, 0.18]])
+    upper = moves(BEND)[1]
+    posed = torch.cat([rest[:1], rest[1:] @ upper[:, :3].T + upper[:, 3]])
+    method.pose(torch.tensor([1.0, 3.0]))
+    found, body = method.network.at_rest(posed, torch.ones(3, dtype=torch.long))
+    torch.testing.assert_close(found, rest, atol=1e-2, rtol=0)
+    assert (body > 0.5).all()
+    _, nobody = method.network.at_rest(rest[1:], torch.ones(2, dtype=torch.long))  # where the upper half was
+    assert (nobody < 0.05).all()
+
+
+def test_density_without_gradients_is_the_same():
+    method = HumanNeRF(frame(), HumanNeRF.smallest()).eval()
+    method.network.offset.alpha.fill_(1.0)
+    method.pose(torch.tensor([1.0, 3.0]))
+    points = 0.8 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.4
+    rows = (torch.arange(200) % 2)[:, None].float()
+    with torch.no_grad():
+        quick = method.network.density(points, rows)
+    torch.testing.assert_close(quick, method.network.geometry(points, rows)[0].detach(), atol=2e-3, rtol=1e-3)
+
+
+def test_the_offset_joins_over_its_share_of_the_budget():
+    offset = HumanNeRF(frame(), HumanNeRF.smallest()).network.offset
+    points, angles = torch.rand(5, 3), torch.rand(5, 3)
+    torch.nn.init.ones_(offset.network.last.bias)
+    offset.before_step(None, 0, 0.05)
+    torch.testing.assert_close(offset(points, angles), points)
+    offset.before_step(None, 0, 0.9)
+    assert float(offset.alpha) == offset.numbers.nonrigid_frequencies
+    assert not torch.allclose(offset(points, angles), points)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_poses_of_a_user(kind, tmp_path):
+    method, camera = kind(frame(), kind.smallest()).eval(), tiny.scene().cameras[0]
+    if kind is HumanNeRF:
+        method.network.canonical.density_network.weights[-1].data[0] += 1.0  # something to see
+    angles, bones = tmp_path / "angles.json", tmp_path / "bones.json"
+    angles.write_text(json.dumps({"format": "lumigraph bones 1", "angles": {"upper": [90.0, 0.0, 0.0]}}))
+    write_bones(bones, replace(skeleton(), times=(7.0,), poses=skeleton().poses[1:]))
+    last = method.given(time=3.0).render(camera).rgb
+    for path in (angles, bones):
+        posed = method.given(pose=str(path))
+        torch.testing.assert_close(posed.bones.at(posed, 1.0), moves(BEND), atol=1e-5, rtol=0)
+        if kind is ArticulatedSplatting:
+            torch.testing.assert_close(posed.render(camera).rgb, last, atol=1e-4, rtol=0)
+    with pytest.raises(LumigraphError, match="does not exist"):
+        method.given(pose=str(tmp_path / "nothing.json"))
+    with pytest.raises(LumigraphError, match="is no choice"):
+        method.given(pose="dance")
+    write_bones(bones, replace(skeleton(), names=("a", "b")))
+    with pytest.raises(LumigraphError, match="has no bone of this character"):
+        method.given(pose=str(bones))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_scene_without_a_skeleton_is_refused(kind):
+    with pytest.raises(LumigraphError, match="no skeleton.*put bones.json"):
+        kind(replace(frame(), skeleton=None), kind.smallest())
+
+
+def test_a_motion_is_played_in_spans():
+    method = ArticulatedSplatting(frame(), ArticulatedSplatting.smallest()).eval()
+    method.skin.weights.volume.data += 0.1
+    played = method.moving(2.0)
+    for share in (0.0, 0.5, 0.98):
+        now = method.given(time=1 + 2 * share).gaussians()
+        there = played.at(2.0 * share)
+        assert len(there) == len(now)
+        size = now.log_scales.exp().amax()
+        assert torch.cdist(now.means, there.means).amin(1).max() < 0.5 * size
