@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
 from ..datasets.tracks import BoxTrack
+from ..datasets.world import Blocks
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
 
@@ -101,6 +102,7 @@ class Capture:
     origin:   of the source's frame on Earth; its axes then point east, north and up, in metres
     notes:     what its user should know, one sentence each
     tracks:   boxes of rigid things that move, source's frame and units, moments as in `Shot.time`
+    blocks:   of a block world, cubes with an edge of one unit of the source
     kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
 
@@ -120,6 +122,7 @@ class Capture:
     notes: list[str] = field(default_factory=list)
     tracks: tuple[BoxTrack, ...] = ()
     kept: bool = False
+    blocks: Blocks | None = None
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
         """The capture with some of its points alone."""
