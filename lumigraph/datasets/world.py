@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from .scene import Scene
@@ -35,6 +35,11 @@ class BlockWorld(Scene):
     kind: ClassVar[str] = "a block world"
 
     blocks: Blocks = Blocks(np.zeros((1, 1, 1), np.uint8))
+
+    @property
+    def label_numbers(self) -> Int[Tensor, " name"]:
+        """Number in `LABELS` of each index of the layer `labels`; the last is that of -1, the sky."""
+        return torch.tensor([*(LABELS.index(name) for name in self.layer("labels").names), LABELS.index("sky")])
 
     @property
     def blocks_from_scene(self) -> Float[Tensor, "4 4"]:

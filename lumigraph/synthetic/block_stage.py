@@ -29,8 +29,9 @@ COLOURS = {
     "snow": ((0.92, 0.94, 0.97), (0.98, 0.98, 0.99)),
 }
 FIELD_OF_VIEW = 70.0  # degrees
-EYE_HEIGHTS, PITCHES = (2.5, 9.0), (-28.0, 2.0)  # above the highest block around, blocks; degrees below the horizon
-WALK_HEIGHT, WALK_PITCH = 3.5, -10.0  # of the walk: blocks and degrees
+EYE_HEIGHTS = (2.5, 9.0)  # above the highest block around, blocks
+PITCHES, PITCH_SPREAD = (-35.0, 2.0), 0.1  # of cameras, degrees; deviation of the slope towards what they look at
+WALK_HEIGHT = 3.5  # of the walk above the highest block around, blocks
 WALK_RADIUS = 0.28  # of the walk around the middle, share of the world's longer side
 CLEARANCE = 2  # blocks around a camera above which it must be
 MIN_ENTROPY, MIN_DISTANCE = 0.75, 2.0  # of labels in a picture, nats; mean depth, blocks (Hao 2021, published code)
@@ -149,11 +150,10 @@ def anywhere(world: World, labels: np.ndarray, count: int, unit: float, random: 
             low, high = np.log(EYE_HEIGHTS)
             eye = np.array([x, y, clear_height(height, x, y) + math.exp(random.uniform(low, high)) - 1])
             # Towards a place in the world, so that pictures at its border are not of the sky alone.
-            target = random.uniform(0.15, 0.85, 2) * labels.shape[:2]
-            pitch = math.radians(random.uniform(*PITCHES))
-            ahead = target - eye[:2]
-            forward = np.array([*(ahead / max(np.linalg.norm(ahead), 1e-6) * math.cos(pitch)), math.sin(pitch)])
-            pose = look_at((eye - middle) / unit, (eye - middle) / unit + forward)
+            i, j = random.uniform(0.15, 0.85, 2) * labels.shape[:2]
+            ahead = np.array([i - x, j - y])
+            drop = height[int(i), int(j)] - eye[2] + random.normal(0, PITCH_SPREAD) * np.linalg.norm(ahead)
+            pose = aimed(eye, ahead, drop, np.linalg.norm(ahead), middle, unit)
             if worth_seeing(world, pose, unit):
                 break
         poses.append(pose)
@@ -182,17 +182,29 @@ def walk(labels: np.ndarray, count: int, unit: float) -> Float[np.ndarray, "came
     # The mean of the highest ground within a sixteenth of the walk, which is nowhere below the ground.
     wide = np.max([np.roll(floor, k) for k in range(-4, 5)], 0)
     level = np.mean([np.roll(wide, k) for k in range(-4, 5)], 0) + WALK_HEIGHT
-    path = np.concatenate([place, level[:, None]], -1)
+    path, centre = np.concatenate([place, level[:, None]], -1), clear_height(height, *middle[:2])
     poses = []
     for share in np.arange(count) / count:
         eye, ahead = (periodic(path, share + step) for step in (0.0, 0.02))
         flat = ahead[:2] - eye[:2]
         inward = middle[:2] - eye[:2]
         flat = flat / np.linalg.norm(flat) + 0.8 * inward / np.linalg.norm(inward)
-        pitch = math.radians(WALK_PITCH)
-        forward = np.array([*(flat / np.linalg.norm(flat) * math.cos(pitch)), math.sin(pitch)])
-        poses.append(look_at((eye - middle) / unit, (eye - middle) / unit + forward))
+        poses.append(aimed(eye, flat, centre - eye[2], np.linalg.norm(inward), middle, unit))
     return np.stack(poses)
+
+
+def aimed(
+    eye: np.ndarray, ahead: np.ndarray, drop: float, distance: float, middle: np.ndarray, unit: float
+) -> Float[np.ndarray, "3 4"]:
+    """Pose of a camera in blocks, in the tracer's unit.
+
+    ahead: horizontal direction, any length; drop, distance: height over the eye and distance of what it looks at
+    """
+    low, high = map(math.radians, PITCHES)
+    pitch = min(max(math.atan2(drop, max(distance, 1.0)), low), high)
+    flat = ahead / max(float(np.linalg.norm(ahead)), 1e-6) * math.cos(pitch)
+    place = (eye - middle) / unit
+    return look_at(place, place + np.array([*flat, math.sin(pitch)]))
 
 
 def periodic(path: Float[np.ndarray, "point 3"], share: float) -> Float[np.ndarray, " 3"]:

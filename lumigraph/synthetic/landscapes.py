@@ -20,7 +20,7 @@ from .terrain import SKY, TREE, WATER, terrain
 from .textures import Colour
 from .vector import COMPILE_OPTIONS, INNER_OPTIONS
 
-WIDTH, FINE = 96, 4  # of the land: blocks a side, points to a block
+WIDTH, FINE = 64, 4  # of the land: blocks a side, points to a block
 FIELD_OF_VIEW = 70.0  # degrees
 EYE_HEIGHTS, PITCHES = (2.5, 12.0), (-28.0, 4.0)  # above the land, blocks; degrees
 FIRST_STEP, STEP_GROWTH, FAR = 0.06, 0.008, 240.0  # of rays: blocks, share of the distance, blocks
@@ -94,15 +94,15 @@ STYLES = {
 
 
 def landscape(
-    seed: int, style: str, size: int = 128, lands: int = 1_000_000
+    seed: int, style: str, size: int = 128, land: int = 0
 ) -> tuple[Float[np.ndarray, "size size 3"], Int[np.ndarray, "size size"]]:
     """A picture, sRGB-encoded, and the label of each pixel, as `LABELS` counts them.
 
     style: a name of `STYLES`, whose light varies a little from one seed to the next
-    lands: different lands that are used; making one takes longer than the picture
+    land:  seed of the terrain, which takes longer to make than a picture
     """
     random, look = np.random.default_rng([seed, 7]), STYLES[style]
-    height, label, texture = ground(seed % lands)
+    height, label, texture = ground(land)
     origin, directions = viewpoint(height, size, random)
     azimuth = random.uniform(0, 2 * math.pi)
     elevation = math.radians(look.height * random.uniform(0.8, 1.2))
@@ -161,7 +161,7 @@ def srgb_film(rgb):
     return np.where(rgb < 0.8, rgb, 0.8 + 0.2 * np.tanh((rgb - 0.8) / 0.2)).clip(0, 1)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def ground(seed: int):
     """Height and label of the upper surface of a land, and noise that repeats."""
     height, label = terrain(WIDTH, seed, FINE).surface
