@@ -33,16 +33,18 @@ NAMED = 6  # unknown blocks in a note
 PATTERNS = tuple(
     (re.compile(pattern), label)
     for pattern, label in (
-        (r"(^|_)air$|torch|rail|flower|dandelion|poppy|orchid|allium|bluet|tulip|daisy|cornflower|lily|rose_bush", "sky"),
-        (r"peony|lilac|sunflower|^(tall_)?(sea)?grass$|^short_grass$|fern|dead_bush|sapling|mushroom$|kelp|vine", "sky"),
-        (r"sugar_cane|button|lever|sign|pressure_plate|^ladder|fence|door|cobweb|^wheat|carrots|potatoes|sweet_berry", "sky"),
+        (r"(^|_)air$|torch|rail|button|lever|sign|pressure_plate|^ladder|fence|door|cobweb", "sky"),
+        (r"flower|dandelion|poppy|orchid|allium|bluet|tulip|daisy|lily|rose_bush|peony|lilac|sugar_cane", "sky"),
+        (r"^(tall_)?(sea)?grass$|^short_grass$|fern|dead_bush|sapling|mushroom$|kelp|vine|^wheat|sweet_berry", "sky"),
+        (r"^(carrots|potatoes|beetroots)$", "sky"),
         (r"leaves|_log$|_wood$|^bamboo|cactus|_stem$|mangrove_roots|azalea", "tree"),
         (r"snow|ice$", "snow"),
         (r"water|bubble_column", "water"),
         (r"sand", "sand"),
         (r"grass_block|moss|^grass_path|mycelium|nylium", "grass"),
         (r"dirt|podzol|farmland|mud|gravel|clay|^path|terracotta|planks|hay", "dirt"),
-        (r"stone|ore$|granite|diorite|andesite|deepslate|tuff|basalt|calcite|bedrock|lava|obsidian|magma|brick|basalt", "stone"),
+        (r"stone|ore$|granite|diorite|andesite|deepslate|tuff|basalt|calcite|bedrock|obsidian|brick", "stone"),
+        (r"lava|magma", "stone"),
     )
 )  # fmt: skip
 
@@ -91,7 +93,10 @@ def read_blocks(path: Path) -> tuple[UInt8[np.ndarray, "x y z"], list[str]]:
     low = len(SECTIONS) * CHUNK
     labels, unknown = np.zeros((SIDE * CHUNK, SIDE * CHUNK, low), np.uint8), Counter[str]()
     for (x, z), (file, chunk) in track(part.items(), "Reading chunks", len(part)):
-        at = slice(CHUNK * (x - first_x), CHUNK * (x - first_x + 1)), slice(CHUNK * (z - first_z), CHUNK * (z - first_z + 1))
+        at = (
+            slice(CHUNK * (x - first_x), CHUNK * (x - first_x + 1)),
+            slice(CHUNK * (z - first_z), CHUNK * (z - first_z + 1)),
+        )
         try:
             labels[at] = chunk_labels(anvil, chunk, unknown)
         except Exception as error:
@@ -104,7 +109,9 @@ def read_blocks(path: Path) -> tuple[UInt8[np.ndarray, "x y z"], list[str]]:
         notes.append(f"{path}: {len(unknown)} kinds of blocks have no label of their own and count as stone: {names}")
     newer = max(chunk.version for _, chunk in part.values())
     if newer > NEWEST:
-        notes.append(f"{path} is of a version newer than is known here (DataVersion {newer} > {NEWEST}); look at its labels")
+        notes.append(
+            f"{path} is of a newer version than is known here (DataVersion {newer} > {NEWEST}); check its labels"
+        )
     return np.ascontiguousarray(trimmed(labels)[:, ::-1]), notes
 
 
@@ -136,8 +143,8 @@ def unknown_version(file: Path, x: int, z: int, region: Any) -> LumigraphError:
     except Exception:
         version = "none"
     return LumigraphError(
-        f"{file}: the chunk at ({x}, {z}) has a layout of an unknown version (DataVersion {version}); open the world in "
-        "Minecraft 1.13 to 1.21 and save it once more"
+        f"{file}: the chunk at ({x}, {z}) has a layout of an unknown version (DataVersion {version}); open the world "
+        "in Minecraft 1.13 to 1.21 and save it once more"
     )
 
 

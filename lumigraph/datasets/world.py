@@ -43,7 +43,7 @@ class BlockWorld(Scene):
 
     @property
     def blocks_from_scene(self) -> Float[Tensor, "4 4"]:
-        """The similarity from the scene's frame to blocks: block (i, j, k) fills [i, i + 1] x [j, j + 1] x [k, k + 1]."""
+        """The similarity from the scene's frame to blocks: block (i, j, k) lies between (i, j, k) and (i, j, k) + 1."""
         matrix = self.frame.to_source.matrix.double().clone()
         matrix[:3, 3] -= torch.tensor(self.blocks.corner, dtype=torch.float64)
         return matrix

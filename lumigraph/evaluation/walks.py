@@ -191,4 +191,3 @@ def colours_by_label(
             between = between + len(own) * (own.mean(0) - colours.mean(0)).square().sum()
     total = (colours - colours.mean(0)).square().sum().clamp_min(1e-9)
     return float(between / total), means
-

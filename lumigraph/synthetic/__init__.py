@@ -41,8 +41,8 @@ from ..geometry import Similarity
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
-from .depth_camera import MILLIMETRES, UNMEASURED
 from .block_stage import blocks_about_middle
+from .depth_camera import MILLIMETRES, UNMEASURED
 from .members import is_category as is_category
 from .members import is_collection as is_collection
 from .members import member_stage

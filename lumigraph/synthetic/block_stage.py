@@ -59,7 +59,7 @@ def blocks_about_middle(blocks: Blocks) -> Blocks:
 def stage_of(blocks: Blocks, size: int, views: int, seed: int, called: str) -> SyntheticStage:
     """A world of blocks in a box from -1 to 1 along its longest side, and cameras above its ground.
 
-    Cameras to learn from are anywhere, those held out walk around the middle. called: name under which pictures are kept
+    Cameras to learn from are anywhere, those held out walk around the middle. called: name of the kept pictures
     """
     labels = blocks.labels
     unit = max(labels.shape) / 2
@@ -142,7 +142,7 @@ def clear_height(height: np.ndarray, x: float, y: float, reach: int = CLEARANCE)
 
 
 def anywhere(world: World, labels: np.ndarray, count: int, unit: float, random: np.random.Generator):
-    """Poses above random places. One whose picture shows too few labels, or is too close to something, is drawn anew."""
+    """Poses above random places. One whose picture has too few labels, or is too close to a block, is drawn anew."""
     height, middle, poses = tops(labels), np.array(labels.shape) / 2, []
     for _ in range(count):
         for _ in range(MAX_TRIES):

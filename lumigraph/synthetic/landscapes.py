@@ -59,7 +59,8 @@ SUMMER = Style(
         ((0.08, 0.20, 0.06), (0.25, 0.40, 0.13)),  # tree
         ((0.90, 0.92, 0.96), (0.98, 0.98, 0.99)),  # snow
     ),
-    sun=(1.12, 1.08, 1.0), height=48.0, zenith=(0.27, 0.50, 0.86), horizon=(0.76, 0.87, 0.96), haze=0.004, clouds=0.35,
+    sun=(1.12, 1.08, 1.0), height=48.0, zenith=(0.27, 0.50, 0.86), horizon=(0.76, 0.87, 0.96),
+        haze=0.004, clouds=0.35,
 )  # fmt: skip
 STYLES = {
     "summer": SUMMER,
@@ -73,7 +74,8 @@ STYLES = {
             ((0.50, 0.18, 0.05), (0.85, 0.55, 0.12)),
             ((0.88, 0.89, 0.92), (0.96, 0.96, 0.97)),
         ),
-        sun=(1.18, 1.04, 0.86), height=30.0, zenith=(0.42, 0.58, 0.80), horizon=(0.90, 0.88, 0.83), haze=0.007, clouds=0.5,
+        sun=(1.18, 1.04, 0.86), height=30.0, zenith=(0.42, 0.58, 0.80), horizon=(0.90, 0.88, 0.83),
+        haze=0.007, clouds=0.5,
     ),
     "winter": Style(
         (
@@ -85,7 +87,8 @@ STYLES = {
             ((0.16, 0.22, 0.22), (0.62, 0.68, 0.72)),
             ((0.90, 0.92, 0.96), (0.98, 0.98, 0.99)),
         ),
-        sun=(1.02, 1.02, 1.06), height=24.0, zenith=(0.60, 0.69, 0.79), horizon=(0.86, 0.89, 0.92), haze=0.012, clouds=0.8,
+        sun=(1.02, 1.02, 1.06), height=24.0, zenith=(0.60, 0.69, 0.79), horizon=(0.86, 0.89, 0.92),
+        haze=0.012, clouds=0.8,
     ),
     "evening": replace(
         SUMMER, sun=(1.25, 0.72, 0.38), height=11.0, zenith=(0.22, 0.24, 0.46), horizon=(0.98, 0.62, 0.36), haze=0.008
@@ -106,7 +109,9 @@ def landscape(
     origin, directions = viewpoint(height, size, random)
     azimuth = random.uniform(0, 2 * math.pi)
     elevation = math.radians(look.height * random.uniform(0.8, 1.2))
-    sun = np.array([math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)])
+    sun = np.array(
+        [math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)]
+    )
     t = distances(height, origin, directions, FAR)
     hit = np.isfinite(t)
     points = origin + t[hit, None] * directions[hit]

@@ -46,7 +46,9 @@ class Terrain:
                 continue
             part = np.ix_(i, j)
             off = ((axis[i, None] - x) ** 2 + (axis[None, j] - y) ** 2) / radius**2
-            base = height[int(np.clip(x * self.fine, 0, len(height) - 1)), int(np.clip(y * self.fine, 0, len(height) - 1))]
+            base = height[
+                int(np.clip(x * self.fine, 0, len(height) - 1)), int(np.clip(y * self.fine, 0, len(height) - 1))
+            ]
             crown = np.where(off < 1, base + top * (0.45 + 0.55 * np.sqrt(np.maximum(1 - off, 0))), -np.inf)
             label[part] = np.where(crown > height[part], TREE, label[part])
             height[part] = np.maximum(height[part], crown)

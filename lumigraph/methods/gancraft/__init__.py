@@ -35,6 +35,7 @@ from .painter import Adversary, Painter, channels, perceptual
 MIN_OPACITY = 1e-3  # from which on a ray has a depth
 STYLE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of pictures whose style is shown
 KEPT_STYLE = 0.98  # share of a style's mean code that one more picture leaves
+CORNER_DEVIATION = 0.1  # of features at corners at first: labels count more
 RAYS_PER_CHUNK = 16_384  # of renderings
 PER_LAND = 8  # landscapes that show the same land
 SKY = LABELS.index("sky")
@@ -42,7 +43,7 @@ SKY = LABELS.index("sky")
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, as its published code has them (configs/projects/gancraft/landscape.yaml, spade/lhq.yaml)."""
+    """The paper's numbers, as its published code has them (NVlabs/imaginaire, landscape.yaml and lhq.yaml)."""
 
     # Field
     features: Width = 64  # numbers at each corner of a block
@@ -66,7 +67,8 @@ class Config:
     painter_code: Width = 256  # numbers of the painter's style code
     painter_width: Width = 128  # channels of the painter's finest layer; coarser ones have up to 16 times as many
     painter_levels: Annotated[int, between(1, 8)] = 6  # resolutions of the painter beside the finest
-    painter_share: Share = 0.5  # share of the budget in which the painter learns, too
+    painter_share: Share = 0.5  # share of the budget in which the painter learns, first of all
+    field_interval: Count = 4  # steps of the painter to one of the field in that share
     landscapes: Count = 4096  # pictures that the painter learns from; more vary more, and take time ahead of training
     landscapes_per_step: Annotated[int, between(1, 64)] = 4  # of the painter; more reduce noise, and cost time
     # Losses
@@ -75,10 +77,12 @@ class Config:
     pseudo_gan_weight: NonNegative = 0.5  # of the adversary that sees pseudo truth as real
     l2_weight: NonNegative = 10.0  # of the squared difference from pseudo truth, of colours in [-1, 1]
     perceptual_weight: NonNegative = 10.0  # of the difference of features
+    opacity_weight: NonNegative = 0.0  # of the light that passes through blocks; higher: blocks are opaque earlier
     kl_weight: NonNegative = 0.05  # of the style codes' divergence from the normal distribution
     learning_rate: LearningRate = 1e-4
     corner_learning_rate: LearningRate = 1e-3  # of the features at corners
     adversary_learning_rate: LearningRate = 4e-4
+    momentum: Annotated[float, between(0, 0.999)] = 0.0  # beta_1 of Adam
     painter_learning_rate: LearningRate = 1e-4
     painter_adversary_learning_rate: LearningRate = 4e-4
     seed: Seed = 0
@@ -144,7 +148,8 @@ class GANcraft(Method):
             samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5,
             encoder_size=32, encoder_width=12,
             painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
-            adversary_width=12, learning_rate=2e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
+            adversary_width=12, opacity_weight=0.5, momentum=0.5,
+            learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
             painter_learning_rate=2e-3, painter_adversary_learning_rate=1e-3,
         )  # fmt: skip
 
@@ -156,6 +161,7 @@ class GANcraft(Method):
             samples_per_block=2, sample_depth=1.0, density_scale=1.0, crop=16, label_window=3,
             encoder_size=8, encoder_width=4,
             painter_code=2, painter_width=4, painter_levels=1, landscapes=4, landscapes_per_step=1,
+            painter_share=1.0, field_interval=1, opacity_weight=0.5,
             adversary_width=4, learning_rate=1e-2, corner_learning_rate=2e-2, painter_learning_rate=1e-2,
         )  # fmt: skip
 
@@ -166,7 +172,7 @@ class GANcraft(Method):
         self.labels.rows = torch.from_numpy(data.blocks.labels)[None].to(self.device)
         self.blocks_from_scene.copy_(data.blocks_from_scene)
         corners = len(self.world.corners)
-        values = torch.randn(corners, self.config.features, generator=self.random(1))
+        values = CORNER_DEVIATION * torch.randn(corners, self.config.features, generator=self.random(1))
         self.field_network.values = nn.Parameter(values.to(self.device))
 
     @property
@@ -208,7 +214,8 @@ class GANcraft(Method):
         density, colour = self.field_network(positions / world.size, world.nodes, world.label_at(positions), style)
         tau = c.density_scale * density * samples.length
         total, opacity, _ = kernels.composite(tau, torch.cat([colour, samples.t[:, None]], -1), samples.ray_starts)
-        behind = torch.where((samples.ray_starts.diff() > 0)[:, None], self.behind.clamp(-1, 1), self.sky(inner.directions, style))
+        sky, meets = self.sky(inner.directions, style), samples.ray_starts.diff() > 0
+        behind = torch.where(meets[:, None], self.behind.clamp(-1, 1), sky)
         features = total[:, :-1] + (1 - opacity)[:, None] * behind
         depth = torch.where(opacity > MIN_OPACITY, total[:, -1] / opacity.clamp_min(MIN_OPACITY), torch.inf)
         return features, depth / self.block_scale, opacity
@@ -274,7 +281,9 @@ class GANcraft(Method):
         there = data.splits["train"]
         shot = data.photograph(int(there[chance(len(there), generator)]), layers=("labels",))
         width, height = (min(c.crop, int(n)) for n in shot.camera.size[0])
-        x, y = (chance(int(n) - own + 1, generator) for n, own in zip(shot.camera.size[0], (width, height), strict=True))
+        x, y = (
+            chance(int(n) - own + 1, generator) for n, own in zip(shot.camera.size[0], (width, height), strict=True)
+        )
         labels = data.label_numbers[shot.extra["labels"]][y : y + height, x : x + width]
         rays = shot.camera.rays(bordered(x, y, width, height))
         gallery = landscapes_of(c.landscapes, 2 * c.crop, c.seed)
@@ -286,8 +295,10 @@ class GANcraft(Method):
         return WorldLesson(rays.to(device), labels[None].to(device), rgb.to(device), ground.to(device), styles)
 
     def step(self, batch: WorldLesson, step: int, descend: Any) -> dict[str, Tensor]:
-        generator = self.random(step)
-        terms = self._step_of_painter(batch, generator, descend) if self._progress <= self.config.painter_share else {}
+        generator, painting = self.random(step), self._progress <= self.config.painter_share
+        terms = self._step_of_painter(batch, generator, descend) if painting else {}
+        if painting and step % self.config.field_interval:
+            return terms
         return terms | self._step_of_field(batch, generator, descend)
 
     def _step_of_painter(self, batch: WorldLesson, generator: torch.Generator, descend: Any) -> dict[str, Tensor]:
@@ -320,7 +331,7 @@ class GANcraft(Method):
         mean, log_variance = self.encoder(pseudo)
         self.styles[batch.styles[0]].lerp_(mean[0].detach(), 1 - KEPT_STYLE)
         height, width = batch.labels.shape[1:]
-        fake, _, _ = self.picture(batch.rays, (width, height), drawn(mean, log_variance, generator), generator)
+        fake, _, opacity = self.picture(batch.rays, (width, height), drawn(mean, log_variance, generator), generator)
         adversary = self.adversary
         logits = adversary(fake.detach(), labels)
         against = c.gan_weight * discriminator_loss(adversary(real, real_labels), logits)
@@ -334,6 +345,7 @@ class GANcraft(Method):
                 "l2": c.l2_weight * error,
                 "perceptual": c.perceptual_weight * perceptual(features(fake), features(pseudo)),
                 "kl": c.kl_weight * divergence(mean, log_variance),
+                "opacity": c.opacity_weight * ((1 - opacity) * (batch.labels[0] != SKY)).square().mean(),
             }
             descend(terms, [self._optimizers[0]])
         self.figures = {"pseudo_mse": float(error.detach()) / 4}
@@ -344,12 +356,13 @@ class GANcraft(Method):
         corners = {"params": [self.field_network.values], "lr": c.corner_learning_rate}
         own = (self.encoder, self.style, self.field_network, self.sky, self.renderer)
         networks = [self.behind, *(p for m in own for p in m.parameters() if p is not self.field_network.values)]
-        betas = {"betas": (0.0, 0.999), "eps": 1e-7}
+        betas = {"betas": (c.momentum, 0.999), "eps": 1e-7}
+        against = {"betas": (0.0, 0.999), "eps": 1e-7}
         self._optimizers = [
             torch.optim.Adam([{"params": networks, "lr": c.learning_rate}, corners], **betas),
-            torch.optim.Adam(self.adversary.parameters(), c.adversary_learning_rate, **betas),
+            torch.optim.Adam(self.adversary.parameters(), c.adversary_learning_rate, **against),
             torch.optim.Adam(self.painter.parameters(), c.painter_learning_rate, **betas),
-            torch.optim.Adam(self.painter_adversary.parameters(), c.painter_adversary_learning_rate, **betas),
+            torch.optim.Adam(self.painter_adversary.parameters(), c.painter_adversary_learning_rate, **against),
         ]
         return self._optimizers
 

@@ -17,7 +17,7 @@ from ...components.fields.encodings import FrequencyEncoding
 SLOPE = 0.2  # of leaky rectifiers
 BORDER = 4  # pixels by which the neural renderer sees beyond each pixel: four convolutions of 3x3
 SMALLEST = 4  # pixels across, at which the style encoder ends
-FIRST_DENSITY = 2.0  # of all blocks, per block, before anything is learnt
+FIRST_DENSITY = 4.0  # of all blocks, per block, before anything is learnt
 
 Style = Float[Tensor, "1 style"]
 Pictures = Float[Tensor, "picture _ _ _"]
@@ -89,7 +89,8 @@ class Modulated(nn.Module):
 class BlockField(nn.Module):
     """Density and features within blocks, from learnt features at their corners (section 3.2).
 
-    F(p, l, z): features of the eight corners, blended trilinearly, partly encoded as waves; the block's label l; style z.
+    F(p, l, z): features of the eight corners, blended trilinearly, partly encoded as waves; label l of the block; style
+    z.
 
     values: a row of features for each corner of a block; corners that several blocks share count once
     """

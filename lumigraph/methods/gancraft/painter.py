@@ -17,13 +17,18 @@ from .networks import Pictures, StyleEncoder, rectified
 LEVELS = (2, 3, 4)  # of the adversary's pyramid, at which it decides
 
 
+def convolution(inputs: int, outputs: int) -> nn.Conv2d:
+    """A convolution of 3x3 that goes on beyond a picture's border with the colours there."""
+    return nn.Conv2d(inputs, outputs, 3, 1, 1, padding_mode="replicate")
+
+
 class Spade(nn.Module):
     """Normalisation whose scale and shift are convolutions of the label map (Park 2019, eq. 1 to 3)."""
 
     def __init__(self, channels: int, labels: int, hidden: int):
         super().__init__()
-        self.shared = nn.Conv2d(labels, hidden, 3, 1, 1)
-        self.modulation = nn.Conv2d(hidden, 2 * channels, 3, 1, 1)
+        self.shared = convolution(labels, hidden)
+        self.modulation = convolution(hidden, 2 * channels)
 
     def forward(self, x: Pictures, labels: Pictures) -> Pictures:
         scale, shift = self.modulation(rectified(self.shared(adaptive_avg_pool2d(labels, x.shape[-2:])))).chunk(2, 1)
@@ -36,7 +41,7 @@ class SpadeBlock(nn.Module):
     def __init__(self, inputs: int, outputs: int, labels: int, hidden: int):
         super().__init__()
         self.norms = nn.ModuleList([Spade(inputs, labels, hidden), Spade(outputs, labels, hidden)])
-        self.convolutions = nn.ModuleList([nn.Conv2d(inputs, outputs, 3, 1, 1), nn.Conv2d(outputs, outputs, 3, 1, 1)])
+        self.convolutions = nn.ModuleList([convolution(inputs, outputs), convolution(outputs, outputs)])
         self.beside = nn.Conv2d(inputs, outputs, 1, bias=False) if inputs != outputs else nn.Identity()
 
     def forward(self, x: Pictures, labels: Pictures) -> Pictures:
@@ -52,13 +57,15 @@ class Painter(nn.Module):
     widths: channels from the coarsest resolution on, each twice as fine as the one before
     """
 
-    def __init__(self, labels: int, code: int, widths: Sequence[int], hidden: int, encoder_size: int, encoder_width: int):
+    def __init__(
+        self, labels: int, code: int, widths: Sequence[int], hidden: int, encoder_size: int, encoder_width: int
+    ):
         super().__init__()
         self.encoder = StyleEncoder(encoder_size, encoder_width, code)
         self.style = nn.Linear(code, widths[0])
-        self.first = nn.Conv2d(labels, widths[0], 3, 1, 1)
+        self.first = convolution(labels, widths[0])
         self.blocks = nn.ModuleList(SpadeBlock(a, b, labels, hidden) for a, b in pairwise([widths[0], *widths]))
-        self.out = nn.Conv2d(widths[-1], 3, 3, 1, 1)
+        self.out = convolution(widths[-1], 3)
 
     def forward(self, labels: Pictures, code: Float[Tensor, "picture code"]) -> Pictures:
         """labels: one channel for each, 1 where it is"""
@@ -79,13 +86,13 @@ class Adversary(nn.Module):
         widths = [width << min(k, 3) for k in range(5)]
         lateral = 2 * width
 
-        def convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Module:
+        def normed(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Module:
             return spectral_norm(nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2))
 
-        self.down = nn.ModuleList(convolution(a, b, 3, 2) for a, b in pairwise([3, *widths]))
-        self.lateral = nn.ModuleList(convolution(b, lateral, 1) for b in widths[1:])
-        self.last = nn.ModuleList(convolution(lateral, lateral, 3) for _ in LEVELS)
-        self.score, self.label = convolution(lateral, 1, 1), convolution(labels, lateral, 1)
+        self.down = nn.ModuleList(normed(a, b, 3, 2) for a, b in pairwise([3, *widths]))
+        self.lateral = nn.ModuleList(normed(b, lateral, 1) for b in widths[1:])
+        self.last = nn.ModuleList(normed(lateral, lateral, 3) for _ in LEVELS)
+        self.score, self.label = normed(lateral, 1, 1), normed(labels, lateral, 1)
 
     def features(self, pictures: Pictures) -> list[Pictures]:
         """Features from fine to coarse, each half as large as the one before."""
