@@ -17,7 +17,7 @@ from lumigraph.camera.rays import Rays
 from lumigraph.datasets.world import LABELS
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.gancraft import World, bordered
-from lumigraph.methods.gancraft.networks import BORDER, NeuralRenderer, StyleEncoder, divergence, drawn
+from lumigraph.methods.gancraft.networks import BORDER, FIRST_DENSITY, NeuralRenderer, StyleEncoder, divergence, drawn
 from lumigraph.methods.gancraft.painter import Adversary, Painter, channels
 from lumigraph.synthetic.landscapes import STYLES
 
@@ -104,7 +104,7 @@ def test_light_is_composited_front_to_back():
         method.field_network.density.bias.fill_(0.3)
         method.field_network.out.bias.fill_(0.25)
         method.behind.fill_(-0.5)
-    sigma = float(torch.nn.functional.softplus(torch.tensor(0.3 + math.log(math.expm1(2.0)))))
+    sigma = float(torch.nn.functional.softplus(torch.tensor(0.3 + math.log(math.expm1(FIRST_DENSITY)))))
     rays = Rays(torch.tensor([[3.0, 0.1, 0.1]]), torch.tensor([[-1.0, 0, 0]]), torch.ones(1))
     features, _, opacity = method.features_of(rays, torch.zeros(1, 8))
     assert float(opacity) == pytest.approx(1 - math.exp(-sigma), abs=0.02)

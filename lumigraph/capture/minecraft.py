@@ -177,7 +177,7 @@ def chunk_labels(anvil: Any, chunk: Any, unknown: Counter[str]) -> UInt8[np.ndar
     return np.concatenate(layers).transpose(2, 1, 0)
 
 
-def trimmed(labels: UInt8[np.ndarray, "x z y"]) -> UInt8[np.ndarray, "x z y"]:
+def trimmed(labels: UInt8[np.ndarray, "x z y"]) -> UInt8[np.ndarray, "_ _ _"]:
     """The columns with blocks, from a little below the lowest surface to above the highest."""
     solid = labels > 0
     columns = solid.any(2)
