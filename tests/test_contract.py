@@ -200,7 +200,8 @@ def fall(losses: list[float]) -> bool:
 
 
 def test_it_learns(taught, monkeypatch):
-    """Its loss falls, where it has one, and it shows held-out photographs better than one that has learnt nothing."""
+    """Its loss falls, where it has one. A method of photographs shows held-out ones better than one that has learnt
+    nothing."""
     monkeypatch.setattr(held_out_poses, "STEPS", 5)  # for each photograph, of methods that refine poses; 200 otherwise
     monkeypatch.setattr(appearance, "FIT_STEPS", 10)  # for each photograph, of methods with appearance; 100 otherwise
     losses = [row["loss"] for row in taught.straight.metrics() if "loss" in row]
@@ -212,7 +213,7 @@ def test_it_learns(taught, monkeypatch):
         assert fall(losses), losses
     else:
         assert taught.method.complete or taught.straight.state.step == STEPS
-    if isinstance(taught.data, Scene):
+    if taught.kind.learns_from is Scene:
         fresh = taught.straight.new_method(taught.device).eval()
         assert evaluate(taught.method, taught.data).psnr > evaluate(fresh, taught.data).psnr + 0.5
 

@@ -684,6 +684,37 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "code_weight": 1.0,
         "learning_rate": 4e-5,
     },
+    "gancraft": {  # NVlabs/imaginaire, configs/projects/gancraft/landscape.yaml, spade/landscapes/lhq.yaml
+        "features": 64,  # blk_feat_dim
+        "encoded": 24,  # blk_feat_dim less pe_no_pe_feat_dim 40
+        "bands": 4,  # pe_lvl_feat
+        "hidden_width": 256,
+        "output_features": 64,  # final_feat_dim
+        "sky_bands": 5,  # pe_lvl_raydir_sky
+        "style": 256,  # interm_style_dims
+        "style_layers": 5,
+        "code": 128,  # style_dims
+        "samples_per_block": 8,  # num_samples 24 in sample_depth 3
+        "sample_depth": 3.0,
+        "density_scale": 0.25,  # dists_scale
+        "crop": 256,
+        "label_window": 11,  # label_smooth_dia
+        "encoder_size": 256,
+        "encoder_width": 64,
+        "painter_code": 256,
+        "painter_width": 128,
+        "adversary_width": 128,
+        "gan_weight": 0.5,
+        "pseudo_gan_weight": 0.5,
+        "l2_weight": 10.0,
+        "perceptual_weight": 10.0,
+        "opacity_weight": 0.0,
+        "kl_weight": 0.05,
+        "momentum": 0.0,  # adam_beta1
+        "learning_rate": 1e-4,
+        "corner_learning_rate": 1e-3,  # blk_feats
+        "adversary_learning_rate": 4e-4,  # dis_opt
+    },
     "dvr": {  # autonomousvision/differentiable_volumetric_rendering, configs/default.yaml, multi_view_reconstruction
         "field": "network",
         "hidden_width": 512,  # im2mesh/dvr/models/decoder.py

@@ -43,6 +43,7 @@ DATASETS = {
     "Scene": ("tiny", "scene"),
     "Shapes": ("tiny_shapes", "shapes"),
     "Collection": ("tiny_collection", "collection"),
+    "BlockWorld": ("tiny_world", "world"),
 }
 
 

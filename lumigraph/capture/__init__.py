@@ -16,12 +16,13 @@ from ..datasets.collection import Collection
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
+from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..files import exists, expanded
 from ..files.names import natural
 from ..files.ranges import typed
 from ..files.readers import LISTED, NAMES
-from . import meshes, single_image
+from . import meshes, minecraft, single_image
 from .assemble import Before as Before
 from .assemble import assemble as assemble
 from .bones import with_bones
@@ -51,7 +52,7 @@ def synthetic() -> Any:
     return import_module("..synthetic", __package__)
 
 
-KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection)}
+KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection, BlockWorld)}
 
 
 def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options: Any) -> Dataset:
@@ -83,9 +84,13 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     """
     path = expanded(source)
     if (request := requested(source)) is not None:
-        return Collection if synthetic().is_collection(request) else Scene
+        if synthetic().is_collection(request):
+            return Collection
+        return BlockWorld if synthetic().is_block_world(request) else Scene
     if not exists(path):
         raise LumigraphError(f"{path} does not exist; check the path")
+    if minecraft.recognises(path):
+        return BlockWorld
     if wanted is Collection and members_of(path):
         return Collection
     if path.is_dir() and any(reader.recognises(path) for reader in READERS.values()):
@@ -187,6 +192,8 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     if (request := requested(source)) is not None:
         return synthetic().read(request)
     path = expanded(source)
+    if path.is_file() and minecraft.recognises(path):
+        return minecraft.read(path)
     capture = with_bones(with_tracks(choose_reader(path, reader).read(path), path), path)
     return with_inner_depth(with_raw(with_masks(capture, path), path))
 

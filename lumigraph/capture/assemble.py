@@ -16,6 +16,7 @@ from ..camera import Camera
 from ..camera.lens import Equirectangular, Lens, Pinhole
 from ..datasets.images import ImageSource, in_parallel, load
 from ..datasets.scene import Scene
+from ..datasets.world import BlockWorld
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
 from ..geometry import Similarity
@@ -119,7 +120,7 @@ def assemble(
     for warning in left_out:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
     points = None if capture.points is None else torch.from_numpy(capture.points @ matrix[:3, :3].T + matrix[:3, 3])
-    return Scene(
+    scene = Scene(
         cameras,
         images,
         frame,
@@ -134,6 +135,7 @@ def assemble(
         torch.tensor([c.calibrated for c in chosen]),
         [c.digest for c in chosen],
     )
+    return scene if capture.blocks is None else BlockWorld(**vars(scene), blocks=capture.blocks)
 
 
 def in_order(shots: list[Shot], before: Before | None) -> list[Shot]:

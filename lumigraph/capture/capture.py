@@ -14,6 +14,7 @@ from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
 from ..datasets.skeleton import Skeleton
 from ..datasets.tracks import BoxTrack
+from ..datasets.world import Blocks
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
 
@@ -103,6 +104,7 @@ class Capture:
     notes:     what its user should know, one sentence each
     tracks:   boxes of rigid things that move, source's frame and units, moments as in `Shot.time`
     skeleton: bones of a character at all moments, source's frame and units
+    blocks:   of a block world, cubes with an edge of one unit of the source
     kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
 
@@ -123,6 +125,7 @@ class Capture:
     tracks: tuple[BoxTrack, ...] = ()
     skeleton: Skeleton | None = None
     kept: bool = False
+    blocks: Blocks | None = None
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
         """The capture with some of its points alone."""

@@ -12,3 +12,5 @@ from .views import ViewScore as ViewScore
 from .views import compare as compare
 from .views import evaluate as evaluate
 from .views import file_name as file_name
+from .walks import evaluate_walk as evaluate_walk
+from .walks import warped_difference as warped_difference

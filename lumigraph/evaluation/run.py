@@ -14,6 +14,7 @@ from ..datasets.collection import Collection
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
+from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files import claim, scene_name, write_json
@@ -24,6 +25,7 @@ from ..run import Trained
 from ..system.progress import counting
 from .shapes import ShapesEvaluation, evaluate_shapes
 from .views import Evaluation, evaluate, file_name, reveal
+from .walks import evaluate_walk
 
 Keep = Callable[[str, Rendering], object]
 
@@ -66,6 +68,8 @@ def evaluate_on(
         return evaluate_shapes(method, data, split, most)
     if isinstance(data, Collection):
         return evaluate_collection(method, data, split, keep, most, lpips, right_halves)
+    if isinstance(data, BlockWorld) and issubclass(method.learns_from, BlockWorld):
+        return evaluate_walk(method, data, split, keep, most)
     assert isinstance(data, Scene)
     return evaluate(method, data, split, keep, most, lpips, right_halves)
 

@@ -20,6 +20,7 @@ READERS = (
     "colmap",
     "llff",
     "light_field",
+    "minecraft",
 )
 NAMES = tuple(name.replace("_", "-") for name in READERS)  # what a user types
 LISTED = f"{', '.join(NAMES[:-1])} or {NAMES[-1]}"

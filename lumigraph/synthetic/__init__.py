@@ -43,6 +43,7 @@ from ..geometry import Similarity
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
+from .block_stage import blocks_about_middle
 from .depth_camera import MILLIMETRES, UNMEASURED
 from .members import is_category as is_category
 from .members import is_collection as is_collection
@@ -73,6 +74,12 @@ TRACER = 1  # of the pictures that are kept: another number traces them anew
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+def is_block_world(request: str) -> bool:
+    """True for a scene of blocks, which has their labels as `blocks`."""
+    name = request.partition(",")[0]
+    return not is_category(request) and name in scenes.available() and hasattr(scenes.scene(name), "blocks")
+
+
 def confirm(request: str) -> None:
     """Raise LumigraphError for a name that nothing here has."""
     if not is_category(request):
@@ -91,7 +98,10 @@ def read(request: str) -> Capture:
     amount = asked.pop("jitter_poses")
     stage = scenes.stage(name, **asked)
     off = jittered(stage, amount, options.seed) if amount else None
-    return capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
+    found = capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
+    if is_block_world(request):
+        found = replace(found, blocks=blocks_about_middle(scenes.scene(name).blocks(options.width, options.land)))
+    return found
 
 
 def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:

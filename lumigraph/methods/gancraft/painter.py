@@ -1,0 +1,133 @@
+"""The label-to-picture network that makes pseudo truth (SPADE; Park et al. 2019, arXiv 1903.07291), and the adversary
+that looks at pictures beside their labels (CC-FPSE; Liu et al. 2019, arXiv 1910.06809)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, instance_norm, interpolate, l1_loss, one_hot
+from torch.nn.utils.parametrizations import spectral_norm
+
+from .networks import Pictures, StyleEncoder, rectified
+
+LEVELS = (2, 3, 4)  # of the adversary's pyramid, at which it decides
+
+
+def convolution(inputs: int, outputs: int) -> nn.Conv2d:
+    """A convolution of 3x3 that goes on beyond a picture's border with the colours there."""
+    return nn.Conv2d(inputs, outputs, 3, 1, 1, padding_mode="replicate")
+
+
+class Spade(nn.Module):
+    """Normalisation whose scale and shift are convolutions of the label map (Park 2019, eq. 1 to 3)."""
+
+    def __init__(self, channels: int, labels: int, hidden: int):
+        super().__init__()
+        self.shared = convolution(labels, hidden)
+        self.modulation = convolution(hidden, 2 * channels)
+
+    def forward(self, x: Pictures, labels: Pictures) -> Pictures:
+        scale, shift = self.modulation(rectified(self.shared(adaptive_avg_pool2d(labels, x.shape[-2:])))).chunk(2, 1)
+        return instance_norm(x) * (1 + scale) + shift
+
+
+class SpadeBlock(nn.Module):
+    """Residual block of two convolutions, each after a `Spade` (Park 2019, figure 4)."""
+
+    def __init__(self, inputs: int, outputs: int, labels: int, hidden: int):
+        super().__init__()
+        self.norms = nn.ModuleList([Spade(inputs, labels, hidden), Spade(outputs, labels, hidden)])
+        self.convolutions = nn.ModuleList([convolution(inputs, outputs), convolution(outputs, outputs)])
+        self.beside = nn.Conv2d(inputs, outputs, 1, bias=False) if inputs != outputs else nn.Identity()
+
+    def forward(self, x: Pictures, labels: Pictures) -> Pictures:
+        y = x
+        for norm, convolution in zip(self.norms, self.convolutions, strict=True):
+            y = convolution(rectified(norm(y, labels)))
+        return self.beside(x) + y
+
+
+class Painter(nn.Module):
+    """Pictures in [-1, 1] from label maps and a style code; its encoder finds the code of a picture.
+
+    widths: channels from the coarsest resolution on, each twice as fine as the one before
+    """
+
+    def __init__(
+        self, labels: int, code: int, widths: Sequence[int], hidden: int, encoder_size: int, encoder_width: int
+    ):
+        super().__init__()
+        self.encoder = StyleEncoder(encoder_size, encoder_width, code)
+        self.style = nn.Linear(code, widths[0])
+        self.first = convolution(labels, widths[0])
+        self.blocks = nn.ModuleList(SpadeBlock(a, b, labels, hidden) for a, b in pairwise([widths[0], *widths]))
+        self.out = convolution(widths[-1], 3)
+
+    def forward(self, labels: Pictures, code: Float[Tensor, "picture code"]) -> Pictures:
+        """labels: one channel for each, 1 where it is"""
+        steps = len(self.blocks) - 1
+        size = [n >> steps for n in labels.shape[-2:]]
+        x = self.first(adaptive_avg_pool2d(labels, size)) + self.style(code)[..., None, None]
+        for k, block in enumerate(self.blocks):
+            x = block(x if k == 0 else interpolate(x, scale_factor=2.0), labels)
+        return self.out(rectified(x)).tanh()
+
+
+class Adversary(nn.Module):
+    """Logits of patches at three resolutions: a feature pyramid whose features are compared with those of the labels
+    there (Liu 2019, section 3.2). Weights have a spectral norm of 1."""
+
+    def __init__(self, labels: int, width: int):
+        super().__init__()
+        widths = [width << min(k, 3) for k in range(5)]
+        lateral = 2 * width
+
+        def normed(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Module:
+            return spectral_norm(nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2))
+
+        self.down = nn.ModuleList(normed(a, b, 3, 2) for a, b in pairwise([3, *widths]))
+        self.lateral = nn.ModuleList(normed(b, lateral, 1) for b in widths[1:])
+        self.last = nn.ModuleList(normed(lateral, lateral, 3) for _ in LEVELS)
+        self.score, self.label = normed(lateral, 1, 1), normed(labels, lateral, 1)
+
+    def features(self, pictures: Pictures) -> list[Pictures]:
+        """Features from fine to coarse, each half as large as the one before."""
+        found = []
+        for layer in self.down:
+            pictures = rectified(layer(pictures))
+            found.append(pictures)
+        return found
+
+    def forward(self, pictures: Pictures, labels: Pictures) -> Float[Tensor, " logit"]:
+        """Logits of all patches. pictures: in [-1, 1]; labels: one channel for each"""
+        features, embedded, logits = self.features(pictures), self.label(labels), []
+        x = self.lateral[-1](features[-1])
+        for level, last in zip(reversed(LEVELS), self.last, strict=True):
+            x = interpolate(x, size=features[level - 1].shape[-2:], mode="bilinear") + self.lateral[level - 2](
+                features[level - 1]
+            )
+            y = rectified(last(x))
+            logits.append(self.score(y)[:, 0] + (y * adaptive_avg_pool2d(embedded, y.shape[-2:])).sum(1))
+        return torch.cat([x.flatten() for x in logits])
+
+
+def perceptual(fake: Sequence[Pictures], real: Sequence[Pictures]) -> Tensor:
+    """Mean absolute difference of features, over all layers."""
+    return torch.stack([l1_loss(a, b.detach()) for a, b in zip(fake, real, strict=True)]).mean()
+
+
+def channels(labels: Int[Tensor, "picture height width"], count: int, smooth: int = 0) -> Pictures:
+    """A channel for each label, 1 where it is.
+
+    smooth: diameter of the window within which the most frequent label counts, pixels; 0 leaves labels as they are
+    """
+    found = one_hot(labels, count).movedim(-1, 1).float()
+    if smooth > 1:
+        radius = smooth // 2
+        common = avg_pool2d(found, 2 * radius + 1, 1, radius, count_include_pad=False).argmax(1)
+        found = one_hot(common, count).movedim(-1, 1).float()
+    return found
