@@ -55,6 +55,7 @@ from .resume import Resume
 from .segment import Segment
 from .track import Track
 from .train import Train, with_options_of
+from .train_captions import NETWORK, captions_command
 from .view import ViewCommand
 
 RULES = ConstructorRegistry()
@@ -214,6 +215,8 @@ def parse(arguments: list[str]) -> Any:
     named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert", "track") else []
     if named:  # the options of the method too
         commands[first] = with_options_of(named[0], rest, commands[first])
+    if first == "train" and rest[:1] == [NETWORK]:
+        commands[first] = captions_command()
     kinds = []
     for name, kind in commands.items():
         first_sentence = (kind.__doc__ or "").strip().partition("\n")[0]
