@@ -38,6 +38,7 @@ DATASETS = {
     "Scene": ("tiny", "scene"),
     "Shapes": ("tiny_shapes", "shapes"),
     "Collection": ("tiny_collection", "collection"),
+    "Words": ("tiny_words", "words"),
 }
 
 

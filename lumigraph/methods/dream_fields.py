@@ -12,7 +12,14 @@ from torch import Tensor
 from ..budget import Effort, Efforts
 from ..camera.rays import Rays
 from ..components.fields.hash_field import HashField, HashNumbers
-from ..components.guidance import DistillationNumbers, Guidance, GuidanceNumbers, Views
+from ..components.guidance import (
+    CPU_GUIDANCE,
+    TINY_GUIDANCE,
+    DistillationNumbers,
+    Guidance,
+    GuidanceNumbers,
+    Views,
+)
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ..components.sampling.spaces import space_of
@@ -66,14 +73,12 @@ class DreamFields(FieldMethod):
             levels=4, features_per_level=4, log2_hashmap_size=15, base_resolution=8, max_resolution=48, sh_bands=1
         )
         occupancy = OccupancyNumbers(samples_per_step=1 << 17, occupancy_resolution=32)
-        guidance = GuidanceNumbers(render_width=48, views_per_step=2, crops_per_view=4, focal=1.8, opacity_steps=100)
-        return Config(table, occupancy, StepNumbers(72), guidance=guidance, hidden_width=32)
+        return Config(table, occupancy, StepNumbers(72), guidance=CPU_GUIDANCE, hidden_width=32)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables, networks and views."""
-        guidance = GuidanceNumbers(render_width=16, views_per_step=1, crops_per_view=2, opacity_steps=10)
-        return Config(**TINY_HASH, guidance=guidance, hidden_width=16, learning_rate=2e-2)
+        return Config(**TINY_HASH, guidance=TINY_GUIDANCE, hidden_width=16, learning_rate=2e-2)
 
     def batch(self, data: Words, generator: torch.Generator) -> Views:
         return self.guidance.views(data, generator)

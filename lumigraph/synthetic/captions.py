@@ -30,7 +30,7 @@ SIZE_SHARES = 0.2, 0.65, 0.15  # of groups of one, two and three things
 BETWEEN = " beside "
 DISTANCE = 4.0  # scene units from camera to origin
 ELEVATIONS = 10.0, 50.0  # degrees above the horizon
-FIELDS_OF_VIEW = 28.0, 36.0  # degrees
+FIELDS_OF_VIEW = 25.0, 31.0  # degrees
 SKIES = Sky((0.95, 0.97, 1.0), (0.97, 0.96, 0.95), (0.75, 0.72, 0.68), light=0.75)
 
 

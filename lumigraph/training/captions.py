@@ -25,26 +25,26 @@ from ..system.progress import track
 
 CONTEXT = 16  # tokens of a caption
 TEXT_WIDTH, TEXT_LAYERS = 64, 2
-WARMUP = 0.1  # share of the steps in which the learning rate rises
+WARMUP = 0.07  # share of the steps in which the learning rate rises
 MAX_ZOOM, MAX_SHIFT, MAX_NOISE = 0.2, 0.1, 0.05  # of random crops; deviation of the noise
-TRACED_PIXELS = 64  # a side of traced pictures
+TRACED_PIXELS = 48  # a side of traced pictures
 HELD_OUT_PICTURES = 10  # of each held-out caption
-PIXELS = 64  # a side of the model's pictures
+PIXELS = 32  # a side of the model's pictures
 
 
 @dataclass(frozen=True)
 class CaptionNumbers:
     """Numbers of the model and of its training."""
 
-    pictures: Count = 6000  # pictures that are traced to learn from; more generalise better, and take longer
-    steps: Steps = 1000  # steps of learning; more recognise more
+    pictures: Count = 3000  # pictures that are traced to learn from; more generalise better, and take longer
+    steps: Steps = 700  # steps of learning; more recognise more
     batch: BatchSize = 64  # pictures in a step, each the wrong one for all other captions
     width: Width = 16  # channels of the residual network's stem; wider recognises more, and costs time
     embedding: Width = 64  # of the shared space
-    learning_rate: LearningRate = 1e-3  # AdamW's learning rate at its highest
+    learning_rate: LearningRate = 2e-3  # AdamW's learning rate at its highest
     weight_decay: NonNegative = 0.05  # of AdamW
     perturbation: Share = 8 / 255  # largest change of a colour against the model; 0 is faster, its gradients are noise
-    perturbed_from: Share = 0.5  # share of the steps after which pictures are perturbed
+    perturbed_from: Share = 0.6  # share of the steps after which pictures are perturbed
     seed: Seed = 0
 
 

@@ -172,7 +172,7 @@ class AttentionPool(nn.Module):
         self.q_proj, self.k_proj, self.v_proj = (nn.Linear(width, width) for _ in range(3))
         self.c_proj = nn.Linear(width, embedding)
 
-    def forward(self, x: Float[Tensor, "batch width height width"]) -> Float[Tensor, "batch embedding"]:
+    def forward(self, x: Float[Tensor, "batch channel height width"]) -> Float[Tensor, "batch embedding"]:
         tokens = x.flatten(2).mT
         tokens = torch.cat([tokens.mean(1, keepdim=True), tokens], 1) + self.positional_embedding
         q, k, v = self.q_proj(tokens[:, :1]), self.k_proj(tokens), self.v_proj(tokens)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -37,6 +37,7 @@ class DistillationNumbers:
             raise LumigraphError(f"--min-time {self.min_time:g} is above --max-time {self.max_time:g}; swap them")
 
 
+@runtime_checkable
 class Guide(Protocol):
     """pixels:   sides of the pictures that it judges
     named_views: True if it follows prompts that name the view (Poole 2022, section 3.2)

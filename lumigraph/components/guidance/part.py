@@ -40,6 +40,13 @@ class GuidanceNumbers:
     view_prompts: Literal["auto", "yes", "no"] = "auto"  # name the view in the prompt; auto: for diffusion models
 
 
+# Views for a plain CPU, in which a small model recognises shapes, and for tests.
+CPU_GUIDANCE = GuidanceNumbers(
+    render_width=40, crop_share=0.9, views_per_step=2, crops_per_view=6, focal=1.9, opacity_steps=100
+)
+TINY_GUIDANCE = GuidanceNumbers(render_width=16, views_per_step=1, crops_per_view=2, opacity_steps=10)
+
+
 class Guidance(Part):
     """Loss terms of a scene's views under a prompt.
 
