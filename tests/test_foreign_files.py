@@ -109,6 +109,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("drawn.png", "drawn.json", "drawn.gif"),
     ),
     "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
+    "train captions": (
+        "train captions --pictures 30 --steps 1 --batch 4 --width 4 --embedding 8 --output small",
+        ("small/",),
+    ),
     "track": (
         "track imap procedural:room,depth,views=300,size=32 --frames 2 --downscale 1 --output found",
         ("found/", "found", "found/lock.json"),

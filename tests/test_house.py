@@ -416,6 +416,7 @@ EXTRAS = {
     "fourdgs",
     "laspy",
     "liblzfse",
+    "diffusers",
     "onnxruntime",
     "pye57",
     "rawpy",

@@ -22,6 +22,25 @@ PAGES = Path(__file__).parent.parent / "docs" / "methods"
 FILES = {path.stem for path in Path(methods.__file__).parent.iterdir()}
 NAMES = [name for name in methods.available() if name.replace("-", "_") in FILES]  # other tests add some of their own
 
+WORDS: dict[str, Any] = {
+    "guidance.render_width": 168,
+    "guidance.crop_share": 154 / 168,
+    "guidance.crops_per_view": 8,  # n_local_aug
+    "guidance.views_per_step": 8,  # a pose for each of eight devices
+    "guidance.min_elevation": 30.0,
+    "guidance.max_elevation": 30.0,
+    "guidance.camera_distance": 4.0,
+    "guidance.focal": 1.2,
+    "guidance.transmittance_weight": 0.5,
+    "guidance.initial_opacity": 0.5,
+    "guidance.final_opacity": 0.1,
+    "guidance.opacity_steps": 500,
+    "guidance.origin_decay": 0.999,
+    "distillation.guidance_scale": 100.0,
+    "distillation.min_time": 0.02,
+    "distillation.max_time": 0.98,
+}
+
 PUBLISHED: dict[str, dict[str, Any]] = {
     "fourier-features": {  # tancik/fourier-feature-networks, Demo.ipynb; the paper's section 6.1. From memory
         "encoding": "gaussian",
@@ -51,6 +70,24 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "guided": True,
         "guard_margin": 0.05,  # frustum_bound
         "learning_rate": 1e-3,
+    },
+    # google-research/dreamfields, config_base.py and config_hq.py; Poole 2022, section 3, from memory
+    "dream-fields": WORDS
+    | {
+        "steps.steps_per_diagonal": 333,  # num_samples 192 over the far and near bounds, 2 sqrt(3)
+        "table.sh_bands": 1,  # viewdirs: False
+    },
+    # dreamgaussian/dreamgaussian, configs/text.yaml. From memory
+    "dream-splats": WORDS
+    | {
+        "initial_gaussians": 5000,
+        "initial_radius": 0.5,
+        "rates.means_lr": 1e-3,
+        "rates.final_means_lr": 2e-5,
+        "rates.sh_lr": 1e-2,
+        "rates.opacities_lr": 0.05,
+        "rates.scales_lr": 5e-3,
+        "rates.quaternions_lr": 5e-3,
     },
     "imap": {  # sections 3.1 to 3.4. From memory; rates and iterations are not in the paper
         "field": "network",

@@ -44,6 +44,7 @@ DATASETS = {
     "Shapes": ("tiny_shapes", "shapes"),
     "Collection": ("tiny_collection", "collection"),
     "BlockWorld": ("tiny_world", "world"),
+    "Words": ("tiny_words", "words"),
 }
 
 

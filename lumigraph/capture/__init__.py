@@ -16,6 +16,7 @@ from ..datasets.collection import Collection
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
+from ..datasets.words import WORDS, Words
 from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..files import exists, expanded
@@ -52,14 +53,15 @@ def synthetic() -> Any:
     return import_module("..synthetic", __package__)
 
 
-KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection, BlockWorld)}
+KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection, BlockWorld, Words)}
 
 
 def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options: Any) -> Dataset:
     """Open a source of any kind as a dataset.
 
     wanted:  the kind to open it as, where it can be several: Scene, Shapes or Collection; see `kind_of`
-    options: those of `open_scene` for photographs, also for those in a collection; `partial` of `read_shapes`
+    options: those of `open_scene` for photographs, also for those in a collection; `partial` of
+             `read_shapes`; `guidance` of `Words.read`
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
     kind, path = kind_of(source, wanted), expanded(source)
@@ -68,11 +70,20 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
         return Collection.of({name: partial(open_dataset, one, **options) for name, one in many.items()}, str(source))
     if kind is Shapes:
         some_sides = bool(options.pop("partial", None))
-        told = [name for name, value in options.items() if value not in (None, 1)]
-        if told:
-            raise LumigraphError(f"{source} holds shapes, and --{told[0]} is about photographs; leave it out")
+        only_of_photographs(source, kind, options)
         return meshes.read_shapes(path, some_sides)
+    if kind is Words:
+        guidance = options.pop("guidance", None)
+        only_of_photographs(source, kind, options)
+        return Words.read(str(source), guidance)
     return open_scene(source, **options)
+
+
+def only_of_photographs(source: str | Path, kind: type[Any], options: dict[str, Any]) -> None:
+    """Raise LumigraphError for options of `open_scene` with a source of another kind."""
+    if told := [name for name, value in options.items() if value not in (None, 1)]:
+        name = told[0].replace("_", "-")
+        raise LumigraphError(f"{source} holds {kind.kind}, and --{name} is about photographs; leave it out")
 
 
 def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
@@ -83,6 +94,8 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     of photographs. Raises LumigraphError for a path that does not exist.
     """
     path = expanded(source)
+    if str(source).startswith(WORDS):
+        return Words
     if (request := requested(source)) is not None:
         if synthetic().is_collection(request):
             return Collection
@@ -181,6 +194,8 @@ def confirm(source: str | Path) -> None:
     """Raise LumigraphError where there is nothing at a source that could be learnt from, by whatever method."""
     if (request := requested(source)) is not None:
         synthetic().confirm(request)
+        return
+    if str(source).startswith(WORDS):
         return
     path = expanded(source)
     if path.is_dir() and not list_images(path) and not members_of(path):

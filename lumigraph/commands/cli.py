@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import operator
 import os
 import sys
@@ -216,6 +217,8 @@ def parse(arguments: list[str]) -> Any:
     named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert", "track") else []
     if named:  # the options of the method too
         commands[first] = with_options_of(named[0], rest, commands[first])
+    if first == "train" and rest[:1] == ["captions"]:  # a model and no method
+        commands[first] = importlib.import_module(".train_captions", __package__).TrainCaptions
     kinds = []
     for name, kind in commands.items():
         first_sentence = (kind.__doc__ or "").strip().partition("\n")[0]

@@ -203,7 +203,8 @@ class Train:
     """Train a method on the photographs of a scene.
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
-    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. If
+    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. Those
+    that learn from words take words:PROMPT and --guidance. If
     photographs have no poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's
     own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` continues.
     """
@@ -226,6 +227,8 @@ class Train:
     """Train on only this number of photographs, spread evenly over the cameras."""
     depth_from: Annotated[str | None, option("FILE", "depth beside the photographs")] = None
     """Cloud (.las, .laz, .e57, .ply) or mesh that gives the photographs their depth, in the frame of their poses."""
+    guidance: Annotated[str | None, option("FILE", "")] = None
+    """Model that judges pictures by words:PROMPT: CLIP or a diffusion model, in a folder or file of yours."""
     scales: Annotated[Scales, option("N")] = 1
     """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
     seed: SeedOption = 0
@@ -265,6 +268,8 @@ class Train:
         options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
         if self.depth_from is not None:
             options["depth_from"] = str(Path(self.depth_from).resolve())
+        if self.guidance is not None:
+            options["guidance"] = str(Path(self.guidance).expanduser().resolve())
         data = open_dataset(source, kind.learns_from, **options)
         name = self.chosen(data)
         kind = methods.find(name)

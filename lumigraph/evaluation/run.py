@@ -15,6 +15,7 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
 from ..datasets.world import BlockWorld
+from ..datasets.words import Words
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files import claim, scene_name, write_json
@@ -26,6 +27,7 @@ from ..system.progress import counting
 from .shapes import ShapesEvaluation, evaluate_shapes
 from .views import Evaluation, evaluate, file_name, reveal
 from .walks import evaluate_walk
+from .words import evaluate_words
 
 Keep = Callable[[str, Rendering], object]
 
@@ -66,6 +68,8 @@ def evaluate_on(
     """
     if isinstance(data, Shapes):
         return evaluate_shapes(method, data, split, most)
+    if isinstance(data, Words):
+        return evaluate_words(method, data, most)
     if isinstance(data, Collection):
         return evaluate_collection(method, data, split, keep, most, lpips, right_halves)
     if isinstance(data, BlockWorld) and issubclass(method.learns_from, BlockWorld):

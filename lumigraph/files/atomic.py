@@ -311,7 +311,9 @@ def refusal(path: Path, error: OSError) -> str:
 
 
 def scene_name(source: str) -> str:
-    """A short name for files: the last part of a path, without a file's suffix, or of "procedural:<name>"."""
+    """A short name for files: the last part of a path, without a file's suffix, or what is behind "procedural:" or
+    "words:"."""
     path = Path(source).resolve()
-    last = source.partition(":")[2] if source.startswith("procedural:") else path.stem if path.is_file() else path.name
+    own = path.stem if path.is_file() else path.name
+    last = source.partition(":")[2] if source.startswith(("procedural:", "words:")) else own
     return re.sub(r"[^\w.-]+", "-", last) or "scene"

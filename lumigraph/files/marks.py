@@ -25,6 +25,7 @@ WHOLE_FOLDER = "."  # the name that stands for a folder which was written as one
 
 Sum = tuple[int, str]  # bytes, SHA-256
 Kind = Literal[
+    "guidance",
     "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
     "page", "splats", "octree", "atlas", "points", "mesh", "panorama", "comparison", "drawings", "scores of drawings",
     "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "canonical", "depth maps",

@@ -23,7 +23,7 @@ BYTES_FACTOR = 4  # copies of a parameter: itself, its gradient, and the two mom
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options of a run for `open_dataset`: see `capture.open_scene`, and `meshes.read_shapes` for shapes."""
+    """Options of a run for `open_dataset`: see `capture.open_scene`, `meshes.read_shapes` and `Words.read`."""
 
     downscale: Downscale | None = None
     reader: str | None = None
@@ -34,6 +34,7 @@ class SourceOptions:
     partial: bool | None = None
     unposed: Unposed | None = None
     depth_from: str | None = None
+    guidance: str | None = None
 
 
 @dataclass(frozen=True)

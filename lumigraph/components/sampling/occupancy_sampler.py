@@ -167,9 +167,9 @@ class OccupancySampler(Sampler):
 
     # Training
 
-    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+    def begin(self, method: Any, data: Any, seconds: float) -> None:
         """Rule out cells that the photographs' alpha proves empty, unless poses are learnt."""
-        if data.images.has_alpha and not self.frame.is_open and not method.moves_cameras:
+        if isinstance(data, Scene) and data.images.has_alpha and not self.frame.is_open and not method.moves_cameras:
             self.grid.rule_out(visual_hull(data, self.numbers.occupancy_resolution)[None])
 
     def begin_from(self, teacher: Any, chance: torch.Generator) -> None:

@@ -1,0 +1,10 @@
+"""Guidance by words: models that judge pictures by a prompt, and the part that leads a scene to it."""
+
+from .guides import DistillationNumbers as DistillationNumbers
+from .guides import Guide as Guide
+from .guides import open_guide as open_guide
+from .part import CPU_GUIDANCE as CPU_GUIDANCE
+from .part import TINY_GUIDANCE as TINY_GUIDANCE
+from .part import Guidance as Guidance
+from .part import GuidanceNumbers as GuidanceNumbers
+from .views import Views as Views

@@ -1,0 +1,103 @@
+"""Guides: models that judge pictures by a prompt, opened from a user's files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...errors import LumigraphError
+from ...files.ranges import NonNegative, Share
+from ...metrics import Score
+from .clip import Clip
+from .clip_files import read_clip
+from .tokenizer import Tokenizer
+
+DIFFUSION_INDEX = "model_index.json"  # of diffusers' folders
+
+Pictures = Float[Tensor, "picture 3 side side"]
+
+
+@dataclass(frozen=True)
+class DistillationNumbers:
+    """A Config's numbers of score distillation (Poole 2022, section 3); CLIP uses none of them."""
+
+    guidance_scale: NonNegative = 100.0  # omega of eq. 4; higher: closer to the prompt, less varied, gaudier
+    min_time: Share = 0.02  # share of the noise schedule at which the least noise is drawn; higher: coarser advice
+    max_time: Share = 0.98  # share of the noise schedule at which the most noise is drawn
+
+    def check(self) -> None:
+        """Raises LumigraphError for an empty range of noise."""
+        if self.min_time > self.max_time:
+            raise LumigraphError(f"--min-time {self.min_time:g} is above --max-time {self.max_time:g}; swap them")
+
+
+@runtime_checkable
+class Guide(Protocol):
+    """pixels:   sides of the pictures that it judges
+    named_views: True if it follows prompts that name the view (Poole 2022, section 3.2)
+    """
+
+    pixels: int
+    named_views: bool
+
+    def loss(
+        self, pictures: Pictures, prompts: tuple[str, ...], generator: torch.Generator, numbers: DistillationNumbers
+    ) -> Tensor:
+        """Scalar that falls where pictures, sRGB in [0, 1], come closer to their prompts."""
+
+    def score(self, pictures: Pictures, prompt: str) -> Score:
+        """Mean agreement of pictures with a prompt."""
+
+
+class ClipGuide:
+    """Agreement of picture and caption by CLIP, the guidance of Dream Fields (Jain 2022, eq. 5)."""
+
+    named_views = False
+
+    def __init__(self, network: Clip, tokenizer: Tokenizer):
+        self.network, self.tokenizer, self.pixels = network, tokenizer, network.sizes.picture
+        self.captions = cache(self._captions)
+
+    @torch.no_grad()
+    def _captions(self, prompts: tuple[str, ...]) -> Float[Tensor, "prompt embedding"]:
+        return self.network.of_captions(self.tokenizer(prompts).to(self.network.logit_scale.device))
+
+    def cosines(self, pictures: Pictures, prompts: tuple[str, ...]) -> Float[Tensor, "picture prompt"]:
+        """Cosines between the embeddings of pictures and of captions."""
+        return self.network.of_pictures(pictures) @ self.captions(prompts).T
+
+    def loss(
+        self, pictures: Pictures, prompts: tuple[str, ...], generator: torch.Generator, numbers: DistillationNumbers
+    ) -> Tensor:
+        """1 - g(I)^T h(y), averaged over pictures (Jain 2022, eq. 5, but for the constant)."""
+        return 1 - (self.network.of_pictures(pictures) * self.captions(prompts)).sum(-1).mean()
+
+    @torch.no_grad()
+    def score(self, pictures: Pictures, prompt: str) -> Score:
+        return Score("similarity to the prompt", float(self.cosines(pictures, (prompt,)).mean()), "", "higher")
+
+
+def open_guide(path: Path, device: torch.device) -> Guide:
+    """The model in a file or folder, kept open while the process runs.
+
+    A folder of diffusers is a diffusion model, anything else CLIP. Raises LumigraphError for what is neither.
+    """
+    return _open(path, device)
+
+
+@cache
+def _open(path: Path, device: torch.device) -> Guide:
+    if not path.exists():
+        raise LumigraphError(f"{path} does not exist; name the folder or file of a model for --guidance")
+    if (path / DIFFUSION_INDEX).is_file():
+        from .diffusion import DiffusionGuide
+
+        return DiffusionGuide(path, device)
+    network, tokenizer = read_clip(path)
+    return ClipGuide(network.to(device), tokenizer)
