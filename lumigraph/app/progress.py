@@ -40,7 +40,7 @@ PERCENT = re.compile(r"(\d+) of (\d+)")
 
 
 def photographs_state(item: Item) -> dict[str, dict[str, Any]]:
-    """State of each photograph of the scene by name: features, matched photographs, whether it is placed and why not."""
+    """State of each photograph by name: features, photographs that match, whether it is placed and why not."""
     found: dict[str, dict[str, Any]] = {}
     database = item.path / SCENE / "work" / "database.db"
     for name, features, matched in rows_of(database):
@@ -175,8 +175,8 @@ def _model(place: Path, modified: int) -> dict[str, Any]:
     return {
         "names": names,
         "cameras": np.round(cameras, 4).tolist(),
-        "points": [[*place, *colour] for place, colour in zip(np.round(places, 4).tolist(), colours.tolist(), strict=True)],
-    }  # fmt: skip
+        "points": np.concatenate([np.round(places, 4), colours], 1).tolist(),
+    }
 
 
 def framed(

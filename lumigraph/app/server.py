@@ -24,15 +24,15 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request as PlainRequest
 
 from .. import methods
-from ..budget import QUALITIES, Quality
+from ..budget import Quality
 from ..errors import LumigraphError
-from ..files import expanded, remove
+from ..files import expanded
 from ..files.locks import held
 from ..files.ranges import Count, Downscale, Pixels
 from ..viewer.address import Address
 from ..viewer.guard import ISOLATION_HEADERS, MAX_MESSAGE_BYTES, Guard
-from . import jobs, pictures, progress, projects, sharing, uploads
-from .jobs import Making, Mapper, Runner
+from . import jobs, pictures, progress, projects, rows, sharing, uploads
+from .jobs import Mapper, Runner
 from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
 from .scene_views import SceneViews, forward, forward_messages
 
@@ -151,7 +151,7 @@ class App:
     # Home
 
     def home(self) -> dict[str, Any]:
-        found = [card(item) for item in projects.items(self.root)]
+        found = [rows.card(item) for item in projects.items(self.root)]
         waiting = [{"key": task.item.key, "share": task.share} for task in self.runner.queue()]
         return {
             "folder": str(self.root),
@@ -168,12 +168,8 @@ class App:
                 raise LumigraphError("A path is for browsers on this machine; drop the photographs instead")
             source = expanded(body.path.strip())
             source = source if source.is_absolute() else self.root / source
-            if source.is_file() and not pictures.is_film(source):
-                raise LumigraphError(f"{source} is neither a folder nor a video; name one of these")
+            check_source(source)
         item = projects.new_project(self.root, body.title or (source.stem if source else "Scene"), source)
-        if source is not None and item.photographs.is_dir() and not pictures.files_of(source) and not has_poses(source):
-            remove(item.path)
-            raise LumigraphError(f"{source} holds no photographs and no video; name another folder")
         return {"key": item.key}
 
     # One item
@@ -185,7 +181,7 @@ class App:
         """All that the page of an item shows."""
         record, job = item.record, jobs.read_job(item)
         files = pictures.files_of(item.photographs) if item.kind != "run" else {}
-        runs = [run_row(path) for path in item.runs]
+        runs = [rows.run_row(path) for path in item.runs]
         current = self.runner.current
         return {
             "key": item.key,
@@ -198,15 +194,21 @@ class App:
                 for name, path in files.items()
             ],
             "runs": runs,
-            "make": making_row(item, job.make) if job.make else None,
+            "make": rows.making_row(item, job.make) if job.make else None,
             "live": current is not None and current.item == item and current.port is not None,
-            "shares": [share_row(item, share) for share in reversed(job.shares)],
-            "result": result_of(item),
+            "shares": [rows.share_row(item, share) for share in reversed(job.shares)],
+            "result": rows.result_of(item),
             "queue": [task.item.key for task in self.runner.queue()],
         }
 
     def advice(self, item: Item) -> list[dict[str, Any]]:
         return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.files_of(item.photographs))]
+
+    def rename(self, item: Item, body: TitleBody) -> dict[str, Any]:
+        return {"key": projects.rename(item, body.title).key}
+
+    def duplicate(self, item: Item) -> dict[str, Any]:
+        return {"key": projects.duplicate(item).key}
 
     def delete(self, item: Item) -> dict[str, Any]:
         self.views.close(item.path)
@@ -278,79 +280,13 @@ class App:
         return (view.port if view else None), view
 
 
-def has_poses(place: Path) -> bool:
-    return any((place / name).exists() for name in projects.SCENE_FILES)
-
-
-def card(item: Item) -> dict[str, Any]:
-    """What the home page shows of an item."""
-    try:
-        record = item.record
-        runs = [path for path in item.runs if path.is_dir()]
-        about = progress.card_of_run(runs[-1]) if runs else {"method": "", "psnr": None}
-        job = jobs.read_job(item).make
-        size = projects.size_of(item.path)
-    except LumigraphError as fault:
-        return {"key": item.key, "kind": item.kind, "title": item.path.name, "fault": str(fault), "age": 0, "bytes": 0}
-    picture = next((path for run in reversed(runs) if (path := progress.picture_of_run(run))), None)
-    if picture is None and item.kind != "run":
-        picture = next(iter(pictures.files_of(item.photographs).values()), None)
-    return {
-        "key": item.key,
-        "kind": item.kind,
-        "title": record.title,
-        "picture": pictures.version_of(picture) if picture else "",
-        "age": progress.age(item.path),
-        "bytes": size,
-        "state": job.state if job else "",
-        "fault": job.fault if job else "",
-        "runs": len(runs),
-        **about,
-    }
-
-
-def run_row(path: Path) -> dict[str, Any]:
-    about = progress.card_of_run(path) if path.is_dir() else {"method": path.suffix, "psnr": None, "trained": True}
-    picture = progress.picture_of_run(path)
-    row = {"name": path.name, "bytes": projects.size_of(path), "age": progress.age(path), **about}
-    return row | {"picture": pictures.version_of(picture) if picture else ""}
-
-
-def making_row(item: Item, job: Making) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        name: getattr(job, name)
-        for name in ("state", "stage", "quality", "seconds", "method", "mapper", "run", "fault", "begun")
-    }
-    if job.state == "queued":
-        return row
-    row["progress"] = (
-        progress.capture_progress(item) if job.stage == "capture" else progress.training_progress(item, job)
-    )
-    if job.quality in QUALITIES[:-1]:
-        row["next"] = QUALITIES[QUALITIES.index(job.quality) + 1]
-    row["messages"] = jobs.log_lines(item)[-30:]
-    return row
-
-
-def share_row(item: Item, share: jobs.ShareJob) -> dict[str, Any]:
-    place = item.path / SHARED / share.name
-    there = place.stat().st_size if share.state == "done" and place.is_file() else None
-    names = ("name", "kind", "run", "state", "fault")
-    return {name: getattr(share, name) for name in names} | {"bytes": there}
-
-
-def result_of(item: Item) -> dict[str, Any] | None:
-    """Findings of the capture: photographs placed and left out, warnings, and what to do."""
-    result = progress.capture_result(item)
-    if result is None:
-        return None
-    names = ("given", "left_out", "blurred", "duplicates", "warnings", "error", "points", "angle", "findings")
-    kept = {name: result.get(name) for name in names} | {"placed": len(result.get("registered", []))}
-    mapper = result.get("options", {}).get("mapper", "incremental")
-    folded = any("folded" in one or "far apart" in one or "leap" in one for one in result.get("warnings", []))
-    few = kept["placed"] < 0.9 * (result.get("used") or 0)
-    other = "global" if mapper == "incremental" else "incremental"
-    return kept | {"mapper": mapper, "try": other if folded or few else ""}
+def check_source(source: Path) -> None:
+    """Raise LumigraphError unless a path on this machine holds photographs, a video or a scene."""
+    if not source.exists():
+        raise LumigraphError(f"{source} does not exist; check the path")
+    poses = any((source / name).exists() for name in projects.SCENE_FILES)
+    if not poses and not pictures.files_of(source) or (source.is_file() and not pictures.is_film(source)):
+        raise LumigraphError(f"{source} holds no photographs and no video; name another folder")
 
 
 # Routes
@@ -450,11 +386,9 @@ def build(app: App) -> ASGIApp:
         Route("/api/trash", asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
         Route("/api/trash/{name}", restore, methods=["POST"]),
         Route(item, asked(None, app.detail)),
-        Route(
-            item, asked(TitleBody, lambda one, body: {"key": projects.rename(one, body.title).key}), methods=["PATCH"]
-        ),
+        Route(item, asked(TitleBody, app.rename), methods=["PATCH"]),
         Route(item, asked(None, app.delete), methods=["DELETE"]),
-        Route(f"{item}/duplicate", asked(None, lambda one: {"key": projects.duplicate(one).key}), methods=["POST"]),
+        Route(f"{item}/duplicate", asked(None, app.duplicate), methods=["POST"]),
         Route(f"{item}/photographs", take, methods=["PUT"]),
         Route(f"{item}/photographs", have),
         Route(f"{item}/photographs", leave_out, methods=["DELETE"]),
@@ -487,30 +421,16 @@ def build(app: App) -> ASGIApp:
 
 
 # A page that was made to share runs its program apart from the app's own address.
-SHOWN_HEADERS = {
-    "Content-Security-Policy": "sandbox allow-scripts; frame-ancestors 'self'",
-    "Cache-Control": "no-cache",
-}
+SANDBOX = "sandbox allow-scripts; frame-ancestors 'self'"
+SHOWN_HEADERS = {"Content-Security-Policy": SANDBOX, "Cache-Control": "no-cache"}
 
 
 def picture_of(item: Item, request: Request) -> Response:
     """A photograph by name, the preview of a run, or the picture of a card, small."""
-    name, run = request.query_params.get("name", ""), request.query_params.get("run", "")
-    side = min(max(whole(request.query_params.get("side", "320")), 16), 2048)
-    if name:
-        made = item.path / projects.SCENE / "images"
-        found = pictures.files_of(item.photographs).get(name) or pictures.files_of(made).get(name)
-    elif run:
-        found = progress.picture_of_run(item.run(run))
-    else:
-        runs = (progress.picture_of_run(path) for path in reversed(item.runs))
-        found = next(filter(None, runs), None)
-        found = found or (
-            next(iter(pictures.files_of(item.photographs).values()), None) if item.kind != "run" else None
-        )
-    if found is None:
-        raise LumigraphError("There is no such picture")
-    kept = "max-age=86400" if "v" in request.query_params else "no-cache"
+    query = request.query_params
+    side = min(max(whole(query.get("side", "320")), 16), 2048)
+    found = rows.picture(item, query.get("name", ""), query.get("run", ""))
+    kept = "max-age=86400" if "v" in query else "no-cache"
     return Response(pictures.thumbnail(found, side), media_type="image/jpeg", headers={"Cache-Control": kept})
 
 
@@ -532,9 +452,9 @@ def whole(text: str) -> int:
 
 def refused(request: Request, fault: Exception) -> Response:
     """One sentence for a fault of a request."""
-    if isinstance(fault, uploads.Misplaced):
+    if isinstance(fault, uploads.MisplacedError):
         return JSONResponse({"fault": str(fault), "have": fault.have}, 409)
-    if isinstance(fault, uploads.DiskFull):
+    if isinstance(fault, uploads.DiskFullError):
         return JSONResponse({"fault": str(fault)}, 507)
     if isinstance(fault, LumigraphError):
         return JSONResponse({"fault": str(fault)}, 400)
