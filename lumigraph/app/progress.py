@@ -203,8 +203,11 @@ def training_progress(item: Item, job: Making) -> dict[str, Any]:
     folder = run_folder(item, job.run)
     if not job.run or not (folder / "config.json").is_file():
         return {"stage": "Beginning", "share": 0.0}
-    run = Run(folder)
-    rows, budget = run.metrics(), Budget.from_json(run.settings.budget)
+    try:
+        run = Run(folder)
+        rows, budget = run.metrics(), Budget.from_json(run.settings.budget)
+    except LumigraphError as fault:
+        return {"stage": str(fault), "share": 0.0}
     if not rows:
         return {"stage": "Compiling kernels", "share": 0.0, "method": run.method_name}
     last = rows[-1]
