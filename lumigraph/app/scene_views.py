@@ -171,6 +171,9 @@ async def forward_messages(browser: WebSocket, port: int, view: SceneView | None
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
+        if view:
+            view.connections -= 1
+            view.used = time.monotonic()
         for task in tasks:
             task.cancel()
         for task in tasks:
@@ -179,6 +182,3 @@ async def forward_messages(browser: WebSocket, port: int, view: SceneView | None
         await there.close()
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await browser.close()
-        if view:
-            view.connections -= 1
-            view.used = time.monotonic()
