@@ -23,6 +23,7 @@ from starlette.websockets import WebSocketDisconnect
 from websockets.sync.server import serve as serve_websockets
 
 from lumigraph.app import jobs, progress, projects, uploads
+from lumigraph.app.job_record import read_job
 from lumigraph.app.projects import find_item, new_project
 from lumigraph.app.scene_views import SceneView
 from lumigraph.app.server import App, build
@@ -183,8 +184,8 @@ def test_a_photograph_arrives_in_pieces(app, client, project):
 
 @pytest.mark.parametrize(
     "name",
-    ["../a.jpg", "a/../../b.jpg", "/etc/a.jpg", "..\\a.jpg", "C:a.jpg", ".hidden.jpg", "a/.b/c.jpg", "a\x00.jpg", "a\n.jpg",
-     "con.jpg", "a/b/c/d/e.jpg", "x" * 300 + ".jpg", "", ".", "a*.jpg", "\u202egpj.a.jpg"],
+    ["../a.jpg", "a/../../b.jpg", "/etc/a.jpg", "..\\a.jpg", "C:a.jpg", ".hidden.jpg", "a/.b/c.jpg",
+     "a\x00.jpg", "a\n.jpg", "con.jpg", "a/b/c/d/e.jpg", "x" * 300 + ".jpg", "", ".", "a*.jpg", "\u202egpj.a.jpg"],
 )  # fmt: skip
 def test_names_that_lead_elsewhere_are_refused(app, client, project, name):
     before = sorted(app.root.parent.rglob("*"))
@@ -433,11 +434,11 @@ def test_a_killed_app_goes_on_where_it_was(app, project):
     app.runner._ended = True  # as after a kill, nobody changes the record any more
     child.send_signal(signal.SIGKILL)
     app.runner._thread.join(10)
-    assert jobs.read_job(item).make.state == "running"
+    assert read_job(item).make.state == "running"
     let(app)
     again = App(app.root, app.address, app.runner.program)
     again.runner.begin()
-    wait(lambda: jobs.read_job(item).make.state == "done")
+    wait(lambda: read_job(item).make.state == "done")
     again.runner.end()
     assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train"]
 

@@ -1,4 +1,4 @@
-"""Jobs: commands of the command line in processes of their own, one after another, and their records in job.json.
+"""Jobs: commands of the command line in processes of their own, one after another.
 
 A record changes before its process does. After a kill of the app its child is asked to end (SIGTERM), saves and ends;
 the next app finds the job as running and begins the same command again, which goes on from its stages or checkpoints.
@@ -13,105 +13,24 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from ..budget import Quality
 from ..errors import LumigraphError
-from ..files import read_json, write_json
-from ..files.ranges import Count, Downscale, Seconds, Steps
 from ..system.signals import start
 from ..viewer.address import HOST, free_port
+from .job_record import JobRecord, JobState, Making, ShareJob, change, change_making, change_share, read_job
 from .pictures import input_of
 from .projects import JOB_FILE, LOG_FILE, RUNS, SCENE, SHARED, Item, is_plain_name, items
+from .sharing import command_of
 
-JobState = Literal["queued", "running", "paused", "stopped", "failed", "done"]
-Mapper = Literal["incremental", "global"]
 POLL_SECONDS = 0.2  # between looks at a child
 IDLE_SECONDS = 2.0  # between looks for jobs that nobody announced
 PATIENCE_SECONDS = 60.0  # for the child of an app that was killed to save
 LOG_BYTES = 60_000  # of the end of a log that are read
 PROGRAM = (sys.executable, "-m", "lumigraph")
-
-
-@dataclass(frozen=True)
-class Making:
-    """Photographs to a run: as it was asked for, and how far it is.
-
-    quality, seconds, steps: budget of the training, one of them
-    stage:   the command that is next or under way
-    run:     name of the run in the project's runs; empty before training
-    fault:   sentence of the command that failed
-    process: number of the running child
-    """
-
-    state: JobState
-    asked: float
-    quality: Quality | None = None
-    seconds: Seconds | None = None
-    steps: Steps | None = None
-    method: str = "gaussian-splatting"
-    mapper: Mapper = "incremental"
-    frames: Count | None = None
-    downscale: Downscale | None = None
-    mask_object: bool = False
-    stage: Literal["capture", "train"] = "capture"
-    run: str = ""
-    fault: str = ""
-    process: int = 0
-    begun: float = 0.0
-
-
-@dataclass(frozen=True)
-class ShareJob:
-    """A run to a file in the project's shared folder. command: words between the run and the file, see `sharing`"""
-
-    name: str
-    kind: str
-    run: str
-    options: list[str]
-    state: JobState
-    asked: float
-    fault: str = ""
-    process: int = 0
-    begun: float = 0.0
-
-
-@dataclass(frozen=True)
-class JobRecord:
-    """Contents of job.json."""
-
-    make: Making | None = None
-    shares: list[ShareJob] = field(default_factory=list)
-
-
-_writing = threading.RLock()  # around reading, changing and writing a record
-
-
-def read_job(item: Item) -> JobRecord:
-    path = item.path / JOB_FILE
-    return read_json(path, JobRecord) if path.is_file() else JobRecord()
-
-
-def change(item: Item, make: Callable[[JobRecord], JobRecord]) -> JobRecord:
-    """Read, change and write a record; nobody else does meanwhile."""
-    with _writing:
-        after = make(read_job(item))
-        write_json(item.path / JOB_FILE, asdict(after), ours=True)
-        return after
-
-
-def change_making(item: Item, **values: Any) -> JobRecord:
-    return change(item, lambda job: replace(job, make=job.make and replace(job.make, **values)))
-
-
-def change_share(item: Item, name: str, **values: Any) -> JobRecord:
-    def one(share: ShareJob) -> ShareJob:
-        return replace(share, **values) if share.name == name else share
-
-    return change(item, lambda job: replace(job, shares=[one(share) for share in job.shares]))
 
 
 @dataclass
@@ -251,8 +170,6 @@ class Runner:
         """Words of the next command, and the port of its viewer."""
         job = task.job
         if isinstance(job, ShareJob):
-            from .sharing import command_of
-
             return command_of(task.item, job), None
         assert job is not None
         if job.stage == "capture" and (words := capture_command(task.item, job)):

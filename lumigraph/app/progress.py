@@ -22,7 +22,8 @@ from ..files import read_json
 from ..files.names import natural
 from ..geometry import evenly
 from ..metrics.rows import last_psnr
-from .jobs import Making, log_lines, run_folder
+from .job_record import Making
+from .jobs import log_lines, run_folder
 from .projects import SCENE, Item
 
 STAGES = {

@@ -9,7 +9,8 @@ from ..budget import QUALITIES
 from ..errors import LumigraphError
 from ..exchange import size_of
 from . import pictures, progress
-from .jobs import Making, ShareJob, log_lines, read_job
+from .job_record import Making, ShareJob, read_job
+from .jobs import log_lines
 from .projects import SCENE, SHARED, Item
 
 MIN_PLACED_SHARE = 0.9  # of the photographs, below which the other mapper is offered

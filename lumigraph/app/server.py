@@ -32,7 +32,8 @@ from ..files.ranges import Count, Downscale, Pixels
 from ..viewer.address import Address
 from ..viewer.guard import ISOLATION_HEADERS, MAX_MESSAGE_BYTES, Guard
 from . import jobs, pictures, progress, projects, rows, sharing, uploads
-from .jobs import Mapper, Runner
+from .job_record import JobState, Mapper, read_job
+from .jobs import Runner
 from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
 from .scene_views import SceneViews, forward, forward_messages
 
@@ -179,7 +180,7 @@ class App:
 
     def detail(self, item: Item) -> dict[str, Any]:
         """All that the page of an item shows."""
-        record, job = item.record, jobs.read_job(item)
+        record, job = item.record, read_job(item)
         files = pictures.files_of(item.photographs) if item.kind != "run" else {}
         runs = [rows.run_row(path) for path in item.runs]
         current = self.runner.current
@@ -224,8 +225,8 @@ class App:
         self.runner.wake()
         return self.detail(item)
 
-    def stop(self, item: Item, state: jobs.JobState) -> dict[str, Any]:
-        job = jobs.read_job(item).make
+    def stop(self, item: Item, state: JobState) -> dict[str, Any]:
+        job = read_job(item).make
         if job is None or job.state not in ("queued", "running", "paused"):
             raise LumigraphError("Nothing is being made here any more")
         self.runner.stop(jobs.Task(item, None), state)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LumigraphError
-from .jobs import ShareJob
+from .job_record import ShareJob
 from .projects import SHARED, Item, is_splats
 
 # Sizes: bytes of a Gaussian or of a second of film. Measured on pages and files of 20,000 to 80,000 Gaussians.
