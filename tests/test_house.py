@@ -44,7 +44,7 @@ FLOORS: list[set[str]] = [
     {"training"},
     {"evaluation", "large"},
     {"derive"},
-    {"benchmark", "explain"},
+    {"app", "benchmark", "explain"},
     {"commands"},
     {"__main__"},
 ]

@@ -32,6 +32,7 @@ from ..files import refusal
 from ..files.ranges import coherent, domain, is_surprising, outside, shown
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
+from .app import AppCommand
 from .bench import Bench
 from .canonicalise import Canonicalise
 from .capture import CaptureCommand
@@ -112,6 +113,7 @@ def held(command: Any) -> Any:
 
 
 COMMANDS: dict[str, type] = {
+    "app": AppCommand,
     "demo": Demo,
     "capture": CaptureCommand,
     "depth": Depth,
@@ -140,6 +142,7 @@ COMMANDS: dict[str, type] = {
 }
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 
+  lumigraph app                         photographs in and scene out, in a browser
   lumigraph demo                        run every step on a procedural scene, in a few minutes
   lumigraph capture PHOTOS_OR_VIDEO     find the camera poses of photographs
   lumigraph train instant-ngp PHOTOS    train on a folder of photographs or a video

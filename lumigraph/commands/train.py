@@ -239,6 +239,8 @@ class Train:
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
     """Show the scene in the browser during training, and afterwards until Ctrl-C."""
+    stay: bool = True
+    """With --view, show the scene after training too, until Ctrl-C."""
     host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
     """Address that --view listens at; 0.0.0.0 gives access to other machines."""
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
@@ -287,7 +289,7 @@ class Train:
                 looking = viewer or watch
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
             show_outcome(run, outcome, method, data)
-            keep_showing(viewer, outcome.signal)
+            keep_showing(viewer if self.stay else None, outcome.signal)
         return exit_code(outcome.signal)
 
     def chosen(self, data: Any) -> str:

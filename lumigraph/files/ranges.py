@@ -10,6 +10,7 @@ must agree beyond that, such as the coarsest level and the finest, a dataclass s
 from __future__ import annotations
 
 import re
+import threading
 import types
 import typing
 from collections.abc import Iterable, Iterator
@@ -160,6 +161,10 @@ def check(value: Any, where: Path | str) -> None:
     coherent(value)
 
 
+# msgspec 0.22 crashes where two threads convert to a class for the first time.
+_converting = threading.RLock()
+
+
 def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any:
     """Plain JSON as a value of a kind: a dataclass, a tuple, a dictionary, a union; ranges and types are checked.
 
@@ -169,7 +174,8 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
     Raises LumigraphError that says which value is wrong, and what it should be.
     """
     try:
-        made = msgspec.convert(value, kind)
+        with _converting:
+            made = msgspec.convert(value, kind)
         if is_dataclass(made):
             coherent(made)
         key = surplus(value, msgspec.to_builtins(made)) if closed else None

@@ -77,6 +77,11 @@ class Guard:
             return False
         return name in self._names or (bool(self.token) and is_ip_address(name))
 
+    @property
+    def cookie(self) -> str:
+        """Value of the header Set-Cookie that keeps the token."""
+        return f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+
     def has_token(self, request: Request) -> bool:
         tokens = parse_qs(urlsplit(request.path).query).get("token", [])
         for line in request.headers.get_all("Cookie"):
@@ -94,7 +99,7 @@ class Guard:
             if response is not None:
                 response.headers.update(ISOLATION_HEADERS)
                 if self.token:
-                    response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+                    response.headers["Set-Cookie"] = self.cookie
             return response
 
         return guarded

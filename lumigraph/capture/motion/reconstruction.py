@@ -74,6 +74,7 @@ SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
 MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
 FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
+SNAPSHOTS, MAX_SNAPSHOTS = "snapshots", 40  # folder among the work of models while cameras are placed, and their number
 MOVING_FILE = "moving.json"  # among the work: features that move
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
 OUTPUT_VERSION = 4  # another number makes all outputs be written again
@@ -429,6 +430,9 @@ class Reconstruction:
         return len(folds(names, np.stack([poses[name] for name in names]), matches, self.intake.in_order))
 
     def map(self, database: Path, models: Path, mapper: str, model: Path | None = None) -> None:
+        snapshots = self.work / SNAPSHOTS
+        remove(snapshots)
+        snapshots.mkdir()
         if mapper == "global":  # it changes what it finds in the database
             copy_database(database, database := self.work / "global.db")
         self.colmap(
@@ -439,6 +443,8 @@ class Reconstruction:
             images=str(self.images),
             models=str(models),
             model=model and str(model),
+            snapshots=str(snapshots),
+            snapshot_every=max(1, len(self.names) // MAX_SNAPSHOTS),
             calibrate=not (self.spherical or all(prior(group)[1] for group in self.groups)),
         )
 

@@ -11,6 +11,7 @@ import ctypes
 import json
 import os
 import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -128,6 +129,7 @@ def place_one_by_one(job: dict[str, Any]) -> None:
     """Incremental structure from motion (Schönberger and Frahm 2016), from the start or from a model, to which
     photographs are added with fewer inliers: the model is there to contradict them."""
     options, placed = incremental_options(job), 2
+    options.snapshot_path, options.snapshot_frames_freq = job["snapshots"], job["snapshot_every"]
     if job["model"]:
         options.mapper.abs_pose_min_num_inliers = MIN_ADDED_INLIERS
         options.multiple_models = False
@@ -135,6 +137,7 @@ def place_one_by_one(job: dict[str, Any]) -> None:
     def another() -> None:
         nonlocal placed
         placed += 1
+        keep_newest(job["snapshots"])
         tell(placed)
 
     def begun() -> None:
@@ -151,6 +154,12 @@ def place_one_by_one(job: dict[str, Any]) -> None:
         initial_image_pair_callback=begun,
         next_image_callback=another,
     )
+
+
+def keep_newest(folder: str) -> None:
+    """Delete the snapshots of a model but for the last two."""
+    for name in sorted(os.listdir(folder))[:-2]:
+        shutil.rmtree(os.path.join(folder, name), ignore_errors=True)
 
 
 def place_all_at_once(job: dict[str, Any]) -> None:

@@ -1,0 +1,1 @@
+"""The app: photographs in and scene out, in a browser."""

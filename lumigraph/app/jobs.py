@@ -1,0 +1,328 @@
+"""Jobs: commands of the command line in processes of their own, one after another.
+
+A record changes before its process does. After a kill of the app its child is asked to end (SIGTERM), saves and ends;
+the next app finds the job as running and begins the same command again, which goes on from its stages or checkpoints.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import LumigraphError
+from ..system.signals import start
+from ..viewer.address import HOST, free_port
+from .job_record import JobRecord, JobState, Making, ShareJob, change, change_making, change_share, read_job
+from .pictures import input_of
+from .projects import JOB_FILE, LOG_FILE, RUNS, SCENE, SHARED, Item, is_plain_name, items
+from .sharing import command_of
+
+POLL_SECONDS = 0.2  # between looks at a child
+IDLE_SECONDS = 2.0  # between looks for jobs that nobody announced
+PATIENCE_SECONDS = 60.0  # for the child of an app that was killed to save
+LOG_BYTES = 60_000  # of the end of a log that are read
+PROGRAM = (sys.executable, "-m", "lumigraph")
+
+
+@dataclass
+class Task:
+    """A job of an item. share: its file's name; None for the making of a run"""
+
+    item: Item
+    share: str | None
+    child: subprocess.Popen[Any] | None = None
+    port: int | None = None  # of the viewer of a training
+
+    @property
+    def job(self) -> Making | ShareJob | None:
+        record = read_job(self.item)
+        if self.share is None:
+            return record.make
+        return next((share for share in record.shares if share.name == self.share), None)
+
+    def set(self, **values: Any) -> None:
+        if self.share is None:
+            change_making(self.item, **values)
+        else:
+            change_share(self.item, self.share, **values)
+
+
+class Runner:
+    """Thread that runs the jobs of a folder, one after another, from `begin` until `end`.
+
+    program: words before those of a command
+    """
+
+    def __init__(self, root: Path, program: Sequence[str] = PROGRAM):
+        self.root, self.program = root, list(program)
+        self.current: Task | None = None
+        self._wake, self._ended = threading.Event(), False
+        # A child ends with the thread that started it, so this one lives as long as the app.
+        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+
+    def begin(self) -> None:
+        self._thread.start()
+
+    def end(self) -> None:
+        """End the running command, whose job goes on when the app starts again."""
+        self._ended = True
+        self._wake.set()
+        if (task := self.current) and task.child:
+            task.child.send_signal(signal.SIGTERM)
+        if self._thread.is_alive():
+            self._thread.join(PATIENCE_SECONDS)
+
+    def wake(self) -> None:
+        self._wake.set()
+
+    def queue(self) -> list[Task]:
+        """Jobs that run or wait, in order."""
+        tasks = []
+        for item in items(self.root):
+            if not (item.path / JOB_FILE).is_file():
+                continue
+            with contextlib.suppress(LumigraphError):  # a damaged record is shown on the page of its project
+                record = read_job(item)
+                jobs: list[tuple[str | None, Making | ShareJob]] = [(share.name, share) for share in record.shares]
+                jobs += [(None, record.make)] if record.make else []
+                for name, job in jobs:
+                    if job.state in ("queued", "running"):
+                        tasks.append((job.state != "running", job.asked, Task(item, name)))
+        return [task for _, _, task in sorted(tasks, key=lambda one: one[:2])]
+
+    def stop(self, task: Task, state: JobState) -> None:
+        """Pause or stop a job; its command saves and ends. Returns at once."""
+        task.set(state=state)
+        running = self.current
+        if running and running.child and (running.item, running.share) == (task.item, task.share):
+            running.child.send_signal(signal.SIGINT)
+
+    def release(self, item: Item) -> None:
+        """Stop the jobs of an item that is about to go, and wait until no command works in it."""
+        for task in self.queue():
+            if task.item == item:
+                self.stop(task, "stopped")
+        end = time.monotonic() + PATIENCE_SECONDS
+        while (running := self.current) and running.item == item:
+            if time.monotonic() > end:
+                raise LumigraphError(f"A command still works in {item.path}; try again when it has ended")
+            time.sleep(POLL_SECONDS)
+
+    def _work(self) -> None:
+        self._await_orphans()
+        while not self._ended:
+            task = next(iter(self.queue()), None)
+            if task is None:
+                self._wake.wait(IDLE_SECONDS)
+                self._wake.clear()
+                continue
+            self.current = task
+            try:
+                self._run(task)
+            except LumigraphError as fault:
+                self._fail(task, str(fault))
+            except Exception as fault:
+                self._fail(task, f"The job ended by a fault of the app ({type(fault).__name__}: {fault}); try it again")
+            finally:
+                self.current = None
+
+    def _fail(self, task: Task, fault: str) -> None:
+        try:
+            task.set(state="failed", fault=fault, process=0)
+        except (LumigraphError, OSError):
+            time.sleep(IDLE_SECONDS)  # the disk is full, or the item has gone
+
+    def _await_orphans(self) -> None:
+        """Wait until commands of an app that was killed have saved and ended."""
+        end = time.monotonic() + PATIENCE_SECONDS
+        for task in self.queue():
+            while (job := task.job) and job.process and is_alive(job.process) and time.monotonic() < end:
+                if self._ended:
+                    return
+                time.sleep(POLL_SECONDS)
+
+    def _run(self, task: Task) -> None:
+        """The commands of a job, until it is done, was paused, or the app ends."""
+        while not self._ended and (job := task.job) and job.state in ("queued", "running"):
+            task.set(state="running", fault="", begun=job.begun or time.time())
+            words, task.port = self._command(task)
+            code = self._call(task, words)
+            job = task.job
+            if self._ended or job is None or job.state != "running":
+                return
+            if code:
+                self._fail(task, sentence(task.item, code))
+            elif isinstance(job, Making) and job.stage == "capture":
+                task.set(stage="train", process=0)
+            else:
+                task.set(state="done", process=0)
+
+    def _command(self, task: Task) -> tuple[list[str], int | None]:
+        """Words of the next command, and the port of its viewer."""
+        job = task.job
+        if isinstance(job, ShareJob):
+            return command_of(task.item, job), None
+        assert job is not None
+        if job.stage == "capture" and (words := capture_command(task.item, job)):
+            return words, None
+        if job.stage == "capture" or not job.run:
+            task.set(stage="train", run=job.run or next_run(task.item, job.method))
+            job = task.job
+            assert isinstance(job, Making)
+        port = free_port(HOST, 0)
+        return train_command(task.item, job, port or 0), port
+
+    def _call(self, task: Task, words: list[str]) -> int:
+        """Run a command with its messages in the log. Returns its exit code."""
+        with open(task.item.path / LOG_FILE, "wb") as log:
+            log.write(f"$ lumigraph {' '.join(words)}\n".encode())
+            log.flush()
+            pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
+            task.child = start([*self.program, *words], cwd=task.item.path, **pipes)
+        task.set(process=task.child.pid)
+        job = task.job
+        if self._ended or job is None or job.state != "running":  # paused while it was being started
+            task.child.send_signal(signal.SIGINT)
+        code = task.child.wait()
+        task.child = task.port = None
+        return code
+
+
+def is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def capture_command(item: Item, job: Making) -> list[str]:
+    """Words of `lumigraph capture`; empty for photographs whose poses are known."""
+    from ..capture.photos import is_bare
+
+    place = input_of(item)
+    if not is_bare(place):
+        return []
+    words = ["capture", str(place), "--output", str(item.path / SCENE), "--mapper", job.mapper]
+    words += ["--frames", str(job.frames)] if job.frames and place.is_file() else []
+    return words + (["--mask-object"] if job.mask_object else [])
+
+
+def scene_of(item: Item) -> Path:
+    """The scene to train on: what `capture` made, or photographs whose poses are known."""
+    made = item.path / SCENE
+    return made if (made / "transforms.json").is_file() else item.photographs
+
+
+def run_folder(item: Item, name: str) -> Path:
+    return item.path / RUNS / name if item.kind == "project" else item.path
+
+
+def train_command(item: Item, job: Making, port: int) -> list[str]:
+    """Words of `lumigraph train`, or of `resume` for a run that was begun."""
+    run = run_folder(item, job.run)
+    budget = [("--quality", job.quality), ("--seconds", job.seconds), ("--steps", job.steps)]
+    words = [word for name, value in budget if value is not None for word in (name, str(value))]
+    words += ["--view", "--no-stay", "--port", str(port)]
+    if (run / "config.json").is_file():
+        return ["resume", str(run), *words]
+    words += ["--downscale", str(job.downscale)] if job.downscale else []
+    return ["train", job.method, str(scene_of(item)), "--output", str(run), *words]
+
+
+def next_run(item: Item, method: str) -> str:
+    """Name of a new run of a method."""
+    folder, number = item.path / RUNS, 1
+    while os.path.lexists(folder / f"{method}-{number}"):
+        number += 1
+    return f"{method}-{number}"
+
+
+def log_lines(item: Item) -> list[str]:
+    """Last lines of the messages of the last command."""
+    path = item.path / LOG_FILE
+    if not path.is_file():
+        return []
+    with open(path, "rb") as file:
+        file.seek(max(0, path.stat().st_size - LOG_BYTES))
+        return file.read().decode("utf-8", "replace").splitlines()
+
+
+def sentence(item: Item, code: int) -> str:
+    """The sentence by which a command has failed."""
+    said = [line for line in log_lines(item) if line.startswith("lumigraph: ")]
+    if said:
+        return said[-1].removeprefix("lumigraph: ")
+    if code == -signal.SIGKILL:
+        return "The system has ended the command, as it does where memory runs out; choose draft, or close programs"
+    return f"The command ended without a sentence (exit code {code}); its messages are in {item.path / LOG_FILE}"
+
+
+# What the page asks for
+
+
+def make(item: Item, **options: Any) -> JobRecord:
+    """Queue the making of a run: photographs to cameras to a new run."""
+    input_of(item)
+    asked = Making("queued", time.time(), **options)
+
+    def begin(job: JobRecord) -> JobRecord:
+        if job.make and job.make.state == "running":
+            raise LumigraphError("This scene is being made already; pause or stop it first")
+        return replace(job, make=asked)
+
+    return change(item, begin)
+
+
+def go_on(item: Item, **options: Any) -> JobRecord:
+    """Queue a paused, stopped or failed job again, or a finished one with a larger budget."""
+
+    def again(job: JobRecord) -> JobRecord:
+        if job.make is None:
+            if item.kind != "run":
+                raise LumigraphError("Nothing has been made here yet; choose draft, good or best")
+            job = replace(job, make=Making("stopped", 0.0, stage="train", run=item.path.name))
+        if job.make and job.make.state in ("queued", "running"):
+            raise LumigraphError("This scene is being made already")
+        assert job.make is not None
+        budget = {"quality": None, "seconds": None, "steps": None} if options.keys() & BUDGETS else {}
+        queued = replace(job.make, **{**budget, **options, "state": "queued", "asked": time.time(), "begun": 0.0})
+        return replace(job, make=replace(queued, fault=""))
+
+    return change(item, again)
+
+
+BUDGETS = {"quality", "seconds", "steps"}
+
+
+def ask_to_share(item: Item, share: ShareJob) -> JobRecord:
+    """Queue a file to share."""
+
+    def add(job: JobRecord) -> JobRecord:
+        kept = [one for one in job.shares if one.name != share.name]
+        if len(kept) < len(job.shares) and any(
+            one.name == share.name and one.state in ("queued", "running") for one in job.shares
+        ):
+            raise LumigraphError(f"{share.name} is being made already")
+        return replace(job, shares=[*kept, share])
+
+    return change(item, add)
+
+
+def forget_share(item: Item, name: str) -> JobRecord:
+    """Delete a shared file, and its record."""
+    if not is_plain_name(name):
+        raise LumigraphError(f"There is no file {name[:80]!r} here")
+    (item.path / SHARED / name).unlink(missing_ok=True)
+    return change(item, lambda job: replace(job, shares=[one for one in job.shares if one.name != name]))

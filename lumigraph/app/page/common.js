@@ -1,0 +1,67 @@
+// Requests to the app, and words for sizes, times and states.
+
+export async function api(method, path, body) {
+  const options = { method, headers: {} };
+  if (body !== undefined) {
+    options.headers["Content-Type"] = "application/json";
+    options.body = JSON.stringify(body);
+  }
+  let response;
+  try {
+    response = await fetch(`/api/${path}`, options);
+  } catch {
+    throw Object.assign(new Error("The app does not answer; start it again, and this page goes on"), { away: true });
+  }
+  const text = await response.text();
+  let said = null;
+  try {
+    said = JSON.parse(text);
+  } catch {
+    said = { fault: text.trim() || `The app answered with ${response.status}` };
+  }
+  if (!response.ok) throw Object.assign(new Error(said.fault), { status: response.status, have: said.have });
+  return said;
+}
+
+export const of = (key) => `items/${encodeURIComponent(key)}`;
+export const pictureUrl = (key, query) => `/api/${of(key)}/picture?${new URLSearchParams(query)}`;
+
+export function bytes(number) {
+  if (number >= 1e9) return `${(number / 1e9).toFixed(1)} GB`;
+  if (number >= 1e6) return `${number < 1e7 ? (number / 1e6).toFixed(1) : Math.round(number / 1e6)} MB`;
+  return `${Math.max(1, Math.round(number / 1e3))} kB`;
+}
+
+export function ago(seconds) {
+  if (seconds < 60) return "just now";
+  if (seconds < 3600) return `${Math.round(seconds / 60)} min ago`;
+  if (seconds < 86400) return `${Math.round(seconds / 3600)} h ago`;
+  const days = Math.round(seconds / 86400);
+  return days === 1 ? "yesterday" : `${days} days ago`;
+}
+
+export function lasting(seconds) {
+  if (seconds < 60) return `${Math.max(1, Math.round(seconds))} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  return `${(seconds / 3600).toFixed(1)} h`;
+}
+
+export const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
+
+// A request that repeats while the page is visible. Returns a function that ends it.
+export function repeat(seconds, ask) {
+  let ended = false;
+  let timer = 0;
+  const turn = async () => {
+    if (!document.hidden) await ask();
+    if (!ended) timer = setTimeout(turn, 1000 * seconds);
+  };
+  turn();
+  const seen = () => document.hidden || (clearTimeout(timer), turn());
+  document.addEventListener("visibilitychange", seen);
+  return () => {
+    ended = true;
+    clearTimeout(timer);
+    document.removeEventListener("visibilitychange", seen);
+  };
+}

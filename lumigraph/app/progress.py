@@ -1,0 +1,279 @@
+"""Progress of a project as pictures: photographs with their features, cameras and sparse points, training."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..budget import Budget
+from ..capture.motion.reconstruction import SNAPSHOTS
+from ..errors import LumigraphError
+from ..files import read_json
+from ..files.names import natural
+from ..geometry import evenly
+from ..metrics.rows import last_psnr
+from .job_record import Making
+from .jobs import log_lines, run_folder
+from .projects import SCENE, Item
+
+STAGES = {
+    "features": "Finding details",
+    "matching": "Comparing photographs",
+    "mapping": "Placing cameras",
+    "unfolding": "Looking for folds",
+    "completing": "Placing the rest",
+    "lenses": "Refining the lens",
+}
+WEIGHTS = {"features": 0.4, "matching": 0.3, "mapping": 0.15, "unfolding": 0.02, "completing": 0.11, "lenses": 0.02}
+MAX_FEATURES, MAX_POINTS, MAX_CAMERAS = 1500, 4000, 1000  # that a page draws
+CURVE_POINTS = 80
+PERCENT = re.compile(r"(\d+) of (\d+)")
+
+
+def photographs_state(item: Item) -> dict[str, dict[str, Any]]:
+    """State of each photograph by name: features, photographs that match, whether it is placed and why not."""
+    found: dict[str, dict[str, Any]] = {}
+    database = item.path / SCENE / "work" / "database.db"
+    for name, features, matched in rows_of(database):
+        found[name] = {"features": features, "matched": matched}
+    if (result := capture_result(item)) is not None:
+        for name in result.get("registered", []):
+            found.setdefault(name, {})["placed"] = True
+        for group in ("left_out", "blurred", "duplicates"):
+            for name, why in result.get(group, {}).items():
+                found.setdefault(name, {})[group] = why
+    return {name: found[name] for name in sorted(found, key=natural)}
+
+
+def rows_of(database: Path) -> list[tuple[str, int | None, int]]:
+    """Photographs of COLMAP's database: name, number of features, number of photographs that show the same."""
+    with read_only(database) as connection:
+        if connection is None:
+            return []
+        images = connection.execute(
+            "SELECT images.image_id, name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
+        ).fetchall()
+        pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows >= 15").fetchall()
+    matched: dict[int, int] = {}
+    for (pair,) in pairs:
+        for image in divmod(pair, 2147483647):
+            matched[image] = matched.get(image, 0) + 1
+    return [(name, features, matched.get(number, 0)) for number, name, features in images]
+
+
+@contextlib.contextmanager
+def read_only(database: Path) -> Iterator[sqlite3.Connection | None]:
+    """COLMAP's database while COLMAP writes it; None where there is none yet, or it is being written just now."""
+    if not database.is_file():
+        yield None
+        return
+    try:
+        with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.2)) as connection:
+            connection.execute("SELECT 1 FROM images LIMIT 1")
+            yield connection
+    except sqlite3.Error:
+        yield None
+
+
+def features(item: Item, name: str) -> list[list[float]]:
+    """Some features of a photograph, x and y as shares of its width and height."""
+    with read_only(item.path / SCENE / "work" / "database.db") as connection:
+        if connection is None:
+            return []
+        row = connection.execute(
+            "SELECT keypoints.rows, cols, data, width, height FROM images JOIN keypoints USING (image_id) "
+            "JOIN cameras USING (camera_id) WHERE name = ?",
+            (name,),
+        ).fetchone()
+    if row is None:
+        return []
+    count, columns, data, width, height = row
+    table = np.frombuffer(data, np.float32).reshape(count, columns)[:, :2] / (width, height)
+    return np.round(table[:: max(1, len(table) // MAX_FEATURES)], 4).tolist()
+
+
+def capture_result(item: Item) -> dict[str, Any] | None:
+    """Contents of capture.json; None before the capture is done."""
+    path = item.path / SCENE / "capture.json"
+    return read_json(path) if path.is_file() else None
+
+
+def capture_progress(item: Item) -> dict[str, Any]:
+    """Stage of a capture under way: its name, the share of the whole that is over, seconds that are left if known."""
+    marks = item.path / SCENE / "work" / "stages.json"
+    done = read_json(marks) if marks.is_file() else {}
+    said = next((line for line in reversed(log_lines(item)) if ": " in line and PERCENT.search(line)), "")
+    share, stage = 0.03, "Looking at photographs"
+    for name, title in STAGES.items():
+        if name not in done:
+            break
+        if done[name]["done"]:
+            share += 0.95 * WEIGHTS[name]
+        else:
+            stage, within = title, within_stage(item, name, said)
+            share += 0.95 * WEIGHTS[name] * within
+    else:
+        stage = "Writing the scene"
+    return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2]}
+
+
+def within_stage(item: Item, stage: str, said: str) -> float:
+    """Share of a stage that is over: by photographs with features, else by the last line of the log."""
+    if stage == "features":
+        rows = rows_of(item.path / SCENE / "work" / "database.db")
+        return sum(features is not None for _, features, _ in rows) / max(len(rows), 1)
+    found = PERCENT.search(said)
+    return min(1.0, int(found[1]) / max(int(found[2]), 1)) if found else 0.0
+
+
+def model_folder(item: Item) -> Path | None:
+    """The latest model: that of the scene, or a snapshot while cameras are placed."""
+    scene = item.path / SCENE
+    if (scene / "capture.json").is_file() and (scene / "sparse" / "0" / "images.bin").is_file():
+        return scene / "sparse" / "0"
+    folder = scene / "work" / SNAPSHOTS
+    found = sorted(folder.iterdir(), reverse=True) if folder.is_dir() else []
+    return next((path for path in found if (path / "points3D.bin").is_file()), None)
+
+
+def model(item: Item) -> dict[str, Any]:
+    """Cameras and sparse points for the page: up is +z, about the middle of the points and one unit wide."""
+    place = model_folder(item)
+    if place is None:
+        return {"version": "", "cameras": [], "points": []}
+    try:
+        return {"version": place.name, **_model(place, (place / "points3D.bin").stat().st_mtime_ns)}
+    except Exception:  # a snapshot that is being written, or deleted
+        return {"version": "", "cameras": [], "points": []}
+
+
+@lru_cache(4)
+def _model(place: Path, modified: int) -> dict[str, Any]:
+    from ..capture.colmap import poses_of, read_model
+
+    found = read_model(place)
+    poses = poses_of(found)
+    names = evenly(sorted(poses, key=natural), MAX_CAMERAS)
+    stacked = np.stack([poses[name] for name in names])
+    points = evenly([p for p in found.points3D.values() if p.track.length() > 2], MAX_POINTS)
+    places = np.array([p.xyz for p in points]).reshape(-1, 3)
+    colours = np.array([p.color for p in points], int).reshape(-1, 3)
+    turn, middle, scale = framed(stacked, places)
+    centres = (stacked[:, :, 3] - middle) @ turn.T / scale
+    axes = np.einsum("ij,njk->nik", turn, stacked[:, :, :3])
+    cameras = np.concatenate([centres, axes.transpose(0, 2, 1).reshape(-1, 9)], 1)
+    places = (places - middle) @ turn.T / scale
+    return {
+        "names": names,
+        "cameras": np.round(cameras, 4).tolist(),
+        "points": np.concatenate([np.round(places, 4), colours], 1).tolist(),
+    }
+
+
+def framed(
+    poses: Float[np.ndarray, "camera 3 4"], points: Float[np.ndarray, "point 3"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]:
+    """Rotation that turns the pictures' mean up to +z, the middle of the points, and the extent of the cameras."""
+    up = -poses[:, :, 1].mean(0)
+    up /= np.linalg.norm(up) + 1e-9
+    across = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
+    across /= np.linalg.norm(across)
+    turn = np.stack([across, np.cross(up, across), up])
+    middle = np.median(points, axis=0) if len(points) else poses[:, :, 3].mean(0)
+    away = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
+    return turn, middle, float(np.median(away)) or 1.0
+
+
+# Training
+
+
+def training_progress(item: Item, job: Making) -> dict[str, Any]:
+    """Step, share, PSNR, its curve and seconds left of a run."""
+    from ..run import Run
+
+    folder = run_folder(item, job.run)
+    if not job.run or not (folder / "config.json").is_file():
+        return {"stage": "Beginning", "share": 0.0}
+    try:
+        run = Run(folder)
+        rows, budget = run.metrics(), Budget.from_json(run.settings.budget)
+    except LumigraphError as fault:
+        return {"stage": str(fault), "share": 0.0}
+    if not rows:
+        return {"stage": "Compiling kernels", "share": 0.0, "method": run.method_name}
+    last = rows[-1]
+    share = budget.progress(last["step"], last["seconds"])
+    points = [(row["seconds"], row["psnr"]) for row in rows if "psnr" in row]
+    means = [np.mean(part, axis=0) for part in np.array_split(points, min(len(points), CURVE_POINTS))] if points else []
+    return {
+        "stage": "Training",
+        "share": share,
+        "step": last["step"],
+        "seconds": last["seconds"],
+        "left": seconds_left(budget, last["step"], last["seconds"]),
+        "psnr": last_psnr(rows),
+        "gaussians": last["statistics"].get("gaussians"),
+        "method": run.method_name,
+        "curve": [[round(float(x), 3) for x in one] for one in means],
+        "quality": budget.quality,
+        "budget": str(budget),
+    }
+
+
+def seconds_left(budget: Budget, step: int, seconds: float) -> float | None:
+    """Seconds of training to come, by the mean time of a step so far."""
+    if budget.steps is None:
+        return max(budget.total - seconds, 0.0)
+    return max(budget.total - step, 0) * seconds / step if step else None
+
+
+def card_of_run(folder: Path) -> dict[str, Any]:
+    """Method, PSNR, and previews of a run, for its card; empty for what cannot be read."""
+    with contextlib.suppress(LumigraphError):
+        return _card(folder, newest(folder))
+    return {"method": "", "psnr": None}
+
+
+def newest(folder: Path) -> tuple[int, ...]:
+    """By which a run's card is known to be current."""
+    places = (folder / name for name in ("metrics.jsonl", "eval.json", "config.json", "checkpoints", "blocks.json"))
+    return tuple(place.stat().st_mtime_ns for place in places if place.exists())
+
+
+@lru_cache(512)
+def _card(folder: Path, version: tuple[int, ...]) -> dict[str, Any]:
+    from ..run import Run, is_block_run
+
+    if is_block_run(folder):
+        return {"method": "block-nerf", "psnr": None, "trained": True}
+    run = Run(folder)
+    held_out = (run.evaluation() or {}).get("psnr")
+    return {
+        "method": run.method_name,
+        "psnr": held_out if held_out is not None else last_psnr(run.metrics()),
+        "held_out": held_out is not None,
+        "trained": run.has_state,
+        "photographs": run.frame.image_count,
+    }
+
+
+def picture_of_run(folder: Path) -> Path | None:
+    """The latest preview of a run."""
+    found = sorted((folder / "previews").glob("*.png")) if (folder / "previews").is_dir() else []
+    return found[-1] if found else None
+
+
+def age(path: Path) -> float:
+    """Seconds since a folder, or something just inside it, changed."""
+    newest = max((one.stat().st_mtime for one in path.iterdir()), default=path.stat().st_mtime) if path.is_dir() else 0
+    return max(0.0, time.time() - max(newest, path.stat().st_mtime))

@@ -1,0 +1,294 @@
+"""Projects and other items of a folder. All of their state is in files, so the app may end at any moment.
+
+    NAME/project.json   title, and the path of photographs that were not uploaded
+    NAME/photos/        uploaded photographs, or one video
+    NAME/scene/         what `lumigraph capture` makes of them
+    NAME/runs/          runs, and splat files that were saved from them
+    NAME/shared/        pages, films and files to share
+    NAME/job.json       what was asked for, and how far it is: see `jobs`
+    NAME/app.log        messages of the last command
+    .lumigraph-app/     lock of the app; trash/, from where deleted items return
+
+Runs and scenes that the command line made, also in `runs/` and `scenes/`, are items too.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from ..errors import LumigraphError
+from ..exchange import size_of
+from ..files import explained, read_json, remove, write_json
+from ..files.names import natural
+
+PROJECT_FILE, JOB_FILE, LOG_FILE = "project.json", "job.json", "app.log"
+PHOTOS, SCENE, RUNS, SHARED = "photos", "scene", "runs", "shared"
+APP_FOLDER, TRASH = ".lumigraph-app", "trash"
+SHELVES = "", RUNS, "scenes"  # folders whose folders are items
+SCENE_FILES = "transforms.json", "transforms_train.json", "sparse", "poses_bounds.npy"  # of photographs with poses
+MAX_TITLE_LENGTH = 120  # letters
+SEPARATOR = ":"  # between the folders of a key, as "/" cannot be in one part of a URL
+
+ItemKind = Literal["project", "run", "scene"]
+
+
+@dataclass(frozen=True)
+class ProjectRecord:
+    """Contents of project.json. source: photographs on this machine, in place of uploads; place: where the project was
+    when the paths inside it were written"""
+
+    title: str
+    made: float
+    source: str = ""
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class TrashRecord:
+    """Where a deleted item was, relative to the folder, and its title."""
+
+    origin: str
+    title: str
+    deleted: float
+
+
+@dataclass(frozen=True)
+class Item:
+    """A project, a run or a scene in the folder that the app shows.
+
+    root: that folder; path: the item's
+    """
+
+    root: Path
+    path: Path
+
+    @property
+    def key(self) -> str:
+        return SEPARATOR.join(self.path.relative_to(self.root).parts)
+
+    @property
+    def kind(self) -> ItemKind:
+        if (self.path / PROJECT_FILE).is_file():
+            return "project"
+        return "run" if is_run(self.path) else "scene"
+
+    @property
+    def record(self) -> ProjectRecord:
+        """Contents of project.json; of another item its name and date."""
+        if self.kind == "project":
+            return read_json(self.path / PROJECT_FILE, ProjectRecord)
+        return ProjectRecord(self.path.name, self.path.stat().st_mtime)
+
+    def keep(self, record: ProjectRecord) -> None:
+        write_json(self.path / PROJECT_FILE, asdict(record), ours=True)
+
+    @property
+    def photographs(self) -> Path:
+        """Photographs, a video, or a scene with poses: the input of `capture` or `train`."""
+        if self.kind == "scene":
+            return self.path
+        return Path(self.record.source) if self.record.source else self.path / PHOTOS
+
+    @property
+    def runs(self) -> list[Path]:
+        """Runs and splat files, the latest last; of a run the run itself."""
+        if self.kind != "project":
+            return [self.path] if self.kind == "run" else []
+        folder = self.path / RUNS
+        found = [path for path in folder.iterdir() if is_run(path) or is_splats(path)] if folder.is_dir() else []
+        return sorted(found, key=lambda path: (path.stat().st_mtime, natural(path.name)))
+
+    def run(self, name: str) -> Path:
+        """One of its runs by name. Raises LumigraphError if there is none."""
+        for path in self.runs:
+            if path.name == name:
+                return path
+        raise LumigraphError(f"{self.record.title} has no run {name[:80]!r}; load the page again")
+
+
+def is_run(path: Path) -> bool:
+    return (path / "config.json").is_file() or (path / "blocks.json").is_file()
+
+
+def is_splats(path: Path) -> bool:
+    return path.suffix.lower() in (".ply", ".spz", ".sog", ".splat") and path.is_file()
+
+
+def items(root: Path) -> list[Item]:
+    """Projects, runs and scenes of a folder, the latest first."""
+    found = [Item(root, path) for shelf in SHELVES for path in candidates(root / shelf)]
+    return sorted(found, key=lambda item: item.path.stat().st_mtime, reverse=True)
+
+
+def candidates(folder: Path) -> Iterator[Path]:
+    if not folder.is_dir():
+        return
+    with explained(folder):
+        paths = list(folder.iterdir())
+    for path in paths:
+        if path.name.startswith(".") or SEPARATOR in path.name or not path.is_dir():
+            continue
+        if any((path / name).exists() for name in (PROJECT_FILE, *SCENE_FILES)) or is_run(path):
+            yield path
+
+
+def find_item(root: Path, key: str) -> Item:
+    """The item of a key. Raises LumigraphError for what is none, and for keys that lead out of the folder."""
+    parts = key.split(SEPARATOR)
+    path = root.joinpath(*parts) if all(map(is_plain_name, parts)) else None
+    shelves = {root / shelf for shelf in SHELVES}
+    if path is None or path.parent not in shelves or path not in set(candidates(path.parent)):
+        raise LumigraphError(f"There is no scene {key[:80]!r} here; load the page again")
+    return Item(root, path)
+
+
+def is_plain_name(name: str) -> bool:
+    """True for the name of one file or folder that is not hidden."""
+    return bool(name) and not name.startswith(".") and not re.search(r"[/\\:\x00-\x1f]", name)
+
+
+def check_title(title: str) -> str:
+    title = " ".join(title.split())
+    if not title or len(title) > MAX_TITLE_LENGTH or not title.isprintable():
+        raise LumigraphError(f"A name has 1 to {MAX_TITLE_LENGTH} letters; choose another one")
+    return title
+
+
+def free_place(root: Path, title: str) -> Path:
+    """A folder that does not exist yet, called after a title."""
+    stem = re.sub(r"[^\w.-]+", "-", title).strip(".-_")[:60] or "scene"
+    names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
+    return next(root / name for name in names if not os.path.lexists(root / name))
+
+
+def new_project(root: Path, title: str, source: Path | None = None) -> Item:
+    """Make an empty project. source: photographs, a video or a scene on this machine"""
+    title = check_title(title)
+    if source is not None and not source.exists():
+        raise LumigraphError(f"{source} does not exist; check the path")
+    item = Item(root, free_place(root, title))
+    with explained(item.path):
+        (item.path / PHOTOS).mkdir(parents=True)
+    item.keep(ProjectRecord(title, time.time(), str(source.resolve()) if source else "", str(item.path.resolve())))
+    return item
+
+
+def rename(item: Item, title: str) -> Item:
+    """Give an item another title. A project keeps its folder, whose path its runs remember; others are renamed."""
+    title = check_title(title)
+    if item.kind == "project":
+        record = item.record
+        item.keep(ProjectRecord(title, record.made, record.source, record.place))
+        return item
+    if item.kind == "scene":
+        raise LumigraphError(f"{item.path} keeps its name, by which runs find their photographs")
+    target = free_place(item.path.parent, title)
+    with explained(target):
+        item.path.rename(target)
+    return Item(item.root, target)
+
+
+def duplicate(item: Item) -> Item:
+    """A copy of an item, without the files that were made to share and without its job."""
+    record = item.record
+    copy = Item(item.root, free_place(item.path.parent, f"{record.title} copy"))
+    leave = shutil.ignore_patterns(SHARED, JOB_FILE, LOG_FILE, "lock.json", ".lumigraph-*.partial")
+    try:
+        with explained(copy.path):
+            shutil.copytree(item.path, copy.path, symlinks=True, ignore=leave)
+    except BaseException:
+        remove(copy.path)
+        raise
+    if item.kind == "project":
+        copy.keep(ProjectRecord(check_title(f"{record.title} copy"[:MAX_TITLE_LENGTH]), time.time(), record.source))
+        relocate(copy, record.place or str(item.path.resolve()))
+    return copy
+
+
+def relocate(item: Item, before: str | None = None) -> None:
+    """Correct the paths inside a project that was moved or copied. before: its place at the time of writing"""
+    if item.kind != "project":
+        return
+    record, now = item.record, str(item.path.resolve())
+    before = record.place if before is None else before
+    if before == now or not before:
+        return
+    scene = item.path / SCENE
+    places = [scene / "work" / "sources.json", scene / "capture.json", *(run / "config.json" for run in item.runs)]
+    for path in filter(Path.is_file, places):
+        write_json(path, moved(read_json(path), before, now), ours=True)
+    item.keep(ProjectRecord(record.title, record.made, record.source, now))
+
+
+def moved(value: object, before: str, now: str) -> object:
+    """JSON whose paths below one folder lead below another one."""
+    match value:
+        case dict():
+            return {key: moved(one, before, now) for key, one in value.items()}
+        case list():
+            return [moved(one, before, now) for one in value]
+        case str() if value == before or value.startswith(before + os.sep):
+            return now + value[len(before) :]
+    return value
+
+
+# Trash
+
+
+def trash_folder(root: Path) -> Path:
+    return root / APP_FOLDER / TRASH
+
+
+def delete(item: Item) -> str:
+    """Move an item to the trash. Returns the name by which `restore` brings it back."""
+    record = TrashRecord(item.path.relative_to(item.root).as_posix(), item.record.title, time.time())
+    place = free_place(trash_folder(item.root), item.path.name)
+    write_json(place.with_name(f"{place.name}.json"), asdict(record), ours=True)
+    with explained(place):
+        item.path.rename(place)
+    return place.name
+
+
+def restore(root: Path, name: str) -> Item:
+    """Bring an item back from the trash, to where it was or beside it."""
+    place = trash_folder(root) / name
+    about = place.with_name(f"{name}.json")
+    if not is_plain_name(name) or not about.is_file() or not place.is_dir():
+        raise LumigraphError(f"{name[:80]!r} is not in the trash any more; load the page again")
+    origin = read_json(about, TrashRecord).origin
+    target = root / origin
+    if ".." in Path(origin).parts or Path(origin).is_absolute():
+        raise LumigraphError(f"{about} names a place outside the folder; move {place} to its place by hand")
+    target = free_place(target.parent, target.name) if os.path.lexists(target) else target
+    with explained(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        place.rename(target)
+    remove(about)
+    relocate(item := Item(root, target))
+    return item
+
+
+def trash(root: Path) -> list[dict[str, Any]]:
+    """Deleted items, the latest first."""
+    folder = trash_folder(root)
+    found: list[dict[str, Any]] = []
+    for about in folder.glob("*.json") if folder.is_dir() else ():
+        place = about.with_suffix("")
+        if place.is_dir():
+            record = read_json(about, TrashRecord)
+            found.append({"name": place.name, "bytes": size_of(place)} | asdict(record))
+    return sorted(found, key=lambda one: one["deleted"], reverse=True)
+
+
+def empty_trash(root: Path) -> None:
+    folder = trash_folder(root)
+    for path in list(folder.iterdir()) if folder.is_dir() else ():
+        remove(path)

@@ -1,0 +1,522 @@
+"""The app's server: routes, and the viewer's guard in front of all of them. State is in files only."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import mimetypes
+import os
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Annotated, Any
+from urllib.parse import quote
+
+import msgspec
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
+from websockets.datastructures import Headers
+from websockets.http11 import Request as PlainRequest
+
+from .. import methods
+from ..budget import Quality
+from ..errors import LumigraphError
+from ..files import expanded
+from ..files.locks import held
+from ..files.ranges import Count, Downscale, Pixels
+from ..viewer.address import Address
+from ..viewer.guard import ISOLATION_HEADERS, MAX_MESSAGE_BYTES, Guard
+from . import jobs, pictures, progress, projects, rows, sharing, uploads
+from .job_record import JobState, Mapper, read_job
+from .jobs import Runner
+from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
+from .scene_views import SceneViews, forward, forward_messages
+
+PAGE = Path(__file__).parent / "page"
+MAX_BODY_BYTES = 1 << 16  # of a request that is no upload
+SWEEP_SECONDS = 15.0  # between looks for viewers without clients
+CONTENT_SECURITY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "frame-src 'self'; media-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {name.lower(): value for name, value in ISOLATION_HEADERS.items()}
+Title = Annotated[str, msgspec.Meta(max_length=400)]
+PathText = Annotated[str, msgspec.Meta(max_length=4096)]
+ShortName = Annotated[str, msgspec.Meta(max_length=255)]
+
+
+class NewBody(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a request for a new project. path: photographs on this machine; empty for uploads"""
+
+    title: Title
+    path: PathText = ""
+
+
+class TitleBody(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a request to rename."""
+
+    title: Title
+
+
+class MakeBody(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a request to make a scene: options of `lumigraph capture` and `train`."""
+
+    quality: Quality = "draft"
+    minutes: Annotated[float, msgspec.Meta(gt=0, le=100_000)] | None = None
+    method: ShortName = "gaussian-splatting"
+    mapper: Mapper = "incremental"
+    frames: Count | None = None
+    downscale: Downscale | None = None
+    mask_object: bool = False
+
+
+class MoreBody(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a request for more training: a quality, or minutes of training in all; neither to go on as before."""
+
+    quality: Quality | None = None
+    minutes: Annotated[float, msgspec.Meta(gt=0, le=100_000)] | None = None
+
+
+class ShareBody(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a request for a file to share. size: longer side of a film in pixels"""
+
+    kind: ShortName
+    run: ShortName
+    size: Pixels | None = None
+
+
+class RunBody(msgspec.Struct, forbid_unknown_fields=True):
+    """Body of a request to show a run; empty for the training under way or the latest run."""
+
+    run: ShortName = ""
+
+
+class Gate:
+    """The viewer's guard as ASGI middleware: requests and websockets that it refuses get 403 and reach no route."""
+
+    def __init__(self, app: ASGIApp, address: Address):
+        self.app, self.guard, self.address = app, Guard(address), address
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        if why := self.guard.refusal(plain(scope)):
+            await self._refuse(scope, receive, send, why)
+            return
+
+        async def sealed(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                present = {name.lower() for name, _ in message["headers"]}
+                added = [(k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in present]
+                if self.address.token:
+                    added.append((b"set-cookie", self.guard.cookie.encode()))
+                message["headers"] = [*message["headers"], *added]
+            await send(message)
+
+        await self.app(scope, receive, sealed)
+
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, why: str) -> None:
+        if scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008})  # before it is accepted: 403
+            return
+        await PlainTextResponse(f"{why}.\n", 403, HEADERS)(scope, receive, send)
+
+
+def plain(scope: Scope) -> PlainRequest:
+    """A request as the guard reads it."""
+    path = scope["path"] + ("?" + scope["query_string"].decode("latin-1") if scope["query_string"] else "")
+    headers = Headers([(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]])
+    return PlainRequest(path, headers)
+
+
+class App:
+    """State of the app: its folder, the jobs, the viewers. Everything that lasts is in files."""
+
+    def __init__(self, root: Path, address: Address, program: list[str] | None = None):
+        self.root, self.address = root.resolve(), address
+        program = program or list(jobs.PROGRAM)
+        self.runner = Runner(self.root, program)
+        self.views = SceneViews(self.root / APP_FOLDER, program)
+
+    @property
+    def is_local(self) -> bool:
+        return not self.address.token
+
+    # Home
+
+    def home(self) -> dict[str, Any]:
+        found = [rows.card(item) for item in projects.items(self.root)]
+        waiting = [{"key": task.item.key, "share": task.share} for task in self.runner.queue()]
+        return {
+            "folder": str(self.root),
+            "local": self.is_local,
+            "cards": found,
+            "trash": projects.trash(self.root),
+            "queue": waiting,
+        }
+
+    def new(self, body: NewBody) -> dict[str, Any]:
+        source = None
+        if body.path:
+            if not self.is_local:
+                raise LumigraphError("A path is for browsers on this machine; drop the photographs instead")
+            source = expanded(body.path.strip())
+            source = source if source.is_absolute() else self.root / source
+            check_source(source)
+        item = projects.new_project(self.root, body.title or (source.stem if source else "Scene"), source)
+        return {"key": item.key}
+
+    # One item
+
+    def item(self, key: str) -> Item:
+        return find_item(self.root, key)
+
+    def detail(self, item: Item) -> dict[str, Any]:
+        """All that the page of an item shows."""
+        record, job = item.record, read_job(item)
+        files = pictures.files_of(item.photographs) if item.kind != "run" else {}
+        runs = [rows.run_row(path) for path in item.runs]
+        current = self.runner.current
+        return {
+            "key": item.key,
+            "kind": item.kind,
+            "title": record.title,
+            "folder": str(item.path),
+            "source": record.source,
+            "photographs": [
+                {"name": name, "version": pictures.version_of(path), "video": pictures.is_film(path)}
+                for name, path in files.items()
+            ],
+            "runs": runs,
+            "make": rows.making_row(item, job.make) if job.make else None,
+            "live": current is not None and current.item == item and current.port is not None,
+            "shares": [rows.share_row(item, share) for share in reversed(job.shares)],
+            "result": rows.result_of(item),
+            "queue": [task.item.key for task in self.runner.queue()],
+        }
+
+    def advice(self, item: Item) -> list[dict[str, Any]]:
+        return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.files_of(item.photographs))]
+
+    def rename(self, item: Item, body: TitleBody) -> dict[str, Any]:
+        return {"key": projects.rename(item, body.title).key}
+
+    def duplicate(self, item: Item) -> dict[str, Any]:
+        return {"key": projects.duplicate(item).key}
+
+    def delete(self, item: Item) -> dict[str, Any]:
+        self.views.close(item.path)
+        self.runner.release(item)
+        return {"trash": projects.delete(item)}
+
+    def make(self, item: Item, body: MakeBody) -> dict[str, Any]:
+        name = methods.check(body.method)
+        relocate(item)
+        budget = {"seconds": 60 * body.minutes} if body.minutes else {"quality": body.quality}
+        rest = {"mapper": body.mapper, "frames": body.frames, "downscale": body.downscale}
+        jobs.make(item, method=name, mask_object=body.mask_object, **rest, **budget)
+        self.runner.wake()
+        return self.detail(item)
+
+    def stop(self, item: Item, state: JobState) -> dict[str, Any]:
+        job = read_job(item).make
+        if job is None or job.state not in ("queued", "running", "paused"):
+            raise LumigraphError("Nothing is being made here any more")
+        self.runner.stop(jobs.Task(item, None), state)
+        return self.detail(item)
+
+    def more(self, item: Item, body: MoreBody) -> dict[str, Any]:
+        budget: dict[str, Any] = {"quality": body.quality} if body.quality else {}
+        if body.minutes:
+            budget = {"seconds": 60 * body.minutes}
+        self.views.close(item.path)
+        relocate(item)
+        jobs.go_on(item, **budget)
+        self.runner.wake()
+        return self.detail(item)
+
+    def leave_out(self, item: Item, name: str) -> dict[str, Any]:
+        """Move an uploaded photograph out of the scene, into a folder beside the photographs."""
+        files = pictures.files_of(item.photographs)
+        if name not in files or item.record.source or item.kind != "project":
+            raise LumigraphError(f"{name[:80]!r} is not among the uploaded photographs; load the page again")
+        place = item.path / "left-out" / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        files[name].rename(place)
+        return self.detail(item)
+
+    def share(self, item: Item, body: ShareBody) -> dict[str, Any]:
+        job = sharing.share_job(item, body.kind, item.run(body.run), time.time(), body.size)
+        jobs.ask_to_share(item, job)
+        self.runner.wake()
+        return self.detail(item)
+
+    def view(self, item: Item, run: str) -> dict[str, Any]:
+        """Address of the scene view of a run, and whether it answers."""
+        current = self.runner.current
+        if not run and current and current.item == item and current.share is None and (port := current.port):
+            from .scene_views import answers
+
+            return {"url": f"/scene/{quote(item.key)}/live/", "ready": answers(port)}
+        path = item.run(run) if run else next(iter(reversed(item.runs)), None)
+        if path is None:
+            raise LumigraphError("There is no run to show yet")
+        relocate(item)
+        view = self.views.open(path)
+        return {"url": f"/scene/{quote(item.key)}/{quote(path.name)}/", "ready": self.views.is_ready(view)}
+
+    def port_of(self, key: str, run: str) -> tuple[int | None, Any]:
+        """Port of the viewer behind a scene's address, and its view; None if there is none."""
+        item, current = self.item(key), self.runner.current
+        if run == "live":
+            return (current.port if current and current.item == item else None), None
+        view = self.views.views.get(item.run(run))
+        return (view.port if view else None), view
+
+
+def check_source(source: Path) -> None:
+    """Raise LumigraphError unless a path on this machine holds photographs, a video or a scene."""
+    if not source.exists():
+        raise LumigraphError(f"{source} does not exist; check the path")
+    poses = any((source / name).exists() for name in projects.SCENE_FILES)
+    if not poses and not pictures.files_of(source) or (source.is_file() and not pictures.is_film(source)):
+        raise LumigraphError(f"{source} holds no photographs and no video; name another folder")
+
+
+# Routes
+
+
+def build(app: App) -> ASGIApp:
+    """The ASGI application: routes behind the guard."""
+
+    def asked(kind: Any, answer: Callable[..., Any]) -> Callable[[Request], Awaitable[Response]]:
+        """Route that reads a JSON body of a kind (None for none) and answers with JSON from a thread."""
+
+        async def route(request: Request) -> Response:
+            arguments: list[Any] = []
+            if "key" in request.path_params:
+                arguments.append(await asyncio.to_thread(app.item, request.path_params["key"]))
+            if kind is not None:
+                arguments.append(await body_of(request, kind))
+            return JSONResponse(await asyncio.to_thread(answer, *arguments))
+
+        return route
+
+    async def page(request: Request) -> Response:
+        name = request.path_params.get("name", "index.html")
+        if name not in os.listdir(PAGE):
+            return PlainTextResponse("There is no such file.\n", 404)
+        about = {"Cache-Control": "no-cache", "Content-Security-Policy": CONTENT_SECURITY}
+        return FileResponse(PAGE / name, media_type=mimetypes.guess_type(name)[0], headers=about)
+
+    async def take(request: Request) -> Response:
+        item = await asyncio.to_thread(app.item, request.path_params["key"])
+        if item.kind != "project" or item.record.source:
+            raise LumigraphError("Photographs can be added to scenes that were made by uploads; make a new one")
+        query = request.query_params
+        file = uploads.upload(item.path / projects.PHOTOS, query.get("name", ""), whole(query.get("size", "")))
+        have = await file.take(whole(query.get("offset", "0")), request.stream())
+        return JSONResponse({"have": have, "name": file.name, "done": have == file.size})
+
+    async def have(request: Request) -> Response:
+        item = await asyncio.to_thread(app.item, request.path_params["key"])
+        query = request.query_params
+        file = uploads.upload(item.path / projects.PHOTOS, query.get("name", ""), whole(query.get("size", "")))
+        return JSONResponse({"have": file.have(), "name": file.name})
+
+    async def leave_out(request: Request) -> Response:
+        item = await asyncio.to_thread(app.item, request.path_params["key"])
+        return JSONResponse(await asyncio.to_thread(app.leave_out, item, request.query_params.get("name", "")))
+
+    async def picture(request: Request) -> Response:
+        return await asyncio.to_thread(picture_of, app.item(request.path_params["key"]), request)
+
+    async def marks(request: Request) -> Response:
+        item, name = app.item(request.path_params["key"]), request.query_params.get("name", "")
+        return JSONResponse(await asyncio.to_thread(progress.features, item, name))
+
+    async def shared(request: Request) -> Response:
+        item, name = app.item(request.path_params["key"]), request.path_params["name"]
+        place = item.path / SHARED / name
+        if not projects.is_plain_name(name) or not place.is_file():
+            raise LumigraphError(f"There is no file {name[:80]!r} here; make it again")
+        shows = "inline" if "show" in request.query_params else "attachment"
+        return FileResponse(place, filename=name, content_disposition_type=shows, headers=SHOWN_HEADERS)
+
+    async def forget(request: Request) -> Response:
+        item = await asyncio.to_thread(app.item, request.path_params["key"])
+        await asyncio.to_thread(jobs.forget_share, item, request.path_params["name"])
+        return JSONResponse(await asyncio.to_thread(app.detail, item))
+
+    async def restore(request: Request) -> Response:
+        item = await asyncio.to_thread(projects.restore, app.root, request.path_params["name"])
+        return JSONResponse({"key": item.key})
+
+    async def scene(request: Request) -> Response:
+        port, _ = app.port_of(request.path_params["key"], request.path_params["run"])
+        if port is None:
+            return PlainTextResponse("This scene is not open; load the page again.\n", 404)
+        return await forward(request, port, "/" + quote(request.path_params.get("rest", "")))
+
+    async def scene_socket(socket: WebSocket) -> None:
+        try:
+            port, view = app.port_of(socket.path_params["key"], socket.path_params["run"])
+        except LumigraphError:
+            port, view = None, None
+        if port is None:
+            await socket.close(1013)
+            return
+        await forward_messages(socket, port, view)
+
+    def kinds(item: Item, body: RunBody) -> list[dict[str, Any]]:
+        return sharing.kinds_for(item.run(body.run))
+
+    item = "/api/items/{key}"
+    routes = [
+        Route("/", page),
+        Route("/static/{name}", page),
+        Route("/api/home", asked(None, app.home)),
+        Route("/api/projects", asked(NewBody, app.new), methods=["POST"]),
+        Route("/api/trash", asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
+        Route("/api/trash/{name}", restore, methods=["POST"]),
+        Route(item, asked(None, app.detail)),
+        Route(item, asked(TitleBody, app.rename), methods=["PATCH"]),
+        Route(item, asked(None, app.delete), methods=["DELETE"]),
+        Route(f"{item}/duplicate", asked(None, app.duplicate), methods=["POST"]),
+        Route(f"{item}/photographs", take, methods=["PUT"]),
+        Route(f"{item}/photographs", have),
+        Route(f"{item}/photographs", leave_out, methods=["DELETE"]),
+        Route(f"{item}/advice", asked(None, app.advice)),
+        Route(f"{item}/picture", picture),
+        Route(f"{item}/states", asked(None, progress.photographs_state)),
+        Route(f"{item}/features", marks),
+        Route(f"{item}/model", asked(None, progress.model)),
+        Route(f"{item}/make", asked(MakeBody, app.make), methods=["POST"]),
+        Route(f"{item}/pause", asked(None, lambda one: app.stop(one, "paused")), methods=["POST"]),
+        Route(f"{item}/stop", asked(None, lambda one: app.stop(one, "stopped")), methods=["POST"]),
+        Route(f"{item}/more", asked(MoreBody, app.more), methods=["POST"]),
+        Route(f"{item}/view", asked(RunBody, lambda one, body: app.view(one, body.run)), methods=["POST"]),
+        Route(f"{item}/kinds", asked(RunBody, kinds), methods=["POST"]),
+        Route(f"{item}/shares", asked(ShareBody, app.share), methods=["POST"]),
+        Route(f"{item}/shares/{{name}}", shared),
+        Route(f"{item}/shares/{{name}}", forget, methods=["DELETE"]),
+        Route("/scene/{key}/{run}/{rest:path}", scene),
+        WebSocketRoute("/scene/{key}/{run}", scene_socket),
+        WebSocketRoute("/scene/{key}/{run}/", scene_socket),
+    ]
+    faults: dict[Any, Any] = {
+        LumigraphError: refused,
+        OSError: refused,
+        ClientDisconnect: refused,
+        msgspec.MsgspecError: refused,
+    }
+    inner = Starlette(routes=routes, exception_handlers=faults, lifespan=lambda _: living(app))
+    return Gate(inner, app.address)
+
+
+# A page that was made to share runs its program apart from the app's own address.
+SANDBOX = "sandbox allow-scripts; frame-ancestors 'self'"
+SHOWN_HEADERS = {"Content-Security-Policy": SANDBOX, "Cache-Control": "no-cache"}
+
+
+def picture_of(item: Item, request: Request) -> Response:
+    """A photograph by name, the preview of a run, or the picture of a card, small."""
+    query = request.query_params
+    side = min(max(whole(query.get("side", "320")), 16), 2048)
+    found = rows.picture(item, query.get("name", ""), query.get("run", ""))
+    kept = "max-age=86400" if "v" in query else "no-cache"
+    return Response(pictures.thumbnail(found, side), media_type="image/jpeg", headers={"Cache-Control": kept})
+
+
+async def body_of(request: Request, kind: Any) -> Any:
+    """Body of a request as a value of a kind. Raises LumigraphError for anything else."""
+    data = b""
+    async for piece in request.stream():
+        data += piece
+        if len(data) > MAX_BODY_BYTES:
+            raise LumigraphError("The request is too long")
+    return msgspec.json.decode(data or b"{}", type=kind)
+
+
+def whole(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or len(text) > 15:
+        raise LumigraphError(f"{text[:20]!r} is no size; load the page again")
+    return int(text)
+
+
+def refused(request: Request, fault: Exception) -> Response:
+    """One sentence for a fault of a request."""
+    if isinstance(fault, uploads.MisplacedError):
+        return JSONResponse({"fault": str(fault), "have": fault.have}, 409)
+    if isinstance(fault, uploads.DiskFullError):
+        return JSONResponse({"fault": str(fault)}, 507)
+    if isinstance(fault, LumigraphError):
+        return JSONResponse({"fault": str(fault)}, 400)
+    if isinstance(fault, msgspec.MsgspecError):
+        return JSONResponse({"fault": f"The page and the app do not fit ({fault}); load the page again"}, 400)
+    if isinstance(fault, ClientDisconnect):
+        return JSONResponse({"fault": "The connection ended"}, 400)
+    said = getattr(fault, "strerror", None) or str(fault)
+    return JSONResponse({"fault": f"{getattr(fault, 'filename', None) or 'A file'} could not be used ({said})"}, 500)
+
+
+@contextlib.asynccontextmanager
+async def living(app: App) -> AsyncIterator[None]:
+    """The time that the server runs: jobs and viewers end with it."""
+
+    async def sweep() -> None:
+        while True:
+            await asyncio.sleep(SWEEP_SECONDS)
+            app.views.sweep()
+
+    app.runner.begin()
+    sweeping = asyncio.create_task(sweep())
+    try:
+        yield
+    finally:
+        sweeping.cancel()
+        app.views.close_all()
+        await asyncio.to_thread(app.runner.end)
+
+
+class Announcing(uvicorn.Server):
+    """A server that calls a function once it answers."""
+
+    def __init__(self, config: uvicorn.Config, opened: Callable[[], object]):
+        super().__init__(config)
+        self.opened = opened
+
+    async def startup(self, sockets: Any = None) -> None:
+        await super().startup(sockets)
+        self.opened()
+
+
+def serve(root: Path, address: Address, opened: Callable[[], object]) -> None:
+    """Serve a folder until Ctrl-C. opened: called once the server answers
+
+    Raises LumigraphError if another app serves the folder.
+    """
+    place = root / APP_FOLDER
+    place.mkdir(parents=True, exist_ok=True)
+    with held(place, "served"):
+        app = App(root, address)
+        config = uvicorn.Config(
+            build(app),
+            host=address.host,
+            port=address.port,
+            log_level="error",
+            access_log=False,
+            ws="websockets-sansio",
+            ws_max_size=MAX_MESSAGE_BYTES,
+            ws_per_message_deflate=False,
+            server_header=False,
+            timeout_graceful_shutdown=2,
+        )
+        Announcing(config, opened).run()

@@ -1,0 +1,117 @@
+"""Files to share: kinds, with the command that makes each and its size before it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import LumigraphError
+from .job_record import ShareJob
+from .projects import SHARED, Item, is_splats
+
+# Sizes: bytes of a Gaussian or of a second of film. Measured on pages and files of 20,000 to 80,000 Gaussians.
+PAGE_BYTES, PAGE_BYTES_PER_GAUSSIAN = 1_400_000, 28
+SPZ_BYTES_PER_GAUSSIAN = 24
+VIEWS_PAGE_BYTES = 72 * 30_000
+FILM_SECONDS, FILM_BYTES_PER_SECOND = 4, 700_000
+MESH_BYTES, POINTS_BYTES = 6_000_000, 4_000_000
+
+
+@dataclass(frozen=True)
+class ShareKind:
+    """One kind of file.
+
+    about: for people; words: of the command before the run; after: options behind the file
+    clouds_only: True for methods of Gaussians alone
+    size: estimate in bytes, from the number of Gaussians; None for other methods
+    """
+
+    title: str
+    about: str
+    ending: str
+    words: tuple[str, ...]
+    size: Callable[[int | None], float]
+    clouds_only: bool = False
+
+
+KINDS = {
+    "page": ShareKind(
+        "Web page",
+        "One file that opens in any browser, on a phone too, without a server",
+        ".html",
+        ("export", "web"),
+        lambda n: VIEWS_PAGE_BYTES if n is None else PAGE_BYTES + n * PAGE_BYTES_PER_GAUSSIAN,
+    ),
+    "film": ShareKind(
+        "Film", "MP4, a flight around the scene", ".mp4", ("render",), lambda n: FILM_SECONDS * FILM_BYTES_PER_SECOND
+    ),
+    "splats": ShareKind(
+        "Splats",
+        "Gaussians for other programs, as .spz",
+        ".spz",
+        ("export", "splats"),
+        lambda n: (n or 0) * SPZ_BYTES_PER_GAUSSIAN,
+        True,
+    ),
+    "mesh": ShareKind("Mesh", "A coloured surface, as .glb", ".glb", ("export", "mesh"), lambda n: MESH_BYTES),
+    "points": ShareKind("Points", "Coloured points, as .ply", ".ply", ("export", "points"), lambda n: POINTS_BYTES),
+}
+
+
+def kinds_for(path: Path) -> list[dict[str, Any]]:
+    """Kinds of files that can be made of a run or a splat file, each with its estimated size."""
+    count = gaussians_of(path)
+    return [
+        {"kind": name, "title": kind.title, "about": kind.about, "bytes": kind.size(count)}
+        for name, kind in KINDS.items()
+        if count is not None or not kind.clouds_only
+    ]
+
+
+def gaussians_of(path: Path) -> int | None:
+    """Number of Gaussians of a run or a splat file; None for what is no cloud."""
+    from ..run import open_run
+    from ..run.records import read_rows
+
+    if is_splats(path):
+        return path.stat().st_size // SPZ_BYTES_PER_GAUSSIAN
+    rows = read_rows(path / "metrics.jsonl")
+    counts = [row["statistics"]["gaussians"] for row in rows[-20:] if "gaussians" in row["statistics"]]
+    if counts:
+        return int(counts[-1])
+    weights = open_run(path).version
+    return header_count(Path(weights)) if weights else None
+
+
+def header_count(weights: Path) -> int | None:
+    """Number of Gaussians in a file of weights, from its header alone."""
+    from safetensors import safe_open
+
+    if weights.suffix != ".safetensors" or not weights.is_file():
+        return None
+    with safe_open(weights, "pt") as file:
+        names = [name for name in file.keys() if name.endswith("means")]
+        return file.get_slice(names[0]).get_shape()[0] if names else None
+
+
+def share_job(item: Item, kind: str, run: Path, now: float, size: int | None = None) -> ShareJob:
+    """The job of a file to share. size: longer side of a film in pixels"""
+    if kind not in KINDS:
+        raise LumigraphError(f"{kind[:40]!r} cannot be made; choose {', '.join(KINDS)}")
+    if kind not in [one["kind"] for one in kinds_for(run)]:
+        raise LumigraphError(f"{run.name} is no cloud of Gaussians, so there are no splats; choose another kind")
+    stem = item.path.name if run == item.path else f"{item.path.name}-{run.name.partition('.')[0]}"
+    options = ["--size", str(size)] if kind == "film" and size else []
+    if kind == "page":
+        options = ["--title", item.record.title]
+    return ShareJob(f"{stem}{KINDS[kind].ending}", kind, run.name, options, "queued", now)
+
+
+def command_of(item: Item, job: ShareJob) -> list[str]:
+    """Words of the command that makes a file. A file of an earlier version is replaced, as it is one of ours."""
+    run, place = item.run(job.run), item.path / SHARED / job.name
+    place.parent.mkdir(exist_ok=True)
+    output = ["--output", str(place)] if job.kind == "film" else [str(place)]
+    return [*KINDS[job.kind].words, str(run), *output, *job.options]

@@ -1,0 +1,550 @@
+"""The app's routes: uploads, projects, jobs with a quick command in place of ours, and who is let in."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import signal
+import sqlite3
+import sys
+import threading
+import time
+from collections import namedtuple
+from pathlib import Path
+
+import numpy as np
+import pytest
+from budgets import budget
+from PIL import Image
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+from websockets.sync.server import serve as serve_websockets
+
+from lumigraph.app import jobs, progress, projects, uploads
+from lumigraph.app.job_record import read_job
+from lumigraph.app.projects import find_item, new_project
+from lumigraph.app.scene_views import SceneView
+from lumigraph.app.server import App, build
+from lumigraph.errors import LumigraphError
+from lumigraph.viewer.address import Address, free_port
+
+pytestmark = budget("exports", 12)
+
+BASE = "http://127.0.0.1:8080"
+HOST = {"Host": "127.0.0.1:8080"}  # for websockets, where the client would have another
+TOKEN = "a-token-nobody-guesses"
+# The command line, in short: capture makes a scene, train a run. It waits for the file `go`, and fails as `fault` says.
+PROGRAM = """
+import json, os, pathlib, shutil, signal, sys, time
+words, here = sys.argv[1:], pathlib.Path.cwd()
+def stop(number, frame):
+    print("saved", flush=True)
+    sys.exit(128 + number)
+signal.signal(signal.SIGINT, stop)
+signal.signal(signal.SIGTERM, stop)
+with open(here / "calls.txt", "a") as calls:
+    calls.write(json.dumps(words) + "\\n")
+while not (here.parent / "go").exists():
+    time.sleep(0.01)
+if (fault := here.parent / "fault").exists():
+    sys.exit(print("warning: something\\nlumigraph: " + fault.read_text()) or 2)
+def option(name):
+    return pathlib.Path(words[words.index(name) + 1])
+if words[0] == "capture":
+    option("--output").mkdir()
+    (option("--output") / "transforms.json").write_text("{}")
+elif words[0] in ("train", "resume"):
+    run = pathlib.Path(words[1]) if words[0] == "resume" else option("--output")
+    shutil.copytree((here.parent.parent / "ball.txt").read_text(), run, dirs_exist_ok=True)
+else:
+    pathlib.Path(words[3] if words[0] == "export" else option("--output")).write_bytes(b"<p>made</p>")
+"""
+
+
+def jpeg(seed: int = 0, size: tuple[int, int] = (64, 48), scale: float = 1.0) -> bytes:
+    """A photograph full of fine detail."""
+    noise = np.random.default_rng(seed).integers(0, 255, (*size[::-1], 3))
+    out = io.BytesIO()
+    Image.fromarray((noise * scale).astype(np.uint8)).save(out, "JPEG", quality=95)
+    return out.getvalue()
+
+
+@pytest.fixture
+def app(tmp_path, ball_run) -> App:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    (tmp_path / "ball.txt").write_text(str(Path(ball_run.path).resolve()))
+    (tmp_path / "scenes-here").mkdir()
+    return App(
+        tmp_path / "scenes-here", Address("127.0.0.1", 8080), [sys.executable, "-S", str(tmp_path / "program.py")]
+    )
+
+
+@pytest.fixture
+def client(app):
+    return TestClient(build(app), base_url=BASE)
+
+
+@pytest.fixture
+def running(app):
+    """A client of an app whose jobs run."""
+    with TestClient(build(app), base_url=BASE) as client:
+        yield client
+
+
+@pytest.fixture
+def project(app) -> str:
+    return new_project(app.root, "Garden").key
+
+
+def put(client, key: str, name: str, data: bytes, offset: int = 0, size: int | None = None):
+    about = {"name": name, "offset": offset, "size": len(data) if size is None else size}
+    return client.put(f"/api/items/{key}/photographs", params=about, content=data)
+
+
+def wait(told, seconds: float = 20.0):
+    end = time.monotonic() + seconds
+    while not (found := told()):
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.02)
+    return found
+
+
+def names(app, key: str) -> list[str]:
+    return sorted(uploads.listed(find_item(app.root, key).path / "photos"))
+
+
+# Who is let in
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example:8080", "me@127.0.0.1:8080", "192.168.1.9:8080"]
+)
+def test_foreign_hosts_get_nothing(client, project, host):
+    for method, path in (("GET", "/"), ("GET", "/api/home"), ("DELETE", f"/api/items/{project}")):
+        assert client.request(method, path, headers={"Host": host}).status_code == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:9999", "https://127.0.0.1:8080"])
+def test_pages_of_other_sites_get_nothing(app, client, project, origin):
+    headers = {"Origin": origin}
+    about = {"name": "a.jpg", "offset": 0, "size": 9}
+    assert (
+        client.put(f"/api/items/{project}/photographs", params=about, content=jpeg(), headers=headers).status_code
+        == 403
+    )
+    assert client.post("/api/projects", json={"title": "x"}, headers=headers).status_code == 403
+    with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"/scene/{project}/live", headers=HOST | headers):
+        pass
+    assert names(app, project) == [] and len(projects.items(app.root)) == 1
+
+
+def test_our_own_page_is_let_in_and_framed_by_nobody(client):
+    page = client.get("/", headers={"Origin": BASE})
+    assert page.status_code == 200 and "app.js" in page.text
+    assert "frame-ancestors 'none'" in page.headers["Content-Security-Policy"]
+    assert page.headers["X-Content-Type-Options"] == "nosniff" and "Set-Cookie" not in page.headers
+    assert client.get("/static/app.js").headers["Content-Type"].startswith("text/javascript")
+    assert client.get("/static/..%2fserver.py").status_code == 404
+
+
+def test_others_need_the_token_and_name_no_path(tmp_path):
+    app = App(tmp_path, Address("0.0.0.0", 8080, TOKEN))
+    client = TestClient(build(app), base_url=BASE)
+    assert client.get("/").status_code == client.get("/?token=wrong").status_code == 403
+    assert client.post("/api/projects", json={"title": "x"}).status_code == 403
+    assert f"lumigraph-8080={TOKEN}" in client.get(f"/?token={TOKEN}").headers["Set-Cookie"]  # which the client keeps
+    assert client.get("/api/home").json()["local"] is False
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "a.jpg").write_bytes(jpeg())
+    refused = client.post("/api/projects", json={"title": "x", "path": str(tmp_path / "pictures")})
+    assert refused.status_code == 400 and "on this machine" in refused.json()["fault"]
+
+
+# Uploads
+
+
+def test_a_photograph_arrives_in_pieces(app, client, project):
+    data = jpeg(1)
+    half = len(data) // 2
+    assert put(client, project, "a b/één.JPG", data[:half], 0, len(data)).json()["done"] is False
+    assert names(app, project) == []  # not before it is whole
+    astray = put(client, project, "a b/één.JPG", data[half + 5 :], half + 5, len(data))
+    assert astray.status_code == 409 and astray.json()["have"] == half
+    about = {"name": "a b/één.JPG", "size": len(data)}
+    assert client.get(f"/api/items/{project}/photographs", params=about).json()["have"] == half
+    assert put(client, project, "a b/één.JPG", data[half:], half, len(data)).json()["done"] is True
+    assert (find_item(app.root, project).path / "photos/a b/één.JPG").read_bytes() == data
+    assert client.get(f"/api/items/{project}/photographs", params=about).json()["have"] == len(data)
+    other = jpeg(2, (80, 60))
+    assert put(client, project, "a b/één.JPG", other).json()["name"] == "a b/één-2.JPG"
+    assert names(app, project) == ["a b/één-2.JPG", "a b/één.JPG"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../a.jpg", "a/../../b.jpg", "/etc/a.jpg", "..\\a.jpg", "C:a.jpg", ".hidden.jpg", "a/.b/c.jpg",
+     "a\x00.jpg", "a\n.jpg", "con.jpg", "a/b/c/d/e.jpg", "x" * 300 + ".jpg", "", ".", "a*.jpg", "\u202egpj.a.jpg"],
+)  # fmt: skip
+def test_names_that_lead_elsewhere_are_refused(app, client, project, name):
+    before = sorted(app.root.parent.rglob("*"))
+    refused = put(client, project, name, jpeg())
+    assert refused.status_code == 400 and refused.json()["fault"].count(". ") == 0
+    assert sorted(app.root.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("page.jpg", b"<script>alert(1)</script>"),
+        ("empty.png", b"\x89PNG\r\n\x1a\n"),
+        ("list.mp4", b"#EXTM3U\n#EXTINF:1,\nfile:///etc/passwd\n"),
+        ("joined.mkv", b"ffconcat version 1.0\nfile /etc/passwd\n"),
+        ("notes.txt", b"hello"),
+        ("scene.json", b"{}"),
+        ("run.sh", b"#!/bin/sh\n"),
+        ("nothing.jpg", b""),
+    ],
+)
+def test_what_is_no_photograph_is_refused_and_leaves_nothing(app, client, project, name, data):
+    refused = put(client, project, name, data)
+    assert refused.status_code == 400 and name in refused.json()["fault"]
+    assert [path for path in (app.root / project / "photos").rglob("*") if path.is_file()] == []
+
+
+def test_a_bomb_of_pixels_is_refused(client, project):
+    header = (
+        b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR" + (60_000).to_bytes(4, "big") * 2 + b"\x08\x02\0\0\0"
+    )
+    import zlib
+
+    header += zlib.crc32(header[12:]).to_bytes(4, "big") + b"\0\0\0\0IEND\xaeB`\x82"
+    refused = put(client, project, "bomb.png", header)
+    assert refused.status_code == 400 and "3600000000 pixels" in refused.json()["fault"]
+
+
+def test_sizes_are_kept_to(app, client, project):
+    assert put(client, project, "a.jpg", jpeg(), size=10).status_code == 400  # more than announced
+    assert put(client, project, "a.jpg", jpeg(), size=10**12).status_code == 400
+    assert put(client, project, "a.jpg", jpeg(), size=0).status_code == 400
+    for size in ("-1", "1e3", "x", "9" * 30, "٣"):
+        assert (
+            client.put(f"/api/items/{project}/photographs", params={"name": "a.jpg", "size": size}).status_code == 400
+        )
+    assert client.post("/api/projects", content=b"{" + b" " * 70_000).status_code == 400
+    assert names(app, project) == []
+
+
+def test_a_full_disk_is_told_and_the_upload_goes_on(app, client, project, monkeypatch):
+    data, usage = jpeg(1), namedtuple("Usage", "total used free")
+    assert not put(client, project, "a.jpg", data[:100], 0, len(data)).json()["done"]
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda place: usage(1 << 40, 1 << 40, 1000))
+        refused = put(client, project, "a.jpg", data[100:], 100, len(data))
+    assert refused.status_code == 507 and "full" in refused.json()["fault"]
+    assert put(client, project, "a.jpg", data[100:], 100, len(data)).json()["done"]
+    full = Path("/dev/full")
+    if full.exists():  # the system's own refusal, in the middle of a piece
+        with monkeypatch.context() as patch:
+            patch.setattr(uploads.Upload, "partial", property(lambda upload: full))
+            patch.setattr(uploads.Upload, "have", lambda upload: 0)
+            assert put(client, project, "b.jpg", data).status_code == 507
+    assert names(app, project) == ["a.jpg"]
+
+
+def test_advice_comes_while_photographs_arrive(client, project):
+    for i in range(5):
+        put(client, project, f"{i}.jpg", jpeg(i, (320, 240)))
+    put(client, project, "dark.jpg", jpeg(7, (320, 240), 0.08))
+    put(client, project, "again.jpg", jpeg(3, (320, 240)))
+    soft = Image.open(io.BytesIO(jpeg(9, (12, 9)))).resize((320, 240), Image.Resampling.BICUBIC)
+    soft.save(out := io.BytesIO(), "JPEG")
+    put(client, project, "soft.jpg", out.getvalue())
+    said = {one["text"].partition(":")[0]: one["names"] for one in client.get(f"/api/items/{project}/advice").json()}
+    assert said["Blurred"] == ["soft.jpg"] and said["Very dark"] == ["dark.jpg"]
+    assert said["Shown twice"] in (["again.jpg"], ["3.jpg"])
+    assert any("8 photographs" in text for text in said)
+    left = client.delete(f"/api/items/{project}/photographs", params={"name": "soft.jpg"}).json()
+    assert "soft.jpg" not in [one["name"] for one in left["photographs"]]
+    shown = client.get(f"/api/items/{project}/picture", params={"name": "0.jpg", "side": 99})
+    assert Image.open(io.BytesIO(shown.content)).size == (99, 74)
+
+
+# Projects
+
+
+@pytest.mark.parametrize(
+    "key", ["..", "..:x", ".lumigraph-app", "Garden:photos", "%2e%2e", "..%2f..", "Garden%2f..", "no"]
+)
+def test_keys_name_items_only(client, project, key):
+    assert client.get(f"/api/items/{key}").status_code in (400, 404)
+    assert client.delete(f"/api/items/{key}").status_code in (400, 404, 405)
+
+
+def test_a_project_is_renamed_copied_deleted_and_brought_back(app, client, project):
+    put(client, project, "a.jpg", jpeg())
+    item = find_item(app.root, project)
+    (item.path / "scene" / "work").mkdir(parents=True)
+    (item.path / "scene" / "work" / "sources.json").write_text(json.dumps([str(item.path / "photos")]))
+    assert client.patch(f"/api/items/{project}", json={"title": " My  garden "}).json()["key"] == project
+    copy = client.post(f"/api/items/{project}/duplicate").json()["key"]
+    (source,) = json.loads((app.root / copy / "scene/work/sources.json").read_text())
+    assert source == str(app.root / copy / "photos")
+    assert sorted(card["title"] for card in client.get("/api/home").json()["cards"]) == ["My garden", "My garden copy"]
+    trash = client.delete(f"/api/items/{project}").json()["trash"]
+    home = client.get("/api/home").json()
+    assert [card["key"] for card in home["cards"]] == [copy] and home["trash"][0]["title"] == "My garden"
+    assert client.post(f"/api/trash/{trash}").json()["key"] == project
+    assert names(app, project) == ["a.jpg"]
+    client.delete(f"/api/items/{copy}")
+    client.delete("/api/trash")
+    assert client.get("/api/home").json()["trash"] == [] and not (app.root / copy).exists()
+    assert client.post("/api/trash/..").status_code in (400, 404, 405)
+    assert client.patch(f"/api/items/{project}", json={"title": "x" * 130}).status_code == 400
+    assert client.patch(f"/api/items/{project}", json={"name": "x"}).status_code == 400
+
+
+def test_a_moved_folder_keeps_its_paths_right(app, project):
+    item = find_item(app.root, project)
+    (item.path / "runs" / "a").mkdir(parents=True)
+    (item.path / "runs" / "a" / "config.json").write_text(json.dumps({"scene": {"source": str(item.path / "scene")}}))
+    item.path.rename(app.root / "elsewhere")
+    projects.relocate(moved := find_item(app.root, "elsewhere"))
+    said = json.loads((moved.path / "runs/a/config.json").read_text())
+    assert said["scene"]["source"] == str(app.root / "elsewhere" / "scene")
+
+
+def test_a_path_on_this_machine_needs_no_upload(app, client, tmp_path):
+    (tmp_path / "pictures").mkdir()
+    refused = client.post("/api/projects", json={"title": "x", "path": str(tmp_path / "pictures")})
+    assert refused.status_code == 400 and "no photographs" in refused.json()["fault"]
+    (tmp_path / "pictures" / "a.jpg").write_bytes(jpeg())
+    key = client.post("/api/projects", json={"title": "", "path": str(tmp_path / "pictures")}).json()["key"]
+    assert [one["name"] for one in client.get(f"/api/items/{key}").json()["photographs"]] == ["a.jpg"]
+    assert put(client, key, "b.jpg", jpeg()).status_code == 400
+    client.delete(f"/api/items/{key}/photographs", params={"name": "a.jpg"})
+    assert (tmp_path / "pictures" / "a.jpg").exists()
+    assert client.post("/api/projects", json={"title": "x", "path": "/etc/passwd"}).status_code == 400
+
+
+# Jobs
+
+
+def calls(app, key: str) -> list[list[str]]:
+    place = app.root / key / "calls.txt"
+    return [json.loads(line) for line in place.read_text().splitlines()] if place.exists() else []
+
+
+def state(client, key: str) -> str:
+    return client.get(f"/api/items/{key}").json()["make"]["state"]
+
+
+def let(app) -> None:
+    (app.root / "go").touch()
+
+
+def test_photographs_become_a_run_and_a_file(app, running, project):
+    let(app)
+    assert running.post(f"/api/items/{project}/make", json={}).status_code == 400  # nothing to make it of
+    put(running, project, "a.jpg", jpeg())
+    assert running.post(f"/api/items/{project}/make", json={"method": "no-such"}).status_code == 400
+    assert running.post(f"/api/items/{project}/make", json={"quality": "superb"}).status_code == 400
+    running.post(f"/api/items/{project}/make", json={"quality": "good", "mapper": "global"})
+    wait(lambda: state(running, project) == "done")
+    capture, train = calls(app, project)
+    here = app.root / project
+    assert capture == ["capture", str(here / "photos"), "--output", str(here / "scene"), "--mapper", "global"]
+    assert train[:5] == [
+        "train",
+        "gaussian-splatting",
+        str(here / "scene"),
+        "--output",
+        str(here / "runs/gaussian-splatting-1"),
+    ]
+    assert train[5:7] == ["--quality", "good"] and "--no-stay" in train
+
+    asked = {"kind": "film", "run": "gaussian-splatting-1"}
+    assert running.post(f"/api/items/{project}/shares", json=asked | {"run": "../x"}).status_code == 400
+    running.post(f"/api/items/{project}/shares", json=asked)
+    row = wait(
+        lambda: next((one for one in running.get(f"/api/items/{project}").json()["shares"] if one["bytes"]), None)
+    )
+    assert calls(app, project)[2][:2] == ["render", str(here / "runs/gaussian-splatting-1")]
+    file = running.get(f"/api/items/{project}/shares/{row['name']}")
+    assert file.content == b"<p>made</p>" and "attachment" in file.headers["Content-Disposition"]
+    assert "sandbox" in file.headers["Content-Security-Policy"]
+    assert running.get(f"/api/items/{project}/shares/..%2fproject.json").status_code in (400, 404)
+    assert running.delete(f"/api/items/{project}/shares/{row['name']}").json()["shares"] == []
+
+
+def test_a_failure_is_the_sentence_of_the_command(app, running, project):
+    put(running, project, "a.jpg", jpeg())
+    let(app)
+    (app.root / "fault").write_text("at most 2 of 3 show the same things; take 20 or more")
+    running.post(f"/api/items/{project}/make", json={})
+    wait(lambda: state(running, project) == "failed")
+    making = running.get(f"/api/items/{project}").json()["make"]
+    assert making["fault"] == "at most 2 of 3 show the same things; take 20 or more" and making["stage"] == "capture"
+    (app.root / "fault").unlink()
+    running.post(f"/api/items/{project}/more", json={})
+    wait(lambda: state(running, project) == "done")
+
+
+def test_a_job_is_paused_and_goes_on_by_resume(app, running, project):
+    put(running, project, "a.jpg", jpeg())
+    running.post(f"/api/items/{project}/make", json={})
+    wait(lambda: calls(app, project))
+    assert running.post(f"/api/items/{project}/make", json={}).status_code == 400  # one at a time
+    running.post(f"/api/items/{project}/pause")
+    wait(lambda: app.runner.current is None)
+    assert state(running, project) == "paused" and "saved" in jobs.log_lines(find_item(app.root, project))
+    let(app)
+    running.post(f"/api/items/{project}/more", json={})
+    wait(lambda: state(running, project) == "done")
+    running.post(f"/api/items/{project}/more", json={"minutes": 2})
+    wait(lambda: len(calls(app, project)) == 4 and state(running, project) == "done")
+    assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train", "resume"]
+    assert calls(app, project)[3][2:4] == ["--seconds", "120.0"]
+
+
+def test_jobs_wait_for_each_other_and_go_with_their_project(app, running):
+    keys = [new_project(app.root, name).key for name in ("one", "two")]
+    for key in keys:
+        put(running, key, "a.jpg", jpeg())
+        running.post(f"/api/items/{key}/make", json={})
+    wait(lambda: calls(app, "one"))
+    assert state(running, "two") == "queued" and running.get("/api/home").json()["queue"][1]["key"] == "two"
+    trash = running.delete("/api/items/one").json()["trash"]
+    wait(lambda: calls(app, "two"))
+    let(app)
+    wait(lambda: state(running, "two") == "done")
+    running.post(f"/api/trash/{trash}")
+    assert state(running, "one") == "stopped"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends the children of a killed process")
+def test_a_killed_app_goes_on_where_it_was(app, project):
+    item = find_item(app.root, project)
+    (item.path / "photos" / "a.jpg").write_bytes(jpeg())
+    jobs.make(item)
+    app.runner.begin()
+    wait(lambda: calls(app, project))
+    child = app.runner.current.child
+    app.runner._ended = True  # as after a kill, nobody changes the record any more
+    child.send_signal(signal.SIGKILL)
+    app.runner._thread.join(10)
+    assert read_job(item).make.state == "running"
+    let(app)
+    again = App(app.root, app.address, app.runner.program)
+    again.runner.begin()
+    wait(lambda: read_job(item).make.state == "done")
+    again.runner.end()
+    assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train"]
+
+
+def test_a_damaged_record_is_told_and_stops_nobody_else(app, running, project):
+    let(app)
+    (app.root / project / "job.json").write_text('{"make": {"state": "dancing"}}')
+    assert "job.json" in running.get(f"/api/items/{project}").json()["fault"]
+    assert "job.json" in running.get("/api/home").json()["cards"][0]["fault"]
+    other = new_project(app.root, "other").key
+    put(running, other, "a.jpg", jpeg())
+    running.post(f"/api/items/{other}/make", json={})
+    wait(lambda: state(running, other) == "done")
+
+
+# Progress
+
+
+def test_features_and_matches_are_read_while_colmap_writes(app, project):
+    item = find_item(app.root, project)
+    work = item.path / "scene" / "work"
+    work.mkdir(parents=True)
+    assert progress.photographs_state(item) == {} and progress.features(item, "a.jpg") == []
+    with contextlib.closing(sqlite3.connect(work / "database.db")) as rows:
+        rows.execute("CREATE TABLE cameras (camera_id INTEGER, width INTEGER, height INTEGER)")
+        rows.execute("CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)")
+        rows.execute("CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)")
+        rows.execute("CREATE TABLE two_view_geometries (pair_id INTEGER, rows INTEGER)")
+        rows.execute("INSERT INTO cameras VALUES (1, 200, 100)")
+        rows.executemany("INSERT INTO images VALUES (?, ?, 1)", [(1, "a.jpg"), (2, "b.jpg"), (3, "c.jpg")])
+        points = np.array([[100, 50, 1, 0], [20, 10, 1, 0]], np.float32)
+        rows.executemany("INSERT INTO keypoints VALUES (?, 2, 4, ?)", [(1, points.tobytes()), (2, points.tobytes())])
+        rows.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", [(2147483647 + 2, 40), (2147483647 + 3, 3)])
+        rows.commit()
+    (item.path / "scene" / "capture.json").write_text(
+        json.dumps({"registered": ["a.jpg"], "left_out": {"c.jpg": "too few details"}})
+    )
+    found = progress.photographs_state(item)
+    assert found["a.jpg"] == {"features": 2, "matched": 1, "placed": True} and found["b.jpg"]["matched"] == 1
+    assert found["c.jpg"] == {"features": None, "matched": 0, "left_out": "too few details"}
+    assert progress.features(item, "a.jpg") == [[0.5, 0.5], [0.1, 0.1]]
+    (work / "stages.json").write_text(json.dumps({"features": {"key": "k", "done": False, "seconds": 1}}))
+    assert progress.capture_progress(item)["stage"] == "Finding details"
+    assert progress.capture_progress(item)["share"] == pytest.approx(0.03 + 0.95 * 0.4 * 2 / 3)
+    assert progress.model(item)["cameras"] == []
+
+
+# The viewer behind the app's address
+
+
+def test_the_viewer_is_reached_through_the_app_alone(app, project):
+    item = find_item(app.root, project)
+    run = item.path / "runs" / "a"
+    run.mkdir(parents=True)
+    (run / "config.json").write_text("{}")
+
+    def echo(connection) -> None:
+        for message in connection:
+            connection.send(b"seen " + message)
+
+    def page(connection, request):
+        if "Upgrade" not in request.headers:
+            return connection.respond(200, f"viewer at {request.path}")
+        return None
+
+    port = free_port("127.0.0.1", 0)
+    with serve_websockets(echo, "127.0.0.1", port, process_request=page, subprotocols=["viser-v1"]) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        client = TestClient(build(app), base_url=BASE)
+        assert client.get(f"/scene/{project}/a/").status_code == 404  # nobody has opened it
+        view = SceneView(port, _Child(), app.root / "log")
+        app.views.views[run] = view
+        shown = client.get(f"/scene/{project}/a/some/file.js")
+        assert (
+            shown.text == "viewer at /some/file.js"
+            and "frame-ancestors 'self'" in shown.headers["Content-Security-Policy"]
+        )
+        with client.websocket_connect(f"/scene/{project}/a", subprotocols=["viser-v1"], headers=HOST) as socket:
+            socket.send_bytes(b"hello")
+            assert socket.receive_bytes() == b"seen hello" and view.connections == 1
+            assert socket.accepted_subprotocol == "viser-v1"
+        wait(lambda: view.connections == 0)
+        with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"/scene/{project}/b", headers=HOST):
+            pass
+        server.shutdown()
+
+
+class _Child:
+    """In place of a viewer's process."""
+
+    def poll(self) -> None:
+        return None
+
+
+def test_an_app_serves_a_folder_alone(tmp_path):
+    from lumigraph.app.projects import APP_FOLDER
+    from lumigraph.files.locks import held
+
+    place = tmp_path / APP_FOLDER
+    place.mkdir()
+    program = "import sys, time, pathlib; from lumigraph.files.locks import held\n"
+    program += f"with held(pathlib.Path({str(place)!r}), 'served'): print('held', flush=True); time.sleep(30)"
+    import subprocess
+
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(LumigraphError, match="being served"), held(place, "served"):
+            pass
+        other.kill()
