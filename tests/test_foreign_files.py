@@ -99,6 +99,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png", "bench/lock.json")
         + ("bench/runs/photographs-voxel-grid-1steps-seed0.log",),
     ),
+    "gallery": (
+        "gallery --methods instant-ngp --output gallery",
+        ("gallery/gallery.html", "gallery/results.json", "gallery/results.md", "gallery/settings.json"),
+    ),
     "bench shapes": (
         "bench shapes --methods distance-grid --shapes photographs --output bench --steps 1",
         ("bench/shapes.json", "bench/shapes.md"),

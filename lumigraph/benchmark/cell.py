@@ -70,6 +70,7 @@ class Cell:
     collection: the name of the one whose member the scene is, with which it is averaged
     prior:      the run that makes the cell's out of so many photographs, which learns nothing; its budget is then that
                 of the cells beside it
+    further:    other options of `lumigraph train`
     """
 
     method: str
@@ -80,6 +81,7 @@ class Cell:
     views: int | None = None
     collection: str = ""
     prior: str | None = None
+    further: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -128,7 +130,7 @@ def train_command(cell: Cell, settings: CellSettings) -> list[str]:
         "--preset": settings.preset,
         "--device": settings.device,
     }
-    return ["train", cell.method, cell.source, *options(told)]
+    return ["train", cell.method, cell.source, *options(told), *cell.further]
 
 
 def reduced(source: str, downscale: int | None) -> int | None:

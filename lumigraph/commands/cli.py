@@ -47,6 +47,7 @@ from .draw import Draw
 from .eval import Eval
 from .explain import Explain
 from .export import Export
+from .gallery import Gallery
 from .infer import Infer
 from .info import Info
 from .jump import Jump
@@ -139,6 +140,7 @@ COMMANDS: dict[str, type] = {
     "info": Info,
     "methods": Methods,
     "bench": Bench,
+    "gallery": Gallery,
 }
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 

@@ -1,0 +1,287 @@
+"""The gallery: every method on the smallest data that it is meant for, on one page.
+
+OUTPUT/
+├── gallery.html    pictures, scores, times, published figures
+├── data/           a mesh, a picture and a model of captions, which some methods learn from
+└── runs/, results.json, results.md    as of every benchmark
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from .. import files, methods
+from ..budget import Budget
+from ..capture import open_scene
+from ..errors import LumigraphError
+from ..evaluation.report import jpeg, page
+from ..evaluation.views import file_name
+from ..figures import save_picture
+from ..metrics import scores_of
+from ..run import Run
+from .cell import Cell, CellSettings, Row, read_rows
+from .conduct import STOP_CODES, Launch, conduct, launch, reason
+from .table import size
+
+PAGE, LOG = "gallery.html", "captions.log"
+MESH, PICTURE, CAPTIONS = "data/knot.ply", "data/picture.png", "data/captions"
+OBJECT, MOVING = "procedural:still-life,size=160,views=40", "procedural:jelly,size=100,views=60"
+TOYS, CHAIRS = "procedural:toys,count=20,size=48,views=12", "procedural:chairs,count=20,size=48,views=12"
+RECORDING = "procedural:room,depth,views=60,size=120"
+EVAL_VIEWS = 3
+MIN_CAPTION_SECONDS = 60.0
+
+
+@dataclass(frozen=True)
+class Showpiece:
+    """A method's entry. source: smallest data that it is meant for; idea: its contribution in a line; known: published
+    figure with its protocol; options: further ones of `lumigraph train`; views: photographs to learn from"""
+
+    source: str
+    idea: str
+    known: str = ""
+    options: tuple[str, ...] = ()
+    views: int | None = None
+
+
+SECTIONS: dict[str, dict[str, Showpiece]] = {
+    "Pictures and light fields": {
+        "fourier-features": Showpiece(
+            PICTURE,
+            "A coordinate network learns detail once its input is a set of waves.",
+            "about 19 dB without, over 25 dB with, natural pictures (Tancik 2020)",
+        ),
+        "lumigraph": Showpiece(OBJECT, "Photographs blended ray by ray over a rough surface; no training."),
+        "view-interpolation": Showpiece(OBJECT, "Neighbouring photographs warped forward by their depth; no training."),
+        "deep-appearance": Showpiece(
+            "procedural:head", "A code and a view direction give a mesh and its view-dependent texture."
+        ),
+    },
+    "Radiance fields": {
+        "nerf": Showpiece(
+            OBJECT,
+            "Density and colour in the weights of a network, learnt through volume rendering.",
+            "31.01 dB, Blender's eight scenes at 800x800 (Mildenhall 2020)",
+        ),
+        "mip-nerf": Showpiece(
+            OBJECT,
+            "Pixels are cones, so that detail below a pixel fades instead of aliasing.",
+            "33.09 dB, Blender's eight scenes at 800x800 (Barron 2021)",
+        ),
+        "nerf-w": Showpiece(
+            "procedural:tourists,size=120,views=60", "A code for the light of each photograph, and passers-by apart."
+        ),
+        "block-nerf": Showpiece(
+            "procedural:city,crossings=2,views=60,size=120",
+            "A city in blocks that train alone and are blended.",
+            options=("--blocks", "1"),
+        ),
+        "rawnerf": Showpiece(
+            "procedural:night,size=100,views=30",
+            "Linear light from noisy mosaics; exposure is chosen later.",
+        ),
+        "regnerf": Showpiece(
+            OBJECT,
+            "Three photographs, and smooth depth in views that nobody took.",
+            "18.89 dB, DTU, three photographs, whole pictures (Niemeyer 2022)",
+            views=3,
+        ),
+    },
+    "Grids, tables and Gaussians": {
+        "dvgo": Showpiece(OBJECT, "Voxels of density and features.", "31.95 dB, Blender at 800x800 (Sun 2022)"),
+        "plenoxels": Showpiece(
+            OBJECT, "Sparse voxels of harmonics, no network.", "31.71 dB, Blender at 800x800 (Fridovich-Keil 2022)"
+        ),
+        "plenoctrees": Showpiece(
+            OBJECT, "Harmonics baked into an octree.", "31.71 dB, Blender at 800x800, over 150 frames/s (Yu 2021)"
+        ),
+        "snerg": Showpiece(
+            OBJECT,
+            "Baked blocks of voxels, one small network per pixel.",
+            "30.38 dB, Blender at 800x800, below 90 MB (Hedman 2021)",
+        ),
+        "tensorf": Showpiece(
+            OBJECT, "Voxels as sums of products of planes and lines.", "33.14 dB, Blender at 800x800 (Chen 2022)"
+        ),
+        "instant-ngp": Showpiece(
+            OBJECT, "Hash tables of many resolutions.", "33.18 dB, Blender at 800x800, five GPU minutes (Müller 2022)"
+        ),
+        "gaussian-splatting": Showpiece(
+            OBJECT, "A cloud of Gaussians, rasterised.", "33.32 dB, Blender at 800x800, over 100 frames/s (Kerbl 2023)"
+        ),
+    },
+    "Shape": {
+        "occupancy-network": Showpiece(MESH, "A network that classifies points as inside or outside."),
+        "deepsdf": Showpiece(MESH, "Signed distance of a point under the code of a shape."),
+        "nglod": Showpiece(MESH, "Codes in an octree, with levels of detail.", "19 to 904 kB a shape (Takikawa 2021)"),
+        "dvr": Showpiece(OBJECT, "Occupancy and texture from photographs by implicit differentiation."),
+        "mesh-fit": Showpiece(OBJECT, "Triangles moved by gradients of a rasteriser, in large steps."),
+        "voxel-fit": Showpiece(OBJECT, "Voxels fitted to photographs, the easy start of a mesh."),
+        "neus": Showpiece(OBJECT, "A signed distance as a radiance field.", "0.84 mm, DTU's 15 scans (Wang 2021)"),
+        "planar-splatting": Showpiece(
+            OBJECT, "Flat Gaussians whose depths agree.", "0.47 to 0.53 mm, DTU's 15 scans, half an hour (Chen 2024)"
+        ),
+    },
+    "Depth cameras": {
+        "tsdf-fusion": Showpiece(RECORDING, "Truncated signed distance averaged in hashed blocks of voxels."),
+        "imap": Showpiece(
+            RECORDING, "One network is the map and the tracker.", "4.2 cm, mean of TUM's three (Sucar 2021)"
+        ),
+        "splat-slam": Showpiece(RECORDING, "Gaussians as the map.", "3.35 cm, TUM fr1/desk (Keetha 2024)"),
+    },
+    "What moves": {
+        "nerfies": Showpiece(
+            MOVING, "A field that bends from moment to moment.", "20.85 dB, DyCheck, masked (Park 2021)"
+        ),
+        "nsff": Showpiece(MOVING, "Scene flow between moments.", "19.53 dB, DyCheck, masked (Li 2021)"),
+        "neural-volumes": Showpiece(
+            "procedural:jelly,rig=6,size=80,views=60", "Photographs of a moment become a warped volume."
+        ),
+        "deformable-splatting": Showpiece(
+            MOVING, "Gaussians moved by planes of space and time.", "34.05 dB, D-NeRF's eight scenes (Wu 2024)"
+        ),
+        "humannerf": Showpiece(
+            "procedural:walker", "A person before one camera, by bones.", "30.66 dB, ZJU-MoCap, ten hours (Weng 2022)"
+        ),
+        "articulated-splatting": Showpiece(
+            "procedural:walker", "Gaussians on bones, at any pose.", "31.8 dB, ZJU-MoCap, five minutes (Hu 2024)"
+        ),
+    },
+    "Objects and light": {
+        "neural-scene-graph": Showpiece(
+            "procedural:traffic,size=120,views=60",
+            "Cars in boxes, with codes.",
+            "26 dB, KITTI (Ost 2021)",
+        ),
+        "object-nerf": Showpiece(OBJECT, "A branch for the scene, a branch with a code for each object."),
+        "nerfactor": Showpiece(
+            "procedural:materials,size=100,views=30", "Shape, albedo, reflectance and light taken apart."
+        ),
+    },
+    "Across scenes": {
+        "pixelnerf": Showpiece(
+            TOYS,
+            "Features of photographs at points of a field.",
+            "19.33 dB, DTU, three photographs (Yu 2021)",
+        ),
+        "srn": Showpiece(CHAIRS, "A hypernetwork and a learnt ray marcher."),
+        "hyp-nerf": Showpiece(TOYS, "A hypernetwork makes the hash table of an object."),
+        "eg3d": Showpiece(
+            TOYS, "A generator on three planes, learnt from an adversary.", "FID 4.70, FFHQ at 512 pixels (Chan 2022)"
+        ),
+    },
+    "Imagination": {
+        "dream-fields": Showpiece(
+            "words:a red cube beside a blue ball", "A field learnt from words.", options=("--guidance", CAPTIONS)
+        ),
+        "dream-splats": Showpiece(
+            "words:a red cube beside a blue ball", "Gaussians learnt from words.", options=("--guidance", CAPTIONS)
+        ),
+        "gancraft": Showpiece("procedural:blocks", "Block worlds as landscapes, by a network that paints labels."),
+    },
+}
+SHOWPIECES = {name: piece for section in SECTIONS.values() for name, piece in section.items()}
+
+
+def gallery(
+    names: Sequence[str],
+    seconds: float,
+    output: Path,
+    tell: Callable[[str], object] = print,
+    launch: Launch = launch,
+) -> int:
+    """Train and evaluate methods, and write the page. What is done is kept. Returns the signal's exit code if one
+    stopped it, otherwise 0.
+
+    names: of methods; those without a Showpiece are refused
+    seconds: of training of each
+    """
+    if missing := [name for name in names if name not in SHOWPIECES]:
+        raise LumigraphError(f"{', '.join(missing)} has no place in the gallery; name others: {', '.join(SHOWPIECES)}")
+    files.claim(output / PAGE, "gallery")
+    cells = [cell_of(name, seconds, output) for name in SHOWPIECES if name in names]
+    sources = {SHOWPIECES[name].source for name in names}
+    guided = any(CAPTIONS in SHOWPIECES[name].options for name in names)
+    if code := prepare(sources, guided, seconds, output, tell, launch):
+        return code
+    if code := conduct(cells, CellSettings(eval_views=EVAL_VIEWS), output, tell, launch):
+        return code
+    write_gallery(cells, output)
+    return 0
+
+
+def cell_of(name: str, seconds: float, output: Path) -> Cell:
+    """The cell of a method's Showpiece. Its own data are those of `prepare`."""
+    piece = SHOWPIECES[name]
+    here = piece.source in (MESH, PICTURE)
+    source = str((output / piece.source).resolve()) if here else piece.source
+    scene = files.scene_name(piece.source)
+    further = tuple(str(output / word) if word == CAPTIONS else word for word in piece.options)
+    return Cell(name, scene, source, Budget(None, seconds), views=piece.views, further=further)
+
+
+def prepare(
+    sources: set[str], guided: bool, seconds: float, output: Path, tell: Callable[[str], object], launch: Launch
+) -> int:
+    """Make the data of methods that learn from files, where they are not there yet. Returns the exit code."""
+    if MESH in sources and not (output / MESH).exists():
+        import trimesh
+
+        knot = trimesh.creation.torus(0.7, 0.25, 64, 32)
+        (output / MESH).parent.mkdir(parents=True, exist_ok=True)
+        files.write_bytes(output / MESH, knot.export(file_type="ply"), "gallery")
+    if PICTURE in sources and not (output / PICTURE).exists():
+        (output / PICTURE).parent.mkdir(parents=True, exist_ok=True)
+        scene = open_scene(OBJECT)
+        save_picture(output / PICTURE, scene.photograph(0).before(scene.frame.background), "gallery")
+    if guided and not (output / CAPTIONS).exists():
+        tell("A model of captions, for the methods that learn from words")
+        lasting = f"{max(seconds, MIN_CAPTION_SECONDS):g}"
+        code = launch(["train", "captions", "--seconds", lasting, "--output", str(output / CAPTIONS)], output / LOG)
+        if code in STOP_CODES:
+            return code
+        if code:
+            raise LumigraphError(f"the model of captions could not be trained: {reason(output / LOG, code)}")
+    return 0
+
+
+def write_gallery(cells: Sequence[Cell], output: Path) -> None:
+    """The page of what these cells have measured, whatever else the output holds."""
+    rows = read_rows(output)
+    found = {cell.method: rows[f"runs/{cell.name}"] for cell in cells if f"runs/{cell.name}" in rows}
+    body = "<header><h1>Gallery</h1><p>Every method on the smallest data that it is meant for</p></header>"
+    for title, section in SECTIONS.items():
+        if cards := "".join(card(name, piece, found[name], output) for name, piece in section.items() if name in found):
+            body += f"<section><h2>{escape(title)}</h2><div class='gallery'>{cards}</div></section>"
+    trained = sorted({row["trained_on"] for row in found.values() if not row["failed"]})
+    files.write_bytes(output / PAGE, page("Gallery", body, " · ".join(trained)), "gallery")
+
+
+def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
+    """A method's picture, idea and figures."""
+    lines = [f"<b>{escape(name)}</b>", escape(methods.summary(name)), escape(piece.idea)]
+    picture = ""
+    if row["failed"]:
+        lines.append(f"failed: {escape(row['failed'])}")
+    else:
+        score = scores_of(row)[:1]
+        spent = f"{row['training_seconds']:.0f} s, {size(row['model_bytes'])}"
+        lines.append(" · ".join([*map(str, score), spent]))
+        if path := picture_of(row, output):
+            picture = f"<img src='{jpeg(path)}' alt='{escape(name)}'>"
+    if piece.known:
+        lines.append(f"published: {escape(piece.known)}")
+    text = "".join(f"<p>{line}</p>" for line in lines)
+    return f"<figure>{picture}<figcaption>{text}<code>{escape(row['command'])}</code></figcaption></figure>"
+
+
+def picture_of(row: Row, output: Path) -> Path | None:
+    """A held-out view as the evaluation kept it, else the latest preview of training."""
+    run = output / row["run"]
+    if "shown" in row and (path := run / "eval" / f"{file_name(row['shown']['name'])}.png").exists():
+        return path
+    previews = Run(run).previews()
+    return previews[max(previews)] if previews else None

@@ -1,0 +1,45 @@
+"""The gallery: a place for every method, and the page of one."""
+
+from __future__ import annotations
+
+import pytest
+from budgets import budget
+from test_benchmark import Here
+
+from lumigraph import methods
+from lumigraph.benchmark import gallery as room
+from lumigraph.errors import LumigraphError
+
+pytestmark = budget("runs", 4)
+
+
+def test_every_method_has_a_place():
+    own = {name for name in methods.available() if methods.find(name).__module__.startswith("lumigraph.")}
+    assert own == set(room.SHOWPIECES)
+
+
+def test_a_page_has_picture_idea_and_figures(ball_folder, tmp_path, monkeypatch):
+    piece = room.Showpiece(str(ball_folder), "Voxels & colours.", "99 dB, nowhere")
+    monkeypatch.setattr(room, "SECTIONS", {"Grids": {"voxel-grid": piece}})
+    monkeypatch.setattr(room, "SHOWPIECES", {"voxel-grid": piece})
+    here = Here()
+    assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=here) == 0
+    page = (tmp_path / "out" / "gallery.html").read_text()
+    for part in ("<h2>Grids</h2>", "Voxels &amp; colours.", "PSNR", "published: 99 dB, nowhere", "data:image/jpeg"):
+        assert part in page, part
+    again = Here()
+    assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=again) == 0 and again.seen == []
+
+
+def test_a_cell_that_fails_says_why(tmp_path, monkeypatch):
+    piece = room.Showpiece(str(tmp_path / "nowhere"), "")
+    monkeypatch.setattr(room, "SECTIONS", {"Grids": {"voxel-grid": piece}})
+    monkeypatch.setattr(room, "SHOWPIECES", {"voxel-grid": piece})
+    assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=Here()) == 0
+    assert "failed: " in (tmp_path / "out" / "gallery.html").read_text()
+
+
+def test_a_method_without_a_place_is_named(tmp_path):
+    with pytest.raises(LumigraphError, match="voxel-grid has no place in the gallery"):
+        room.gallery(["voxel-grid"], 1.0, tmp_path)
+    assert not list(tmp_path.iterdir())
