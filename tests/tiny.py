@@ -30,8 +30,9 @@ TRACKS = tuple(
     BoxTrack(name, "piece", size, (0.0,), (place,), ((1.0, 0.0, 0.0, 0.0),)) for name, size, place in (HALF, QUARTER)
 )
 # Two bones through the ball, of which the upper one bends, for methods of bodies.
-REST = BonePose(((0.0, 0.0, -0.4), (0.0, 0.0, 0.0)), ((1.0, 0.0, 0.0, 0.0),) * 2)
-SKELETON = Skeleton(("lower", "upper"), (-1, 0), REST, (0.0,), (REST,))
+JOINTS, STRAIGHT = ((0.0, 0.0, -0.4), (0.0, 0.0, 0.0)), (1.0, 0.0, 0.0, 0.0)
+REST, POSE = BonePose(JOINTS, (STRAIGHT, (0.98, 0.2, 0.0, 0.0))), BonePose(JOINTS, (STRAIGHT,) * 2)
+SKELETON = Skeleton(("lower", "upper"), (-1, 0), REST, (0.0,), (POSE,))
 
 # What a user would do by putting a file into lumigraph/methods/.
 if (folder := str(Path(__file__).parent / "methods")) not in lumigraph.methods.__path__:

@@ -87,7 +87,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
         adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
         c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, refine=refine, adaptive=adaptive)
-        return replace(c, weights=WeightNumbers(8, 0, 1e-2, 0.2))
+        return replace(c, weights=WeightNumbers(8, 0, 1e-2, 0.5), bones=BoneNumbers("table", pose_lr=1e-3))
 
     def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
         """Round Gaussians about the bones at rest, in random colours."""

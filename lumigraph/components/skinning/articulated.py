@@ -7,7 +7,7 @@ from typing import Any
 from ...camera import Camera
 from ...method import Method
 from ...method.controls import Value
-from .bone_motion import CAPTURED, BoneMotion, clip_of
+from .bone_motion import AT_REST, CAPTURED, BoneMotion, clip_of
 
 
 class Articulated(Method):
@@ -26,6 +26,6 @@ class Articulated(Method):
         """The same in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError
         for a file that holds none of this character."""
         told = super().given(*evidence, **controls)
-        if (path := str(controls.get("pose", CAPTURED))) != CAPTURED:
+        if (path := str(controls.get("pose", CAPTURED))) not in (CAPTURED, AT_REST):
             clip_of(path, self.frame)
         return told

@@ -23,7 +23,7 @@ from ...method.controls import Control, moment
 from ..training.pose_refinement import PoseAdam
 from ..training.schedules import falling
 
-CAPTURED = "captured"  # value of the control `pose` for the bones of the capture
+CAPTURED, AT_REST = "captured", "rest"  # values of the control `pose` for bones of the capture, and for those at rest
 FALL = 0.05  # of the rate of corrections that is left at the end of the budget
 MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
 MIN_ANGLE = 1e-8  # radians, squared, against division by zero
@@ -123,6 +123,11 @@ class BoneMotion(Part):
         """The same under the method's settings: of the capture, or of a user's poses."""
         if (path := str(method.settings.get("pose", CAPTURED))) == CAPTURED:
             return self.local(times)
+        if path == AT_REST:
+            home = rigid_inverse(self.home)
+            local = local_of(self.skeleton.parents, home).expand(len(times), -1, -1, -1)
+            back = self.back * self.back.new_tensor([1, -1, -1, -1])  # the inverse of a unit quaternion
+            return back.expand(len(times), -1, -1), local[..., 3]
         clip = clip_of(path, self.frame)
         first, last = self.frame.times or (0.0, 1.0)
         share = (times.cpu() - first) / (last - first)
@@ -157,8 +162,8 @@ class BoneMotion(Part):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        about = "Bones that are shown: those of the capture, or of a file of poses; `time` then plays that file."
-        pose = Control("pose", CAPTURED, choices=(CAPTURED,), files=SUFFIXES, about=about)
+        about = "Bones that are shown: of the capture, at rest, or of a file of poses, which `time` then plays."
+        pose = Control("pose", CAPTURED, choices=(CAPTURED, AT_REST), files=SUFFIXES, about=about)
         return (*((moment(self.frame.times),) if self.frame.times else ()), pose)
 
 

@@ -59,7 +59,11 @@ class WeightVolume(Part):
         self.code: nn.Parameter | None = None
         if numbers.weight_code:
             levels = max(1, (cells - 1).bit_length())
-            widths = [numbers.weight_code, *(max(self.bones + 1, 512 >> k) for k in range(levels - 1)), self.bones + 1]
+            widths = [
+                numbers.weight_code,
+                *(max(self.bones + 1, numbers.weight_code >> k) for k in range(levels - 1)),
+                self.bones + 1,
+            ]
             self.code = nn.Parameter(torch.randn(1, widths[0], *[FIRST_CELLS] * 3))
             layers: list[nn.Module] = []
             for a, b in zip(widths, widths[1:], strict=False):
