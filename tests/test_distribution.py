@@ -61,12 +61,12 @@ def blobs(count: int, seed: int) -> torch.Tensor:
 
 def test_the_shipped_network_notices_what_is_wrong():
     """Blur, noise, paler colours and fewer modes each cost more the stronger they are, and another draw costs least."""
-    network, real = RandomFeatures(), blobs(150, 0)
+    network, real = RandomFeatures(), blobs(200, 0)
 
     def fid(made: torch.Tensor) -> float:
         return distances(real, made, network)[0].value
 
-    another = blobs(150, 1)
+    another = blobs(200, 1)
     floor = fid(another)
 
     def blur(x: torch.Tensor, n: int) -> torch.Tensor:
@@ -76,9 +76,9 @@ def test_the_shipped_network_notices_what_is_wrong():
     noise = torch.randn(another.shape, generator=torch.Generator().manual_seed(2))
     for worse in (
         [blur(another, 8), blur(another, 16)],
-        [another + 0.05 * noise, another + 0.1 * noise],
+        [another + 0.1 * noise, another + 0.2 * noise],
         [0.5 + 0.8 * (another - 0.5), 0.5 + 0.5 * (another - 0.5)],
-        [another[:20].repeat(8, 1, 1, 1)[:150], another[:3].repeat(50, 1, 1, 1)],
+        [another[:20].repeat(10, 1, 1, 1), another[:4].repeat(50, 1, 1, 1)],
     ):
         mild, strong = (fid(x.clamp(0, 1)) for x in worse)
         assert floor < mild < strong

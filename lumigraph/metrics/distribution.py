@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,12 +21,13 @@ from ..errors import LumigraphError
 from . import Score
 from .lpips import read_weights
 
-Pictures = Float[Tensor, "picture height width 3"]
-Features = Float[Tensor, "picture feature"]
+Pictures = Float[Tensor, "_ _ _ 3"]
+Features = Float[Tensor, "_ feature"]
 MIN_PICTURES = 2  # in a set
 BATCH = 32  # pictures that go through a network together
 
 
+@runtime_checkable
 class FeatureNetwork(Protocol):
     """Features of pictures. name: as scores state it; definition: as a protocol states it"""
 
@@ -97,7 +98,8 @@ RANDOM_SIZE = 64  # pixels across
 
 class RandomFeatures:
     """Means and deviations over the picture of the rectified outputs of four convolutions, each at half the size of the
-    one before, with weights drawn once (He 2015) from NumPy's frozen generator.
+    one before, with weights drawn once (He 2015) from NumPy's frozen generator. Every second filter has no mean, so it
+    sees edges and noise alone.
 
     It was trained on nothing, so it favours no method and no data, and is the same ruler on every machine. It measures
     colours, edges and textures at four scales; it knows no objects. Figures of different sizes of sets, and those of
@@ -114,6 +116,7 @@ class RandomFeatures:
         self.weights, inputs = list[Tensor](), 3
         for width in RANDOM_WIDTHS:
             drawn = frozen.standard_normal((width, inputs, 3, 3)) * np.sqrt(2 / (9 * inputs))
+            drawn[1::2] -= drawn[1::2].mean((2, 3), keepdims=True)
             self.weights.append(torch.from_numpy(drawn).float())
             inputs = width
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ...components.training.adversarial import EqualisedLinear
 from ...kernels import factor_grid
 from ...kernels.factor_grid import Factors
-from .networks import Decoder, Styles, SynthesisNetwork, clamped
+from .networks import PlaneDecoder, Styles, SynthesisNetwork, clamped
 
 Made = Float[Tensor, "picture row number"]
 Points = Float[Tensor, "point 3"]
@@ -51,7 +51,7 @@ class PlaneField(MadeField):
         self.size = 4 << (len(widths) - 1)
         self.channels = channels
         self.synthesis = SynthesisNetwork(3 * channels, widths, style)
-        self.decoder = Decoder(channels, decoder, features)
+        self.decoder = PlaneDecoder(channels, decoder, features)
         self.styles = self.synthesis.styles
         self.register_buffer("ones", torch.ones(3 * self.size, channels), persistent=False)
 

@@ -148,7 +148,7 @@ class SuperResolution(nn.Module):
         return 0.5 + 0.5 * picture
 
 
-class Decoder(nn.Module):
+class PlaneDecoder(nn.Module):
     """Density before its activation, and features in [0, 1], from what the planes hold at a point (section 4.1)."""
 
     def __init__(self, inputs: int, width: int, features: int):
