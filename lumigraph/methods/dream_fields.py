@@ -18,7 +18,7 @@ from ..components.guidance import (
     DistillationNumbers,
     Guidance,
     GuidanceNumbers,
-    Views,
+    PromptedViews,
 )
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
@@ -109,7 +109,7 @@ class DreamFields(FieldMethod):
         return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
 
-def rays_of(views: Views) -> Rays:
+def rays_of(views: PromptedViews) -> Rays:
     """Rays of all pixels, view by view."""
     pixels = views.camera[0].pixels()
     index = torch.arange(len(views), device=pixels.device).repeat_interleave(len(pixels))

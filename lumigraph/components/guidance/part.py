@@ -15,7 +15,15 @@ from ...errors import LumigraphError
 from ...files.ranges import NonNegative, Pixels, PositiveShare, Share, Steps, between
 from ...method import Part
 from .guides import DistillationNumbers, Guide, open_guide
-from .views import Views, before_backgrounds, camera_around, cropped, degrees_between, named_view, opacity_target
+from .views import (
+    PromptedViews,
+    before_backgrounds,
+    camera_around,
+    cropped,
+    degrees_between,
+    named_view,
+    opacity_target,
+)
 
 Degrees = Annotated[float, between(-90, 90)]
 
@@ -68,7 +76,7 @@ class Guidance(Part):
         memo[id(self)] = copied
         return copied
 
-    def views(self, words: Words, generator: torch.Generator) -> Views:
+    def views(self, words: Words, generator: torch.Generator) -> PromptedViews:
         """Random cameras around the scene, with the prompts that name them. Raises LumigraphError without guidance."""
         n = self.numbers
         if words.guidance is None:
@@ -83,10 +91,10 @@ class Guidance(Part):
         names = [named_view(a, e) for a, e in zip(azimuth.tolist(), elevation.tolist(), strict=True)]
         prompts = tuple(f"{words.prompt}, {name}" if naming else words.prompt for name in names)
         camera = camera_around(azimuth, elevation, n.camera_distance, n.focal, n.render_width, self.origin)
-        return Views(camera, prompts)
+        return PromptedViews(camera, prompts)
 
     def terms(
-        self, rgba: Float[Tensor, "view 4 height width"], views: Views, step: int, generator: torch.Generator
+        self, rgba: Float[Tensor, "view 4 height width"], views: PromptedViews, step: int, generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Guidance and transmittance prior of premultiplied views (Jain 2022, eq. 6).
 
