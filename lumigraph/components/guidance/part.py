@@ -50,9 +50,18 @@ class GuidanceNumbers:
 
 # Views for a plain CPU, in which a small model recognises shapes, and for tests.
 CPU_GUIDANCE = GuidanceNumbers(
-    render_width=40, crop_share=0.9, views_per_step=2, crops_per_view=6, focal=1.9, opacity_steps=100
+    render_width=40,
+    crop_share=0.9,
+    views_per_step=1,
+    crops_per_view=6,
+    focal=1.9,
+    final_opacity=0.06,
+    opacity_steps=100,
+    origin_decay=0.99,
 )
-TINY_GUIDANCE = GuidanceNumbers(render_width=16, views_per_step=1, crops_per_view=2, opacity_steps=10)
+TINY_GUIDANCE = GuidanceNumbers(
+    render_width=16, views_per_step=1, crops_per_view=2, transmittance_weight=2.0, opacity_steps=1
+)
 
 
 class Guidance(Part):
