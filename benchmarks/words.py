@@ -40,7 +40,7 @@ from lumigraph.training.captions import TRACED_PIXELS, augmented
 CPU = torch.device("cpu")
 VIEWS, ELEVATION, SHOWN = 8, 25.0, 4  # on a ring that training does not draw, degrees
 CLASSIFIER_SEED = 1000  # of renderings that no model of `train captions` has seen
-PIXELS = 40  # a side of the classifier's pictures
+PIXELS = 32  # a side of the classifier's pictures
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Options:
     captions: int = 20
     steps: int = 300
     without_prior: bool = True  # also without the transmittance prior
-    classifier_pictures: int = 4000
-    classifier_steps: int = 800
+    classifier_pictures: int = 2000
+    classifier_steps: int = 500
     size: int = 128  # pixels of the sheet's pictures
     seed: int = 0
     output: Path = Path("words.png")
@@ -65,10 +65,10 @@ def classifier(o: Options) -> nn.Module:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(CLASSIFIER_SEED)
         layers: list[nn.Module] = []
-        for inputs, outputs in ((3, 24), (24, 48), (48, 96), (96, 128)):
+        for inputs, outputs in ((3, 16), (16, 32), (32, 64), (64, 96)):
             layers += [nn.Conv2d(inputs, outputs, 3, 2 if inputs > 3 else 1, 1, bias=False), nn.BatchNorm2d(outputs)]
             layers += [nn.ReLU()]
-        network = nn.Sequential(*layers, nn.AdaptiveMaxPool2d(1), nn.Flatten(), nn.Linear(128, len(captions.THINGS)))
+        network = nn.Sequential(*layers, nn.AdaptiveMaxPool2d(1), nn.Flatten(), nn.Linear(96, len(captions.THINGS)))
     generator = torch.Generator().manual_seed(CLASSIFIER_SEED)
     optimizer = torch.optim.AdamW(network.parameters(), 2e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, o.classifier_steps)
@@ -87,7 +87,9 @@ def named(pictures: Tensor, network: nn.Module) -> str:
     with torch.no_grad():
         logits = network(sized(pictures, PIXELS)).mean(0)
     best = {captions.THINGS[i] for i in logits.topk(2).indices.tolist()}
-    return next((captions.caption(pair) for pair in captions.pairs() if set(pair) == best), " and ".join(map(str, best)))
+    return next(
+        (captions.caption(pair) for pair in captions.pairs() if set(pair) == best), " and ".join(map(str, best))
+    )
 
 
 def retrieved(pictures: Tensor, guide: ClipGuide) -> str:

@@ -74,7 +74,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
     # google-research/dreamfields, config_base.py and config_hq.py; Poole 2022, section 3, from memory
     "dream-fields": WORDS
     | {
-        "steps.steps_per_diagonal": 333,  # num_samples 192 over the far and near bounds, 2 sqrt(3)
+        "steps.steps_per_diagonal": 192,  # num_samples, from 4 - sqrt(3) to 4 + sqrt(3)
         "table.sh_bands": 1,  # viewdirs: False
     },
     # dreamgaussian/dreamgaussian, configs/text.yaml. From memory

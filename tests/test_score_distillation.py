@@ -12,9 +12,9 @@ from budgets import budget
 
 from lumigraph.components.guidance.diffusion import DiffusionGuide
 from lumigraph.components.guidance.guides import DistillationNumbers, open_guide
+from lumigraph.datasets.words import Words
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.dream_fields import DreamFields
-from lumigraph.datasets.words import Words
 from lumigraph.training import fit
 
 pytest.importorskip("diffusers")

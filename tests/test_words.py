@@ -1,4 +1,4 @@
-"""Guidance by words: tokens, files of CLIP, random views, the transmittance prior, and captions of procedural scenes."""
+"""Guidance by words: tokens, files of CLIP, random views, the transmittance prior, and captions to learn from."""
 
 from __future__ import annotations
 
@@ -163,7 +163,13 @@ def test_cameras_look_at_the_origin_from_their_angles():
 
 @pytest.mark.parametrize(
     ("azimuth", "elevation", "name"),
-    [(10, 0, "front view"), (350, 20, "front view"), (90, 0, "side view"), (180, 10, "back view"), (0, 80, "overhead view")],
+    [
+        (10, 0, "front view"),
+        (350, 20, "front view"),
+        (90, 0, "side view"),
+        (180, 10, "back view"),
+        (0, 80, "overhead view"),
+    ],
 )
 def test_views_have_names(azimuth, elevation, name):
     assert named_view(azimuth, elevation) == name

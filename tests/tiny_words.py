@@ -92,7 +92,9 @@ def hugging_face(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         for own, other in NAMES.items():
             name = name.replace(own, other) if name.startswith(own) or own.startswith(".") else name
         if "in_proj_" in name:
-            found |= {name.replace("in_proj_", f"{p}_proj."): y.contiguous() for p, y in zip("qkv", x.chunk(3), strict=True)}
+            found |= {
+                name.replace("in_proj_", f"{p}_proj."): y.contiguous() for p, y in zip("qkv", x.chunk(3), strict=True)
+            }
         else:
             found[name] = x.contiguous()
     return found

@@ -77,13 +77,13 @@ class Eval:
 
 
 def compared(result: dict[str, Any]) -> dict[str, str]:
-    """Compared views with their size and rendering time, or shapes, as text."""
+    """Compared views with their size and rendering time, shapes, or renderings of words, as text."""
     protocol = result["protocol"]
-    what = "views" if "views" in protocol else "shapes"
+    what = next(x for x in ("views", "shapes", "renderings") if x in protocol)
     count, there = protocol[what], protocol["of"]
     some = f"{count} of {protocol['split']}" if count == there else f"{count} of {there} of {protocol['split']}"
     members = f", {protocol['members']} members" if "members" in protocol else ""
-    if what == "shapes":
+    if what != "views":
         return {what: f"{some}{members}"}
     sizes = protocol["resolution"]
     shown = sizes if isinstance(sizes, str) else ", ".join(sizes)

@@ -39,7 +39,7 @@ class WordsEvaluation:
 
     @property
     def compared(self) -> str:
-        return f"{self.protocol['views']} views"
+        return f"{self.protocol['renderings']} renderings"
 
     def to_json(self) -> dict[str, Any]:
         return {"scores": [self.score.to_json()], "protocol": self.protocol, "prompt": self.prompt}
@@ -65,7 +65,8 @@ def evaluate_words(method: Method, words: Words, views: int | None = None) -> Wo
     )
     protocol = {
         "split": "test",
-        "views": count,
+        "renderings": count,
+        "of": count,
         "cameras": "a ring, 15 degrees above the horizon, before the background of the run",
         "judge": str(words.guidance),
     }

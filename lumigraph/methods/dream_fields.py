@@ -18,7 +18,7 @@ from ..components.guidance import (
     DistillationNumbers,
     Guidance,
     GuidanceNumbers,
-    Views,
+    PromptedViews,
 )
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
@@ -80,10 +80,10 @@ class DreamFields(FieldMethod):
         """Tiny tables, networks and views."""
         return Config(**TINY_HASH, guidance=TINY_GUIDANCE, hidden_width=16, learning_rate=2e-2)
 
-    def batch(self, data: Words, generator: torch.Generator) -> Views:
+    def batch(self, data: Any, generator: torch.Generator) -> Any:
         return self.guidance.views(data, generator)
 
-    def loss(self, batch: Views, step: int) -> dict[str, Tensor]:
+    def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         """Guidance of random views before random backgrounds, and the transmittance prior (Jain 2022, eq. 6)."""
         generator, rays = self.random(step), rays_of(batch)
         (samples,), terms = self.learn(rays, generator)
@@ -109,7 +109,7 @@ class DreamFields(FieldMethod):
         return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
 
-def rays_of(views: Views) -> Rays:
+def rays_of(views: PromptedViews) -> Rays:
     """Rays of all pixels, view by view."""
     pixels = views.camera[0].pixels()
     index = torch.arange(len(views), device=pixels.device).repeat_interleave(len(pixels))

@@ -20,7 +20,7 @@ from ..components.guidance import (
     DistillationNumbers,
     Guidance,
     GuidanceNumbers,
-    Views,
+    PromptedViews,
 )
 from ..datasets.scene import Frame
 from ..datasets.words import Words
@@ -75,10 +75,10 @@ class DreamSplats(Method):
         """A few Gaussians and tiny views."""
         return replace(cls.cpu_preset(), guidance=TINY_GUIDANCE, initial_gaussians=100)
 
-    def batch(self, data: Words, generator: torch.Generator) -> Views:
+    def batch(self, data: Words, generator: torch.Generator) -> PromptedViews:
         return self.guidance.views(data, generator)
 
-    def loss(self, batch: Views, step: int) -> dict[str, Tensor]:
+    def loss(self, batch: PromptedViews, step: int) -> dict[str, Tensor]:
         """Guidance of random views before random backgrounds, and the transmittance prior (Jain 2022, eq. 6)."""
         cloud = self.cloud.gaussians()
         seen = [splat(cloud, view_of(batch.camera[i], self.frame.near)) for i in range(len(batch))]

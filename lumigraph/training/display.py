@@ -18,6 +18,7 @@ from torch import Tensor
 from ..budget import Budget, lasting
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
+from ..datasets.words import Words
 from ..method import Lesson, Method
 from ..method.capabilities import HasGaussians, can
 from ..system import threads
@@ -188,6 +189,8 @@ def learnt_from(data: Dataset) -> str:
     """Number of training and held-out inputs; size of photographs now and in the source."""
     held_out = len(data.splits.get("test", ()))
     aside = f", {held_out:,} held out"
+    if isinstance(data, Words):
+        return f"Learning from {data.source}"
     if not isinstance(data, Scene):
         return f"Learning from {len(data.splits['train']):,} of {data.kind}{aside}"
     count = len(data.splits["train"])

@@ -7,4 +7,4 @@ from .part import CPU_GUIDANCE as CPU_GUIDANCE
 from .part import TINY_GUIDANCE as TINY_GUIDANCE
 from .part import Guidance as Guidance
 from .part import GuidanceNumbers as GuidanceNumbers
-from .views import Views as Views
+from .views import PromptedViews as PromptedViews

@@ -94,7 +94,7 @@ class Attention(nn.Module):
         return self.out_proj(attended(q, k, v, self.heads, causal))
 
 
-class Block(nn.Module):
+class AttentionBlock(nn.Module):
     """Attention and perceptron, each normalised before and added."""
 
     def __init__(self, s: TransformerSizes):
@@ -115,7 +115,7 @@ class Block(nn.Module):
 class Transformer(nn.Module):
     def __init__(self, s: TransformerSizes):
         super().__init__()
-        self.resblocks = nn.ModuleList([Block(s) for _ in range(s.layers)])
+        self.resblocks = nn.ModuleList([AttentionBlock(s) for _ in range(s.layers)])
 
     def forward(self, x: Float[Tensor, "batch token width"], causal: bool) -> Float[Tensor, "batch token width"]:
         for block in self.resblocks:

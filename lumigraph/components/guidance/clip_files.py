@@ -212,11 +212,12 @@ def read_tokenizer(folder: Path) -> Tokenizer:
         vocabulary = files.read_json(folder / VOCABULARY, dict[str, int])
         lines = files.read_bytes(folder / MERGES).decode("utf-8", "replace").splitlines()
         pairs = [tuple(line.split(" ")) for line in lines if line != MERGES_VERSION]
-        merges = [pair for pair in pairs if len(pair) == 2]
+        merges = [(pair[0], pair[1]) for pair in pairs if len(pair) == 2]
     elif (folder / PUBLISHED).is_file():
         with files.explained(folder / PUBLISHED):
             lines = gzip.decompress(files.read_bytes(folder / PUBLISHED)).decode("utf-8").split("\n")
-        merges = [tuple(line.split()) for line in lines[1 : MAX_MERGES + 1]]
+        pairs = [tuple(line.split()) for line in lines[1 : MAX_MERGES + 1]]
+        merges = [(pair[0], pair[1]) for pair in pairs if len(pair) == 2]
         letters = sorted(byte_names(), key=lambda letter: (ord(letter) > 255, ord(letter)))
         names = [*letters, *(x + WORD_END for x in letters), *map("".join, merges), BEGIN, END]
         vocabulary = {name: number for number, name in enumerate(names)}
@@ -224,7 +225,7 @@ def read_tokenizer(folder: Path) -> Tokenizer:
         raise LumigraphError(f"{folder} holds no vocabulary; put {VOCABULARY} and {MERGES}, or {PUBLISHED}, there")
     if BEGIN not in vocabulary or END not in vocabulary:
         raise LumigraphError(f"{folder / VOCABULARY} has no {BEGIN} and {END}; it is not the vocabulary of a CLIP")
-    return Tokenizer(vocabulary, merges)  # type: ignore[arg-type]
+    return Tokenizer(vocabulary, merges)
 
 
 def write_clip(folder: Path, network: Clip, tokenizer: Tokenizer) -> None:

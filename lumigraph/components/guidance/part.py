@@ -15,7 +15,15 @@ from ...errors import LumigraphError
 from ...files.ranges import NonNegative, Pixels, PositiveShare, Share, Steps, between
 from ...method import Part
 from .guides import DistillationNumbers, Guide, open_guide
-from .views import Views, before_backgrounds, camera_around, cropped, degrees_between, named_view, opacity_target
+from .views import (
+    PromptedViews,
+    before_backgrounds,
+    camera_around,
+    cropped,
+    degrees_between,
+    named_view,
+    opacity_target,
+)
 
 Degrees = Annotated[float, between(-90, 90)]
 
@@ -42,9 +50,18 @@ class GuidanceNumbers:
 
 # Views for a plain CPU, in which a small model recognises shapes, and for tests.
 CPU_GUIDANCE = GuidanceNumbers(
-    render_width=40, crop_share=0.9, views_per_step=2, crops_per_view=6, focal=1.9, opacity_steps=100
+    render_width=40,
+    crop_share=0.9,
+    views_per_step=1,
+    crops_per_view=6,
+    focal=1.9,
+    final_opacity=0.06,
+    opacity_steps=100,
+    origin_decay=0.99,
 )
-TINY_GUIDANCE = GuidanceNumbers(render_width=16, views_per_step=1, crops_per_view=2, opacity_steps=10)
+TINY_GUIDANCE = GuidanceNumbers(
+    render_width=16, views_per_step=1, crops_per_view=2, transmittance_weight=2.0, opacity_steps=1
+)
 
 
 class Guidance(Part):
@@ -68,7 +85,7 @@ class Guidance(Part):
         memo[id(self)] = copied
         return copied
 
-    def views(self, words: Words, generator: torch.Generator) -> Views:
+    def views(self, words: Words, generator: torch.Generator) -> PromptedViews:
         """Random cameras around the scene, with the prompts that name them. Raises LumigraphError without guidance."""
         n = self.numbers
         if words.guidance is None:
@@ -83,10 +100,10 @@ class Guidance(Part):
         names = [named_view(a, e) for a, e in zip(azimuth.tolist(), elevation.tolist(), strict=True)]
         prompts = tuple(f"{words.prompt}, {name}" if naming else words.prompt for name in names)
         camera = camera_around(azimuth, elevation, n.camera_distance, n.focal, n.render_width, self.origin)
-        return Views(camera, prompts)
+        return PromptedViews(camera, prompts)
 
     def terms(
-        self, rgba: Float[Tensor, "view 4 height width"], views: Views, step: int, generator: torch.Generator
+        self, rgba: Float[Tensor, "view 4 height width"], views: PromptedViews, step: int, generator: torch.Generator
     ) -> dict[str, Tensor]:
         """Guidance and transmittance prior of premultiplied views (Jain 2022, eq. 6).
 

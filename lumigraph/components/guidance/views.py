@@ -24,7 +24,7 @@ FRONT_DEGREES, OVERHEAD_DEGREES = 60.0, 60.0  # half-width of front and back vie
 
 
 @dataclass(frozen=True)
-class Views:
+class PromptedViews:
     """Cameras around a scene, and the prompt of each."""
 
     unit: ClassVar[str] = "views"
