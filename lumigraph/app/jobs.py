@@ -34,7 +34,7 @@ PROGRAM = (sys.executable, "-m", "lumigraph")
 
 
 @dataclass
-class Task:
+class QueuedJob:
     """A job of an item. share: its file's name; None for the making of a run"""
 
     item: Item
@@ -64,7 +64,7 @@ class Runner:
 
     def __init__(self, root: Path, program: Sequence[str] = PROGRAM):
         self.root, self.program = root, list(program)
-        self.current: Task | None = None
+        self.current: QueuedJob | None = None
         self._wake, self._ended = threading.Event(), False
         # A child ends with the thread that started it, so this one lives as long as the app.
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
@@ -84,7 +84,7 @@ class Runner:
     def wake(self) -> None:
         self._wake.set()
 
-    def queue(self) -> list[Task]:
+    def queue(self) -> list[QueuedJob]:
         """Jobs that run or wait, in order."""
         tasks = []
         for item in items(self.root):
@@ -96,10 +96,10 @@ class Runner:
                 jobs += [(None, record.make)] if record.make else []
                 for name, job in jobs:
                     if job.state in ("queued", "running"):
-                        tasks.append((job.state != "running", job.asked, Task(item, name)))
+                        tasks.append((job.state != "running", job.asked, QueuedJob(item, name)))
         return [task for _, _, task in sorted(tasks, key=lambda one: one[:2])]
 
-    def stop(self, task: Task, state: JobState) -> None:
+    def stop(self, task: QueuedJob, state: JobState) -> None:
         """Pause or stop a job; its command saves and ends. Returns at once."""
         task.set(state=state)
         running = self.current
@@ -135,7 +135,7 @@ class Runner:
             finally:
                 self.current = None
 
-    def _fail(self, task: Task, fault: str) -> None:
+    def _fail(self, task: QueuedJob, fault: str) -> None:
         try:
             task.set(state="failed", fault=fault, process=0)
         except (LumigraphError, OSError):
@@ -150,7 +150,7 @@ class Runner:
                     return
                 time.sleep(POLL_SECONDS)
 
-    def _run(self, task: Task) -> None:
+    def _run(self, task: QueuedJob) -> None:
         """The commands of a job, until it is done, was paused, or the app ends."""
         while not self._ended and (job := task.job) and job.state in ("queued", "running"):
             task.set(state="running", fault="", begun=job.begun or time.time())
@@ -166,7 +166,7 @@ class Runner:
             else:
                 task.set(state="done", process=0)
 
-    def _command(self, task: Task) -> tuple[list[str], int | None]:
+    def _command(self, task: QueuedJob) -> tuple[list[str], int | None]:
         """Words of the next command, and the port of its viewer."""
         job = task.job
         if isinstance(job, ShareJob):
@@ -181,7 +181,7 @@ class Runner:
         port = free_port(HOST, 0)
         return train_command(task.item, job, port or 0), port
 
-    def _call(self, task: Task, words: list[str]) -> int:
+    def _call(self, task: QueuedJob, words: list[str]) -> int:
         """Run a command with its messages in the log. Returns its exit code."""
         with open(task.item.path / LOG_FILE, "wb") as log:
             log.write(f"$ lumigraph {' '.join(words)}\n".encode())

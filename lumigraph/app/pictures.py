@@ -52,7 +52,7 @@ def is_film(path: Path) -> bool:
 
 
 def input_of(item: Item) -> Path:
-    """What `capture` is to be given: the folder of photographs, or the only video in it.
+    """Input of `capture`: the folder of photographs, or the only video in it.
 
     Raises LumigraphError if there is nothing, or a video among other things.
     """

@@ -183,15 +183,16 @@ def _model(place: Path, modified: int) -> dict[str, Any]:
 def framed(
     poses: Float[np.ndarray, "camera 3 4"], points: Float[np.ndarray, "point 3"]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]:
-    """Rotation that turns the pictures' mean up to +z, the middle of the points, and the extent of the cameras."""
+    """Rotation that turns the pictures' mean up to +z; middle and half-size of the cameras and most points."""
     up = -poses[:, :, 1].mean(0)
     up /= np.linalg.norm(up) + 1e-9
     across = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
     across /= np.linalg.norm(across)
     turn = np.stack([across, np.cross(up, across), up])
-    middle = np.median(points, axis=0) if len(points) else poses[:, :, 3].mean(0)
-    away = np.linalg.norm(poses[:, :, 3] - middle, axis=1)
-    return turn, middle, float(np.median(away)) or 1.0
+    most = np.quantile(points, [0.05, 0.95], axis=0) if len(points) else np.zeros((0, 3))
+    corners = np.concatenate([poses[:, :, 3], most])
+    middle = (corners.min(0) + corners.max(0)) / 2
+    return turn, middle, float(np.linalg.norm(corners - middle, axis=1).max()) or 1.0
 
 
 # Training

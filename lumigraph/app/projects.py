@@ -53,7 +53,7 @@ class ProjectRecord:
 
 @dataclass(frozen=True)
 class TrashRecord:
-    """Where a deleted item was, relative to the folder, and its title."""
+    """Place of a deleted item, relative to the folder, and its title."""
 
     origin: str
     title: str

@@ -18,7 +18,7 @@ MAX_MESSAGES = 30  # lines of a log on the page
 
 
 def card(item: Item) -> dict[str, Any]:
-    """What the home page shows of an item."""
+    """Card of an item on the home page."""
     try:
         record = item.record
         runs = [path for path in item.runs if path.is_dir()]

@@ -229,7 +229,7 @@ class App:
         job = read_job(item).make
         if job is None or job.state not in ("queued", "running", "paused"):
             raise LumigraphError("Nothing is being made here any more")
-        self.runner.stop(jobs.Task(item, None), state)
+        self.runner.stop(jobs.QueuedJob(item, None), state)
         return self.detail(item)
 
     def more(self, item: Item, body: MoreBody) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import { html, useEffect, useRef } from "./preact.js";
 import { counted } from "./common.js";
 
-const FRUSTUM = 0.11; // size of a camera, in distances of the cameras from the scene
+const FRUSTUM = 0.09; // size of a camera, in half-sizes of the scene
 const CORNERS = [[-1, -0.7], [1, -0.7], [1, 0.7], [-1, 0.7]];
 
 export function Cameras({ model }) {
@@ -63,7 +63,7 @@ function paint(canvas, model, state, now) {
   context.clearRect(0, 0, width, height);
   const [ct, st, cp, sp] = [Math.cos(state.turn), Math.sin(state.turn), Math.cos(state.tilt), Math.sin(state.tilt)];
   const far = 3.6;
-  const focal = 0.98 * Math.min(width, height * 1.25) * state.zoom;
+  const focal = 1.5 * Math.min(width, height) * state.zoom;
   const project = (x, y, z) => {
     const across = ct * x + st * y;
     const away = -st * x + ct * y;
@@ -71,7 +71,7 @@ function paint(canvas, model, state, now) {
     if (depth < 0.2) return null;
     return [width / 2 + (focal * across) / depth, height / 2 - (focal * (sp * away + cp * z)) / depth, depth];
   };
-  const size = Math.max(1.5, 1.6 * ratio);
+  const size = 2.2 * ratio;
   for (const [x, y, z, red, green, blue] of model.points) {
     const at = project(x, y, z);
     if (!at) continue;
