@@ -267,9 +267,9 @@ def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
     if row["failed"]:
         lines.append(f"failed: {escape(row['failed'])}")
     else:
-        score = scores_of(row)[:1]
+        score = [f"{one.name} {one}" for one in scores_of(row)[:1]]
         spent = f"{row['training_seconds']:.0f} s, {size(row['model_bytes'])}"
-        lines.append(" · ".join([*map(str, score), spent]))
+        lines.append(" · ".join([*score, spent]))
         if path := picture_of(row, output):
             picture = f"<img src='{jpeg(path)}' alt='{escape(name)}'>"
     if piece.known:
