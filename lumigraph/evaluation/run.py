@@ -14,8 +14,8 @@ from ..datasets.collection import Collection
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..datasets.shapes import Shapes
-from ..datasets.world import BlockWorld
 from ..datasets.words import Words
+from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files import claim, scene_name, write_json
