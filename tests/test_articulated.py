@@ -67,7 +67,7 @@ def test_weights_begin_at_the_nearest_bone_and_sum_to_one():
     torch.testing.assert_close(weights.sum(1), torch.ones(3))
     assert weights[0, 0] > 0.95 and weights[1, 1] > 0.95 and 0.2 < weights[2, 0] < 0.8
     coded = WeightVolume(frame(), replace(SHARP, weight_code=4))
-    torch.testing.assert_close(coded.weights(), volume.weights())
+    torch.testing.assert_close(coded.weights(), volume.weights(), atol=1e-3, rtol=1e-2)
     away = distance(torch.tensor([[1.0, 0, 0.5], [0, 0, 2.0]]), torch.zeros(1, 3), torch.tensor([[0, 0, 1.0]]))
     torch.testing.assert_close(away, torch.tensor([1.0, 1.0]))
 
