@@ -12,11 +12,14 @@ from bodies import BEND, bent, frame, skeleton
 from budgets import budget
 
 from lumigraph.components.skinning.bone_motion import BoneMotion, BoneNumbers, exponential, rotation_vectors
+from lumigraph.components.skinning.contact import bodies_of, contact_map, gaps
 from lumigraph.components.skinning.skinned_cloud import skinned
 from lumigraph.components.skinning.weight_volume import WeightNumbers, WeightVolume, distance
 from lumigraph.datasets.skeleton import rigid_inverse, rigid_product
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange.bones import write_bones
+from lumigraph.figures import ramp
+from lumigraph.gaussians.cloud import BAND_0
 from lumigraph.geometry import rotated, to_matrix
 from lumigraph.methods.articulated_splatting import ArticulatedSplatting
 from lumigraph.methods.humannerf import HumanNeRF
@@ -64,7 +67,7 @@ def test_weights_begin_at_the_nearest_bone_and_sum_to_one():
     torch.testing.assert_close(weights.sum(1), torch.ones(3))
     assert weights[0, 0] > 0.95 and weights[1, 1] > 0.95 and 0.2 < weights[2, 0] < 0.8
     coded = WeightVolume(frame(), replace(SHARP, weight_code=4))
-    torch.testing.assert_close(coded.weights(), volume.weights())
+    torch.testing.assert_close(coded.weights(), volume.weights(), atol=1e-3, rtol=1e-2)
     away = distance(torch.tensor([[1.0, 0, 0.5], [0, 0, 2.0]]), torch.zeros(1, 3), torch.tensor([[0, 0, 1.0]]))
     torch.testing.assert_close(away, torch.tensor([1.0, 1.0]))
 
@@ -157,3 +160,27 @@ def test_a_motion_is_played_in_spans():
         assert len(there) == len(now)
         size = now.log_scales.exp().amax()
         assert torch.cdist(now.means, there.means).amin(1).max() < 0.5 * size
+
+
+def test_contact_is_where_two_bodies_are_close():
+    assert bodies_of((-1, 0, 1, -1, 3, 0)).tolist() == [0, 0, 0, 1, 1, 0]
+    cloud = ArticulatedSplatting(frame(), ArticulatedSplatting.smallest()).cloud.gaussians()[:4]
+    means = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0.5], [0.0, 0.3, 0.0]])
+    opacities = torch.tensor([9.0, 9.0, 9.0, -9.0])  # the last one is not solid
+    cloud = replace(cloud, means=means, log_scales=torch.full((4, 3), 0.1).log(), opacities=opacities)
+    found = gaps(cloud, torch.tensor([0, 0, 1, 1]))
+    torch.testing.assert_close(found, torch.tensor([0.3, 1.25**0.5 - 0.2, 0.3, 0.1]))
+    shown = contact_map(cloud, torch.tensor([0, 0, 1, 1]), 0.35)
+    touching, away = (0.5 + BAND_0 * shown.harmonics[i, 0] for i in (0, 1))
+    torch.testing.assert_close(
+        torch.stack([touching, away]), ramp(torch.tensor([1.0, (3 - (1.25**0.5 - 0.2) / 0.35) / 2]))
+    )
+
+
+def test_a_scene_of_two_bodies_can_show_contact():
+    two = replace(skeleton(), parents=(-1, -1))
+    method = ArticulatedSplatting(replace(frame(), skeleton=two), ArticulatedSplatting.smallest()).eval()
+    camera = tiny.scene().cameras[0]
+    assert {control.name for control in method.controls} >= {"time", "pose", "show"}
+    assert not torch.equal(method.given(show="contact").render(camera).rgb, method.render(camera).rgb)
+    assert set(method.body_of(method.filtered()).tolist()) == {0, 1}

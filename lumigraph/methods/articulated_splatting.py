@@ -48,7 +48,7 @@ class Config:
     transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
     isotropy_weight: NonNegative = 0.01  # weight of long Gaussians, which tear at joints; higher: rounder
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
-    bones: BoneNumbers = BoneNumbers("table", pose_lr=2e-2, pose_from=0.1)
+    bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
     rates: RateNumbers = RateNumbers()
     refine: RefineNumbers = RefineNumbers()

@@ -19,6 +19,7 @@ MIN_PRIOR = 1e-6  # of a bone's share at first, whose logarithm is learnt on fro
 LEAF_LENGTH = 0.6  # of a bone without children, in lengths of its parent's
 FIRST_CELLS = 1  # along an axis, from which convolutions begin
 SLOPE = 0.2  # of leaky ReLUs
+FIRST_LOGIT = 1e-4  # largest weight of the last convolution at first, when shares are the prior's
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class WeightVolume(Part):
             for a, b in zip(widths, widths[1:], strict=False):
                 layers += [nn.ConvTranspose3d(a, b, 4, 2, 1), nn.LeakyReLU(SLOPE)]
             self.convolutions = nn.Sequential(*layers[:-1])
-            nn.init.zeros_(layers[-2].weight)  # type: ignore[arg-type]
+            nn.init.uniform_(layers[-2].weight, -FIRST_LOGIT, FIRST_LOGIT)  # type: ignore[arg-type]
             nn.init.zeros_(layers[-2].bias)  # type: ignore[arg-type]
         else:
             self.volume = nn.Parameter(torch.zeros_like(self.prior))

@@ -18,7 +18,7 @@ from ...files.ranges import Layers, LearningRate, Octaves, Share, Width
 from ...method import Field, Part
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
-MIN_BODY = 1e-3  # sum of weights f(x) below which a point is outside the body
+MIN_BODY = 1e-3  # sum of weights f(x) up to which a point is outside the body
 POINTS_PER_CHUNK = 1 << 14  # whose places in all bones' frames are held at a time
 
 
@@ -107,6 +107,7 @@ class PosedField(Field):
             each = (torch.einsum("nbij,nj->nbi", table[..., :3], points) + table[..., 3]).transpose(0, 1)
         weights = self.volume.of_each(each, self.weights)
         body = weights.sum(0)
+        body = body * (body > MIN_BODY)
         return (weights[..., None] * each).sum(0) / body.clamp_min(MIN_BODY)[:, None], body
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Any]:
@@ -125,7 +126,7 @@ class PosedField(Field):
 
     def _dense(self, points: Points, rows: Int[Tensor, " point"]) -> Densities:
         rest, body = self.at_rest(points, rows)
-        inside = (body > MIN_BODY).nonzero()[:, 0]
+        inside = body.nonzero()[:, 0]
         placed = self.offset(rest[inside], self.angles[rows[inside]])
         return torch.zeros_like(body).index_copy(0, inside, self.canonical.density(placed) * body[inside])
 
