@@ -29,7 +29,7 @@ from torch import Tensor
 from lumigraph.camera import Camera
 from lumigraph.capture import open_dataset
 from lumigraph.capture.views import with_fewer_views
-from lumigraph.commands.draw import turned
+from lumigraph.commands.draw import magnified, turned
 from lumigraph.components.fields.kept_photographs import square
 from lumigraph.datasets.collection import Collection
 from lumigraph.depth_maps import DepthMap
@@ -109,11 +109,11 @@ def fid_over_training(options: Options, run: Run, data: Collection, folder: Path
 def sheet(options: Options, method: EG3D, folder: Path) -> None:
     around = turned(method.viewpoint, 4)
     drawn = [method.drawn(seed) for seed in range(options.seeds)]
-    rows = [Row(f"seed {i}", [one.render(around[k]).rgb for k in range(4)]) for i, one in enumerate(drawn)]
+    rows = [Row(f"seed {i}", [magnified(one.render(around[k]).rgb) for k in range(4)]) for i, one in enumerate(drawn)]
     title = f"{options.seeds} drawn objects, four views each"
     save_picture(folder / "drawn.png", contact_sheet(title, ["0°", "90°", "180°", "270°"], rows))
     rows = [
-        Row(f"seed {i}", [one.given(truncation=0.6).render(around[k]).rgb for k in range(4)])
+        Row(f"seed {i}", [magnified(one.given(truncation=0.6).render(around[k]).rgb) for k in range(4)])
         for i, one in enumerate(drawn)
     ]
     title = "The same objects, truncation 0.6"
@@ -155,7 +155,7 @@ def consistency(options: Options, method: EG3D, folder: Path) -> dict[str, Any]:
                 constants.append(constant)
                 shares.append(float(visible.float().mean()))
                 if angle == 30 and seed < 6:
-                    rows.append(Row(f"seed {seed}, {picture}: {close:.1f} dB", pictures))
+                    rows.append(Row(f"seed {seed}, {picture}: {close:.1f} dB", list(map(magnified, pictures))))
             mean = [sum(x) / len(x) for x in (scores, constants, shares)]
             found[f"{picture}, {angle} degrees"] = dict(zip(("psnr", "constant", "share"), mean, strict=True))
             print(picture, angle, *(f"{x:.2f}" for x in mean), flush=True)
@@ -185,7 +185,7 @@ def nearest(options: Options, method: EG3D, data: Collection, folder: Path) -> d
     also_far, *_ = closest(unseen)
     pixels = drawn[0].numel() ** 0.5
     triples = zip(drawn, by_pixels.tolist(), by_features.tolist(), strict=True)
-    rows = [Row("", [one, pictures[i], pictures[k]]) for one, i, k in triples]
+    rows = [Row("", list(map(magnified, (one, pictures[i], pictures[k])))) for one, i, k in triples]
     columns = ["drawn", "nearest by pixels", "by features"]
     save_picture(
         folder / "nearest.png", contact_sheet("Drawn objects and the nearest photographs learnt from", columns, rows)
@@ -215,7 +215,12 @@ def inversion(options: Options, method: EG3D, data: Collection, folder: Path) ->
         scores = [psnr(pictures[k], pictures[k + 1]) for k in range(0, len(pictures), 2)]
         own.append(scores[0])
         others += scores[1:]
-        rows.append(Row(f"{name}: {scores[0]:.1f} dB; held out {', '.join(f'{x:.1f}' for x in scores[1:])}", pictures))
+        rows.append(
+            Row(
+                f"{name}: {scores[0]:.1f} dB; held out {', '.join(f'{x:.1f}' for x in scores[1:])}",
+                list(map(magnified, pictures)),
+            )
+        )
         print(rows[-1].label, f"{seconds[-1]:.0f} s", flush=True)
     columns = ["given", "found", *["held out", "found"] * 3]
     save_picture(folder / "inverted.png", contact_sheet("Unseen objects, found in one photograph", columns, rows))

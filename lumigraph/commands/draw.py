@@ -16,6 +16,7 @@ from .options import DeviceOption, Overwrite, Set, controlled, needed, option
 
 MAX_SEED, MAX_SEEDS = 9999, 256
 FRAMES_PER_SEED = 30
+MIN_CELL = 128  # pixels across, of a picture on the sheet
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ class Draw:
         rows = []
         for seed in track(seeds, "Drawing", len(seeds)):
             told: Any = drawing.drawn(seed)
-            rows.append(Row(f"seed {seed}", [told.render(around[i]).rgb.cpu() for i in range(self.views)]))
+            rows.append(Row(f"seed {seed}", [magnified(told.render(around[i]).rgb) for i in range(self.views)]))
         columns = [f"{360 * i // self.views}°" for i in range(self.views)]
         save_picture(sheet, contact_sheet(f"{run.title}: {len(seeds)} drawn objects", columns, rows), "drawings")
         told_rows: dict[str, Any] = {"sheet": str(sheet)}
@@ -141,6 +142,12 @@ def numbers(text: str) -> list[int]:
     if len(found) > MAX_SEEDS:
         raise LumigraphError(f"--seeds {text} names more than {MAX_SEEDS} objects; give fewer")
     return found
+
+
+def magnified(picture: Any) -> Any:
+    """A picture with whole pixels enlarged, where it is too small to be looked at."""
+    times = -(-MIN_CELL // picture.shape[0])
+    return picture.cpu().repeat_interleave(times, 0).repeat_interleave(times, 1)
 
 
 def turned(camera: Any, count: int, turns: int = 1) -> Any:

@@ -128,7 +128,7 @@ class AdversarialLesson:
 
 GROWTH = 1 / 27.5  # share of the budget over which the rendering grows
 AVERAGE_RAMP = 0.05  # share of the pictures so far, in which the averaged weights forget half at the beginning
-STYLE_KEEP = 0.998  # share of the average style that a step keeps
+STYLE_KEEP = 0.998  # share of the average style that a step keeps; fewer steps than 500 have their plain mean
 DENSITY_POINTS = 1000  # of each field
 STYLE_CANDIDATES = 64  # random styles at most that a fit may begin with
 STYLE_SAMPLES = 512  # random codes from which the deviation of styles is measured
@@ -281,7 +281,7 @@ class EG3D(Method):
         own = labels(views)
         style = generator.mapping(codes, torch.where(swapped.to(self.device), own.roll(1, 0), own))
         with torch.no_grad():
-            generator.average.lerp_(style.mean(0), 1 - STYLE_KEEP)
+            generator.average.lerp_(style.mean(0), max(1 - STYLE_KEEP, 1 / (step + 1)))
         made = generator.field.made(generator.repeated(style), random)
         return made, self._pictures(generator, made, style, views, random)
 
