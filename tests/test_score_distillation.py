@@ -11,7 +11,8 @@ import torch
 from budgets import budget
 
 from lumigraph.components.guidance.diffusion import DiffusionGuide
-from lumigraph.components.guidance.guides import DistillationNumbers, open_guide
+from lumigraph.components.guidance.guides import DistillationNumbers
+from lumigraph.components.guidance.opening import open_guide
 from lumigraph.datasets.words import Words
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.dream_fields import DreamFields

@@ -17,7 +17,8 @@ from budgets import budget
 from lumigraph.commands.cli import main
 from lumigraph.components.guidance.clip import VisionSizes
 from lumigraph.components.guidance.clip_files import read_clip
-from lumigraph.components.guidance.guides import ClipGuide, DistillationNumbers, open_guide
+from lumigraph.components.guidance.guides import ClipGuide, DistillationNumbers
+from lumigraph.components.guidance.opening import open_guide
 from lumigraph.components.guidance.part import Guidance, GuidanceNumbers
 from lumigraph.components.guidance.tokenizer import BEGIN, END, Tokenizer
 from lumigraph.components.guidance.views import (

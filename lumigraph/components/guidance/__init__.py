@@ -2,7 +2,7 @@
 
 from .guides import DistillationNumbers as DistillationNumbers
 from .guides import Guide as Guide
-from .guides import open_guide as open_guide
+from .opening import open_guide as open_guide
 from .part import CPU_GUIDANCE as CPU_GUIDANCE
 from .part import TINY_GUIDANCE as TINY_GUIDANCE
 from .part import Guidance as Guidance

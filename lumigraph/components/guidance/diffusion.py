@@ -22,8 +22,9 @@ from ...errors import LumigraphError
 from ...metrics import Score
 from .clip import TextTransformer
 from .clip_files import ConfigRecord, TowerRecord, load, named_as_here, read_tensors, read_tokenizer, tower_of
-from .guides import DIFFUSION_INDEX, DistillationNumbers, Pictures
+from .guides import DistillationNumbers, Pictures
 
+DIFFUSION_INDEX = "model_index.json"
 CLASSES = {"unet": "UNet2DConditionModel", "text_encoder": "CLIPTextModel"}  # that are understood
 TEXT_WEIGHTS = "model.safetensors"
 SCORE_SHARES = (0.2, 0.5, 0.8)  # of the noise schedule, at which agreement is measured

@@ -1,10 +1,9 @@
-"""Guides: models that judge pictures by a prompt, opened from a user's files."""
+"""Guides: models that judge pictures by a prompt; CLIP as one (Radford 2021)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -15,10 +14,7 @@ from ...errors import LumigraphError
 from ...files.ranges import NonNegative, Share
 from ...metrics import Score
 from .clip import Clip
-from .clip_files import read_clip
 from .tokenizer import Tokenizer
-
-DIFFUSION_INDEX = "model_index.json"  # of diffusers' folders
 
 Pictures = Float[Tensor, "picture 3 side side"]
 
@@ -81,23 +77,3 @@ class ClipGuide:
     @torch.no_grad()
     def score(self, pictures: Pictures, prompt: str) -> Score:
         return Score("similarity to the prompt", float(self.cosines(pictures, (prompt,)).mean()), "", "higher")
-
-
-def open_guide(path: Path, device: torch.device) -> Guide:
-    """The model in a file or folder, kept open while the process runs.
-
-    A folder of diffusers is a diffusion model, anything else CLIP. Raises LumigraphError for what is neither.
-    """
-    return _open(path, device)
-
-
-@cache
-def _open(path: Path, device: torch.device) -> Guide:
-    if not path.exists():
-        raise LumigraphError(f"{path} does not exist; name the folder or file of a model for --guidance")
-    if (path / DIFFUSION_INDEX).is_file():
-        from .diffusion import DiffusionGuide
-
-        return DiffusionGuide(path, device)
-    network, tokenizer = read_clip(path)
-    return ClipGuide(network.to(device), tokenizer)

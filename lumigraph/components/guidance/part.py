@@ -14,7 +14,8 @@ from ...datasets.words import Words
 from ...errors import LumigraphError
 from ...files.ranges import NonNegative, Pixels, PositiveShare, Share, Steps, between
 from ...method import Part
-from .guides import DistillationNumbers, Guide, open_guide
+from .guides import DistillationNumbers, Guide
+from .opening import open_guide
 from .views import (
     PromptedViews,
     before_backgrounds,
