@@ -153,7 +153,7 @@ def anywhere(world: World, labels: np.ndarray, count: int, unit: float, random: 
             i, j = random.uniform(0.15, 0.85, 2) * labels.shape[:2]
             ahead = np.array([i - x, j - y])
             drop = height[int(i), int(j)] - eye[2] + random.normal(0, PITCH_SPREAD) * np.linalg.norm(ahead)
-            pose = aimed(eye, ahead, drop, np.linalg.norm(ahead), middle, unit)
+            pose = aimed(eye, ahead, drop, float(np.linalg.norm(ahead)), middle, unit)
             if worth_seeing(world, pose, unit):
                 break
         poses.append(pose)
@@ -189,7 +189,7 @@ def walk(labels: np.ndarray, count: int, unit: float) -> Float[np.ndarray, "came
         flat = ahead[:2] - eye[:2]
         inward = middle[:2] - eye[:2]
         flat = flat / np.linalg.norm(flat) + 0.8 * inward / np.linalg.norm(inward)
-        poses.append(aimed(eye, flat, centre - eye[2], np.linalg.norm(inward), middle, unit))
+        poses.append(aimed(eye, flat, centre - eye[2], float(np.linalg.norm(inward)), middle, unit))
     return np.stack(poses)
 
 

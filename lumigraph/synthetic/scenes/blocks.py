@@ -30,9 +30,9 @@ class Options(Pictures):
     land: Seed = 1
 
 
-def blocks(width: int = 64, land: int = 1) -> Blocks:
+def blocks(options: Options) -> Blocks:
     """The world's blocks."""
-    return cubes(terrain(width, land))
+    return cubes(terrain(options.width, options.land))
 
 
 def cubes(land: Terrain) -> Blocks:
@@ -58,7 +58,7 @@ def cubes(land: Terrain) -> Blocks:
 def plant(labels: np.ndarray, x: int, y: int, ground: int, tall: int, radius: float) -> None:
     """A trunk, and a crown around its upper half."""
     labels[x, y, ground : ground + tall - 1] = TREE
-    i, j, k = np.indices(labels.shape, sparse=True)
+    i, j, k = np.ogrid[tuple(map(slice, labels.shape))]
     centre = ground + 0.65 * tall
     ball = ((i - x) ** 2 + (j - y) ** 2) / (radius + 0.2) ** 2 + ((k + 0.5 - centre) / (0.42 * tall)) ** 2 <= 1
     labels[ball & (labels == 0)] = TREE
@@ -66,4 +66,4 @@ def plant(labels: np.ndarray, x: int, y: int, ground: int, tall: int, radius: fl
 
 def stage(size: int = 128, views: int = 60, seed: int = 0, width: int = 64, land: int = 1) -> SyntheticStage:
     """Cameras above the land; held-out ones walk around its middle."""
-    return stage_of(blocks(width, land), size, views, seed, "blocks")
+    return stage_of(cubes(terrain(width, land)), size, views, seed, "blocks")
