@@ -7,7 +7,8 @@
 Arguments are pairs of a run and a mesh file in the frame of its photographs. The mesh is read by trimesh and rendered
 with four samples a pixel: the first triangle along each ray, the texture bilinear at its texels, without light. PSNR is
 the mean over views, in dB, over the pixels that the mesh covers wholly; for photographs with transparency also over
-whole pictures before their background. The run's views are compared over the same pixels.
+whole pictures before their background. Where photographs have masks or transparency, the silhouette is compared with
+those, by IoU. The run's views are compared over the same pixels.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from lumigraph.export.texture.colours import first_surface
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
 from lumigraph.geometry import evenly
-from lumigraph.metrics import psnr
+from lumigraph.metrics import intersection_over_union, psnr
 from lumigraph.run import Run
 from lumigraph.system.console import console
 from lumigraph.system.progress import track
@@ -75,6 +76,10 @@ def compared(run: Run, path: Path, options: Options) -> dict:
         trusted = torch.ones_like(covered, dtype=torch.bool) if photograph.mask is None else photograph.mask
         inside = trusted & (covered == 1)
         shares.append(float(inside.float().mean()))
+        if (silhouette := photograph.alpha if photograph.mask is None else photograph.mask) is not None:
+            found.setdefault("mask IoU", []).append(
+                intersection_over_union((covered > 0.5).view(-1), (silhouette > 0.5).view(-1))
+            )
         whole = drawn + (1 - covered[..., None]) * torch.tensor(run.frame.background)
         pixels = {"covered": inside}
         if photograph.alpha is not None:

@@ -69,6 +69,12 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     return done
 
 
+@pytest.fixture(autouse=True)
+def _random_numbers_of_its_own() -> None:
+    """No test draws other numbers because of the tests before it."""
+    torch.manual_seed(0)
+
+
 @contextlib.contextmanager
 def limited() -> Iterator[None]:
     """Fail instead of waiting for ever."""

@@ -17,6 +17,7 @@ from lumigraph.depth_maps import DepthMap
 from lumigraph.errors import LumigraphError
 from lumigraph.export import photo3d as room
 from lumigraph.export.photo3d import layers, stitching
+from lumigraph.geometry import evenly
 
 pytestmark = budget("exports", 6)
 
@@ -101,13 +102,23 @@ def given_depth(monkeypatch):
 
 
 def test_a_burst_from_one_place_becomes_a_panorama(given_depth):
-    assert not room.photo3d(ball(), 90).flat
+    assert not room.photo3d(ball(), 90, views=3).flat
     given_depth[:] = [0.0, 0.001, 0.002]
-    assert room.photo3d(ball(), 90).flat
+    assert room.photo3d(ball(), 90, views=3).flat
+
+
+def test_a_photograph_without_any_depth_is_named(given_depth, monkeypatch):
+    maps = [seen_from(x) for x in given_depth]
+    maps[1] = DepthMap.measured(maps[1].camera, torch.full_like(maps[1].depth, torch.nan), maps[1].rgb)
+    monkeypatch.setattr(room, "depth_of", lambda *_: maps)
+    scene = ball()
+    name = scene.names[evenly(scene.splits["train"].tolist(), 3)[1]]
+    with pytest.raises(LumigraphError, match=f"{name} shares too little with the others"):
+        room.photo3d(scene, 90, views=3)
 
 
 def test_a_page_holds_the_picture_and_the_reach(given_depth, tmp_path):
-    found = room.photo3d(ball(), 90)
+    found = room.photo3d(ball(), 90, views=3)
     assert found.reach == pytest.approx(0.3, abs=1e-3)
     room.write_page(tmp_path / "photo.html", found, "A square")
     page = (tmp_path / "photo.html").read_text()
@@ -119,6 +130,20 @@ def test_one_photograph_is_a_fault():
     alone = replace(scene, splits={"train": torch.arange(1), "test": torch.arange(0)})
     with pytest.raises(LumigraphError, match="has one photograph"):
         room.photo3d(alone, 90)
+
+
+def test_photographs_without_poses_are_captured_first(tmp_path, monkeypatch, ball_folder, capsys):
+    (bare := tmp_path / "burst").mkdir()
+    for picture in sorted(ball_folder.rglob("*.png"))[:3]:
+        (bare / picture.name).write_bytes(picture.read_bytes())
+
+    def refused(photographs, *_):
+        raise LumigraphError(f"no features in {photographs[0]}")
+
+    monkeypatch.setattr("lumigraph.commands.capture.find_cameras", refused)
+    monkeypatch.chdir(tmp_path)
+    assert main(["photo3d", str(bare), str(tmp_path / "photo.html")]) == 2
+    assert f"no features in {bare}" in capsys.readouterr().err
 
 
 def test_an_ending_that_is_neither_page_nor_mesh_is_a_fault(ball_folder, tmp_path, capsys):

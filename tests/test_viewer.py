@@ -41,7 +41,7 @@ from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, ro
 from lumigraph.viewer.modes import PALETTE, along_axis, extra_modes, normals, picture
 from lumigraph.viewer.painter import Pace, Painter
 from lumigraph.viewer.shared import render_inside
-from lumigraph.viewer.turns import IDLE_RENDER_SHARE, RENDER_SHARE, NotWantedError, Turns
+from lumigraph.viewer.turns import RENDER_SHARE, NotWantedError, Turns
 from lumigraph.viewer.visitor import UNIT_SCALE, splats
 
 WHITE = (1.0, 1.0, 1.0)
@@ -489,14 +489,15 @@ def test_turns_come_in_the_order_of_asking_and_can_be_given_up():
 
 
 def test_those_at_rest_ask_seldom(now):
-    turns = Turns(training=True)
+    turns = Turns(training=True, idle_share=0.1)
     assert turns.claim_refresh()
     assert not turns.claim_refresh()  # someone is at it
     now[0] += 0.5
     turns.refreshed(0.5)
-    now[0] += 0.45 / IDLE_RENDER_SHARE
-    assert not turns.claim_refresh()
-    now[0] += 0.1 / IDLE_RENDER_SHARE
+    assert turns.until_refresh() == 1.0  # the longest
+    now[0] += 4.5
+    assert not turns.claim_refresh() and turns.until_refresh() == pytest.approx(0.5)
+    now[0] += 1.0
     assert turns.claim_refresh()
 
 

@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Downscale, between
+from .capture import posed
 from .common import show, typed
 from .options import Overwrite, ReaderOption, needed, option
 
@@ -49,7 +50,8 @@ class Photo3DCommand:
         if not page and self.output.suffix.lower() != ".glb":
             raise LumigraphError(f"{self.output} is neither a page nor a mesh; name a file that ends in .html or .glb")
         claim(self.output, "page" if page else "mesh", self.overwrite)
-        scene = open_scene(self.scene, self.downscale, self.reader, whole=True)
+        source = posed(self.scene)
+        scene = open_scene(source, self.downscale, self.reader, whole=True)
         found = photo3d(scene, self.size, self.views)
         if page:
             write_page(self.output, found, self.title or Path(self.scene).stem)
@@ -64,7 +66,7 @@ class Photo3DCommand:
                 "trusted depth": trusted,
                 "triangles": f"{len(found.mesh.faces):,}",
                 "page" if page else "mesh": f"{self.output} ({self.output.stat().st_size / 1e6:.1f} MB)",
-                "next": typed("depth", self.scene, "--output", "FOLDER"),
+                "next": typed("depth", source, "--output", "FOLDER"),
             }
         )
         return 0

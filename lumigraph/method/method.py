@@ -61,6 +61,7 @@ class Method(nn.Module, ABC):
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     default_quality: ClassVar[Quality | None] = None  # budget of `train` where none is asked for; None: by seconds
+    idle_render_share: ClassVar[float] = 0.03  # of training's time, for viewers whose camera is at rest
     taught_steps: ClassVar[int | None] = None  # default steps after another method's field; None: by seconds
     _place: Tensor
 

@@ -93,6 +93,7 @@ class SplatSlam(Method):
 
     Config = Config
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH
+    idle_render_share: ClassVar[float] = 0.2  # a map that grows while one walks is looked at
     grows: ClassVar[tuple[str, ...]] = ("anchor",)
     radius: Tensor
     anchor: Tensor

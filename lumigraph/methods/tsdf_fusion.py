@@ -51,6 +51,7 @@ class TSDFFusion(RayMethod):
     Config = Config
     any_lens: ClassVar[bool] = True
     default_quality: ClassVar[Quality | None] = "good"  # each depth map once, however long it takes
+    idle_render_share: ClassVar[float] = 0.5  # a map that grows while one walks is looked at
     taught_steps: ClassVar[int | None] = 1
     fused: Tensor  # depth maps so far
     count: Tensor  # of depth maps in all; 0 before any are known

@@ -114,7 +114,7 @@ class Painter:
             else:
                 if self._requested == requested:
                     self.settled.set()
-                self._sleep(1.0)
+                self._sleep(self._turns.until_refresh())
 
     def _refine(self, requested: int) -> bool:
         """Draw better pictures one after the other; whether the best was reached before another request came."""

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 
 RENDER_SHARE = 0.5  # of the time that renderings may take from training while a camera moves
-IDLE_RENDER_SHARE = 0.03  # and while none does
+REFRESH_SECONDS = 0.1, 1.0  # least and longest time between two claims of a client at rest
 POLL_SECONDS = 0.1  # seconds between checks whether to stop waiting
 
 
@@ -21,11 +21,12 @@ class Turns:
     """A queue of renderings, served in the order of requests. Training has the method by default and gives way between
     steps, never so often that renderings take more than their share of the time.
 
-    training: whether someone trains; `give_way` must then be called between steps, until `end_training`
+    training:   whether someone trains; `give_way` must then be called between steps, until `end_training`
+    idle_share: of the time that clients at rest may take from training: `Method.idle_render_share`
     """
 
-    def __init__(self, training: bool = False):
-        self.training, self.paused = training, False
+    def __init__(self, training: bool = False, idle_share: float = 1.0):
+        self.training, self.paused, self._idle_share = training, False, idle_share
         self._condition = threading.Condition()
         self._waiting: deque[object] = deque()
         self._open = False  # training gives way at the moment
@@ -96,4 +97,9 @@ class Turns:
     def refreshed(self, seconds: float) -> None:
         """Take note of a refresh that is over, and of how long it took."""
         with self._condition:
-            self._idle_until = time.perf_counter() + seconds / IDLE_RENDER_SHARE
+            self._idle_until = time.perf_counter() + seconds / self._idle_share
+
+    def until_refresh(self) -> float:
+        """Seconds after which a client at rest claims its next refresh."""
+        least, longest = REFRESH_SECONDS
+        return min(max(self._idle_until - time.perf_counter(), least), longest)

@@ -150,7 +150,7 @@ class Viewer:
 
     def __init__(self, method: Method, subject: Subject, address: Address, training: bool = False):
         self.method, self.subject, self.address = method, subject, address
-        self.turns = Turns(training)
+        self.turns = Turns(training, method.idle_render_share)
         self._visitors: dict[int, Visitor] = {}
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs

@@ -39,7 +39,7 @@ MAX_LATITUDE = 80.0  # degrees
 TEXELS = 2  # of the texture along each side of a pixel of the panorama
 ZOOM = 0.85  # of a page's angle of view to a photograph's, so that borders stay outside
 NEAR_SHARE, FAR_SHARE = 0.02, 100.0  # of the distance to the focus: what a page draws
-REACH = 1.0  # of the camera in a page: times the mean distance of the photographs from their middle
+MAX_REACH = 0.15  # of a page's camera from the middle: share of its distance to the focus; farther, edges open wide
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ def photo3d(scene: Scene, size: int, views: int = MAX_PHOTOGRAPHS) -> Photo3D:
     forward = camera.pose[0, :, 2]
     focus = camera.position[0] + front.depth[front.known].median() * forward
     height = scene.cameras[numbers[0]]
-    return Photo3D(camera, mesh, focus, REACH * spread, angle_of(height), share, flat)
+    reach = min(spread, MAX_REACH * float((focus - camera.position[0]).norm()))
+    return Photo3D(camera, mesh, focus, reach, angle_of(height), share, flat)
 
 
 def write_page(path: Path, photo: Photo3D, title: str) -> None:

@@ -104,6 +104,7 @@ class IMap(FieldMethod):
 
     Config = Config
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH
+    idle_render_share: ClassVar[float] = 0.2  # a map that grows while one walks is looked at
     network: MapNetwork | DistanceTable
     sampler: MapSampler
     losses: Tensor
