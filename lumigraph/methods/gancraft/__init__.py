@@ -21,6 +21,7 @@ from ...camera.rays import Rays, Rendering, Samples
 from ...capture.single_image import photograph
 from ...components.fields.kept_photographs import Kept
 from ...components.training.adversarial import discriminator_loss, generator_loss, held
+from ...components.training.row_optimizers import exchange
 from ...datasets.scene import Frame
 from ...datasets.world import LABELS, BlockWorld
 from ...files.ranges import Count, LearningRate, NonNegative, Octaves, Positive, Seed, Share, Width, between
@@ -137,6 +138,7 @@ class GANcraft(Method):
         self.labels = Kept(torch.zeros(1, 1, 1, 1, dtype=torch.uint8))
         self.register_buffer("blocks_from_scene", torch.eye(4, dtype=torch.float64))
         self.register_buffer("styles", torch.zeros(len(STYLES), c.code))
+        self._optimizers: list[torch.optim.Optimizer] = []
         self._progress = 0.0
         self._world: World | None = None
 
@@ -148,7 +150,7 @@ class GANcraft(Method):
             samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5,
             encoder_size=32, encoder_width=12,
             painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
-            adversary_width=12, opacity_weight=0.5, momentum=0.5,
+            adversary_width=12, kl_weight=0.005, opacity_weight=0.5, momentum=0.5,
             learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
             painter_learning_rate=2e-3, painter_adversary_learning_rate=1e-3,
         )  # fmt: skip
@@ -173,7 +175,7 @@ class GANcraft(Method):
         self.blocks_from_scene.copy_(data.blocks_from_scene)
         corners = len(self.world.corners)
         values = CORNER_DEVIATION * torch.randn(corners, self.config.features, generator=self.random(1))
-        self.field_network.values = nn.Parameter(values.to(self.device))
+        exchange(self.field_network, "values", values, self._optimizers[0] if self._optimizers else None)
 
     @property
     def world(self) -> World:
@@ -361,7 +363,7 @@ class GANcraft(Method):
         networks = [self.behind, *(p for m in own for p in m.parameters() if p is not self.field_network.values)]
         adam = partial(torch.optim.Adam, eps=1e-7)
         own_betas, other_betas = (c.momentum, 0.999), (0.0, 0.999)
-        self._optimizers: list[torch.optim.Optimizer] = [
+        self._optimizers = [
             adam([{"params": networks, "lr": c.learning_rate}, corners], betas=own_betas),
             adam(self.adversary.parameters(), c.adversary_learning_rate, betas=other_betas),
             adam(self.painter.parameters(), c.painter_learning_rate, betas=own_betas),

@@ -17,7 +17,7 @@ from ...components.fields.encodings import FrequencyEncoding
 SLOPE = 0.2  # of leaky rectifiers
 BORDER = 4  # pixels by which the neural renderer sees beyond each pixel: four convolutions of 3x3
 SMALLEST = 4  # pixels across, at which the style encoder ends
-MAX_LOG_VARIANCE = 4.0  # of style codes, either way
+MAX_LOG_VARIANCE, FIRST_LOG_VARIANCE = 4.0, -3.0  # of style codes, either way, and before anything is learnt
 FIRST_DENSITY = 4.0  # of all blocks, per block, before anything is learnt
 
 Style = Float[Tensor, "1 style"]
@@ -40,6 +40,7 @@ class StyleEncoder(nn.Module):
         widths = [3, *(min(width << k, 8 * width) for k in range(int(math.log2(size // SMALLEST))))]
         self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths))
         self.out = nn.Linear(widths[-1] * SMALLEST**2, 2 * code)
+        nn.init.constant_(self.out.bias[code:], FIRST_LOG_VARIANCE)
 
     def forward(self, pictures: Pictures) -> tuple[Float[Tensor, "picture code"], Float[Tensor, "picture code"]]:
         """pictures: in [-1, 1]"""
