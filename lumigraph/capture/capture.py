@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
 from ..datasets.tracks import BoxTrack
-from ..datasets.world import Blocks
+from ..datasets.world import BlockLabels
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
 
@@ -122,7 +122,7 @@ class Capture:
     notes: list[str] = field(default_factory=list)
     tracks: tuple[BoxTrack, ...] = ()
     kept: bool = False
-    blocks: Blocks | None = None
+    blocks: BlockLabels | None = None
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
         """The capture with some of its points alone."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from ..datasets.world import LABELS, Blocks
+from ..datasets.world import LABELS, BlockLabels
 from ..errors import LumigraphError
 from ..system.progress import track
 from .capture import Capture
@@ -61,7 +61,7 @@ def read(path: Path) -> Capture:
     """The part of a region file, or of a world's folder, that has most chunks: at most 64 blocks each way."""
     labels, notes = read_blocks(path)
     stage = import_module("..synthetic.block_stage", __package__)  # a room above this one
-    found = stage.captured(Blocks(labels), str(path))
+    found = stage.captured(BlockLabels(labels), str(path))
     return replace(found, notes=notes)
 
 

@@ -31,7 +31,7 @@ from ...synthetic.landscapes import STYLES, landscape
 from ...system.progress import track
 from ...system.work import at_work
 from .networks import BORDER, BlockField, NeuralRenderer, SkyNetwork, StyleEncoder, StyleNetwork, divergence, drawn
-from .painter import Adversary, Painter, channels, halves, perceptual
+from .painter import Adversary, LabelPainter, channels, halves, perceptual
 
 MIN_OPACITY = 1e-3  # from which on a ray has a depth
 STYLE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of pictures whose style is shown
@@ -133,14 +133,14 @@ class GANcraft(Method):
             self.renderer = NeuralRenderer(c.output_features, c.hidden_width, c.style)
             widths = [min(c.painter_width << k, 16 * c.painter_width) for k in range(c.painter_levels, -1, -1)]
             sizes = c.encoder_size, c.encoder_width
-            self.painter = Painter(len(LABELS), c.painter_code, widths, c.painter_width, *sizes)
+            self.painter = LabelPainter(len(LABELS), c.painter_code, widths, c.painter_width, *sizes)
             self.adversary, self.painter_adversary = (Adversary(len(LABELS), c.adversary_width) for _ in range(2))
         self.labels = Kept(torch.zeros(1, 1, 1, 1, dtype=torch.uint8))
         self.register_buffer("blocks_from_scene", torch.eye(4, dtype=torch.float64))
         self.register_buffer("styles", torch.zeros(len(STYLES), c.code))
         self._optimizers: list[torch.optim.Optimizer] = []
         self._progress = 0.0
-        self._world: World | None = None
+        self._world: BlockGrid | None = None
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -178,10 +178,10 @@ class GANcraft(Method):
         exchange(self.field_network, "values", values, self._optimizers[0] if self._optimizers else None)
 
     @property
-    def world(self) -> World:
+    def world(self) -> BlockGrid:
         """The blocks as grids for kernels."""
         if self._world is None or self._world.labels is not self.labels.rows:
-            self._world = World.of(self.labels.rows)
+            self._world = BlockGrid.of(self.labels.rows)
         return self._world
 
     def in_blocks_frame(self, rays: Rays) -> Rays:
@@ -373,7 +373,7 @@ class GANcraft(Method):
 
 
 @dataclass(frozen=True)
-class World:
+class BlockGrid:
     """Blocks as grids for kernels.
 
     labels:   (1, x, y, z)
@@ -390,7 +390,7 @@ class World:
     nodes: kernels.Nodes
 
     @staticmethod
-    def of(labels: Tensor) -> World:
+    def of(labels: Tensor) -> BlockGrid:
         solid = labels[0] > SKY
         shape, device = tuple(solid.shape), labels.device
         occupied = torch.zeros((1, *[max(shape)] * 3), dtype=torch.bool, device=device)
@@ -401,7 +401,7 @@ class World:
         corners = near.flatten().nonzero()[:, 0]
         x, y, z = near.shape
         nodes = kernels.Nodes.of(corners, (x, y, z))
-        return World(labels, torch.tensor(shape, device=device).float(), occupied, occupied.float(), corners, nodes)
+        return BlockGrid(labels, torch.tensor(shape, device=device).float(), occupied, occupied.float(), corners, nodes)
 
     def sampled(self, rays: Rays, step: float, depth: float, jitter: Float[Tensor, " ray"] | None) -> Samples:
         """Samples of rays within blocks, a step apart; each ray ends after a way of `depth` blocks through them.

@@ -56,7 +56,7 @@ class SpadeBlock(nn.Module):
         return self.beside(x) + y
 
 
-class Painter(nn.Module):
+class LabelPainter(nn.Module):
     """Pictures in [-1, 1] from label maps and a style code; its encoder finds the code of a picture.
 
     widths: channels from the coarsest resolution on, each twice as fine as the one before

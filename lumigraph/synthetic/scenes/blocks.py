@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...datasets.world import Blocks
+from ...datasets.world import BlockLabels
 from ...files.ranges import Seed, between
 from ..block_stage import stage_of
 from ..stage import Pictures, SyntheticStage
@@ -30,12 +30,12 @@ class Options(Pictures):
     land: Seed = 1
 
 
-def blocks(options: Options) -> Blocks:
+def blocks(options: Options) -> BlockLabels:
     """The world's blocks."""
     return cubes(terrain(options.width, options.land))
 
 
-def cubes(land: Terrain) -> Blocks:
+def cubes(land: Terrain) -> BlockLabels:
     """Land as cubes: soil below grass, stone below all, water up to its level, trunks and crowns of trees."""
     height = np.maximum(np.round(land.ground), 1).astype(int)
     side, top = len(height), int(max(height.max(), WATER_LEVEL)) + MARGIN
@@ -52,7 +52,7 @@ def cubes(land: Terrain) -> Blocks:
     labels[wet[:, :, None] & (z >= np.minimum(height, level - 1)[:, :, None]) & (z < level)] = WATER
     for x, y, tall, radius in land.trees:
         plant(labels, int(x), int(y), int(height[int(x), int(y)]), round(tall), radius)
-    return Blocks(labels[:, :, : int(np.flatnonzero((labels > 0).any((0, 1)))[-1]) + 2])
+    return BlockLabels(labels[:, :, : int(np.flatnonzero((labels > 0).any((0, 1)))[-1]) + 2])
 
 
 def plant(labels: np.ndarray, x: int, y: int, ground: int, tall: int, radius: float) -> None:
