@@ -31,7 +31,7 @@ from ...synthetic.landscapes import STYLES, landscape
 from ...system.progress import track
 from ...system.work import at_work
 from .networks import BORDER, BlockField, NeuralRenderer, SkyNetwork, StyleEncoder, StyleNetwork, divergence, drawn
-from .painter import Adversary, LabelPainter, channels, halves, perceptual
+from .spade import Adversary, LabelPainter, channels, halves, perceptual
 
 MIN_OPACITY = 1e-3  # from which on a ray has a depth
 STYLE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of pictures whose style is shown
