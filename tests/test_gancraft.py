@@ -16,9 +16,9 @@ from lumigraph import methods
 from lumigraph.camera.rays import Rays
 from lumigraph.datasets.world import LABELS
 from lumigraph.errors import LumigraphError
-from lumigraph.methods.gancraft import World, bordered
+from lumigraph.methods.gancraft import BlockGrid, bordered
 from lumigraph.methods.gancraft.networks import BORDER, FIRST_DENSITY, NeuralRenderer, StyleEncoder, divergence, drawn
-from lumigraph.methods.gancraft.painter import Adversary, Painter, channels
+from lumigraph.methods.gancraft.spade import Adversary, LabelPainter, channels
 from lumigraph.synthetic.landscapes import STYLES
 
 pytestmark = budget("methods", 6)
@@ -33,11 +33,11 @@ def gancraft(**changes):
     return method.eval()
 
 
-def slabs() -> World:
+def slabs() -> BlockGrid:
     """Grass at 1 <= z < 2, air, stone from z = 4 to 7."""
     labels = torch.zeros(1, 5, 6, 7, dtype=torch.uint8)
     labels[..., 1], labels[..., 4:] = GRASS, STONE
-    return World.of(labels)
+    return BlockGrid.of(labels)
 
 
 def ray(origin, direction) -> Rays:
@@ -141,7 +141,7 @@ def test_the_most_frequent_label_counts_within_a_window():
 
 def test_the_painter_follows_labels_and_style_and_the_adversary_compares_labels():
     torch.manual_seed(0)
-    painter, adversary = Painter(len(LABELS), 2, [8, 8, 4], 4, 8, 4), Adversary(len(LABELS), 4)
+    painter, adversary = LabelPainter(len(LABELS), 2, [8, 8, 4], 4, 8, 4), Adversary(len(LABELS), 4)
     maps = channels(torch.stack([torch.full((16, 16), GRASS), torch.full((16, 16), STONE)]), len(LABELS))
     codes = torch.tensor([[1.0, -1.0]])
     one, other, restyled = painter(maps[:1], codes), painter(maps[1:], codes), painter(maps[:1], -codes)

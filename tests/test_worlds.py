@@ -20,8 +20,9 @@ from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate_walk, warped_difference
 from lumigraph.evaluation.walks import colours_by_label
 from lumigraph.method import Method
-from lumigraph.synthetic import block_stage, scenes
+from lumigraph.synthetic import block_stage
 from lumigraph.synthetic.landscapes import STYLES, landscape
+from lumigraph.synthetic.scenes.blocks import Options, blocks
 from lumigraph.synthetic.terrain import terrain
 
 pytestmark = budget("capture", 12)
@@ -94,7 +95,7 @@ def test_bad_regions_are_told_in_one_sentence(tmp_path):
 
 
 def test_boxes_cover_what_can_be_seen_once():
-    labels = scenes.scene("blocks").blocks(16, 3).labels
+    labels = blocks(Options(width=16, land=3)).labels
     seen, covered = block_stage.exposed(labels), np.zeros(labels.shape, int)
     for label in range(1, len(LABELS)):
         for low, high in block_stage.joined_boxes(seen & (labels == label)):
@@ -118,7 +119,7 @@ def test_layers_agree_with_the_blocks():
 
 
 def test_cameras_are_above_the_ground_and_the_walk_is_closed():
-    labels = scenes.scene("blocks").blocks(24, 1).labels
+    labels = blocks(Options(width=24, land=1)).labels
     unit, height = 12.0, block_stage.tops(labels)
     poses = block_stage.walk(labels, 50, unit)
     places = poses[:, :, 3] * unit + np.array(labels.shape) / 2

@@ -10,7 +10,7 @@ import tiny
 import torch
 
 from lumigraph.datasets.images import Layer, LayerSource
-from lumigraph.datasets.world import LABELS, Blocks, BlockWorld
+from lumigraph.datasets.world import LABELS, BlockLabels, BlockWorld
 
 SIDE, RADIUS = 8, 0.6  # blocks of the box from -1 to 1, scene units
 NAMES = ("grass", "stone")
@@ -38,4 +38,4 @@ def world() -> BlockWorld:
     rows = tuple(tuple(scale * (i == j) for j in range(3)) + (0.0,) for i in range(3)) + ((0.0, 0.0, 0.0, 1.0),)
     frame = replace(scene.frame, source_from_scene=rows, tracks=())
     fields = vars(scene) | {"frame": frame, "layers": scene.layers | {"labels": layer}}
-    return BlockWorld(**fields, blocks=Blocks(labels(), (-SIDE / 2,) * 3))
+    return BlockWorld(**fields, blocks=BlockLabels(labels(), (-SIDE / 2,) * 3))

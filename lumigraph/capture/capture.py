@@ -14,7 +14,7 @@ from ..camera.lens import Lens
 from ..datasets.scene import GeographicOrigin
 from ..datasets.skeleton import Skeleton
 from ..datasets.tracks import BoxTrack
-from ..datasets.world import Blocks
+from ..datasets.world import BlockLabels
 from ..errors import LumigraphError
 from ..geometry import RIGID_TOLERANCE
 
@@ -125,7 +125,7 @@ class Capture:
     tracks: tuple[BoxTrack, ...] = ()
     skeleton: Skeleton | None = None
     kept: bool = False
-    blocks: Blocks | None = None
+    blocks: BlockLabels | None = None
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
         """The capture with some of its points alone."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from ..datasets.world import LABELS, Blocks
+from ..datasets.world import LABELS, BlockLabels
 from ..errors import LumigraphError
 from ..system.progress import track
 from .capture import Capture
@@ -61,7 +61,7 @@ def read(path: Path) -> Capture:
     """The part of a region file, or of a world's folder, that has most chunks: at most 64 blocks each way."""
     labels, notes = read_blocks(path)
     stage = import_module("..synthetic.block_stage", __package__)  # a room above this one
-    found = stage.captured(Blocks(labels), str(path))
+    found = stage.captured(BlockLabels(labels), str(path))
     return replace(found, notes=notes)
 
 
@@ -180,8 +180,8 @@ def chunk_labels(anvil: Any, chunk: Any, unknown: Counter[str]) -> UInt8[np.ndar
 def trimmed(labels: UInt8[np.ndarray, "x z y"]) -> UInt8[np.ndarray, "_ _ _"]:
     """The columns with blocks, from a little below the lowest surface to above the highest."""
     solid = labels > 0
-    columns = solid.any(2)
-    x, z = (np.flatnonzero(columns.any(axis)) for axis in (1, 0))
+    columns = np.any(solid, 2)
+    x, z = np.flatnonzero(np.any(columns, 1)), np.flatnonzero(np.any(columns, 0))
     tops = labels.shape[2] - solid[:, :, ::-1].argmax(2)
     low, high = max(int(tops[columns].min()) - DEPTH, 0), int(tops[columns].max()) + 1
     return labels[x[0] : x[-1] + 1, z[0] : z[-1] + 1, low:high]

@@ -17,7 +17,7 @@ LABELS = ("sky", "grass", "dirt", "stone", "sand", "water", "tree", "snow")
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockLabels:
     """Cubes with an edge of 1 in the source's frame.
 
     labels: index into `LABELS` of each block, 0 for air; x east, y north, z up
@@ -34,7 +34,7 @@ class BlockWorld(Scene):
 
     kind: ClassVar[str] = "a block world"
 
-    blocks: Blocks = Blocks(np.zeros((1, 1, 1), np.uint8))
+    blocks: BlockLabels = BlockLabels(np.zeros((1, 1, 1), np.uint8))
 
     @property
     def label_numbers(self) -> Int[Tensor, " name"]:

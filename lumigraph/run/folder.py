@@ -34,6 +34,7 @@ from ..camera import Camera
 from ..capture import KINDS, Before, open_dataset
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
+from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..files import marks
 from ..files.locks import LOCK_FILE, check_place, held
@@ -174,7 +175,7 @@ class Run(Trained):
     @property
     def photographed(self) -> bool:
         """True if it was trained on photographs, so that there are cameras."""
-        return self.kind == Scene.kind
+        return self.kind in (Scene.kind, BlockWorld.kind)
 
     @property
     def open_scene(self) -> Callable[..., Scene] | None:

@@ -100,7 +100,7 @@ def read(request: str) -> Capture:
     off = jittered(stage, amount, options.seed) if amount else None
     found = capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
     if is_block_world(request):
-        found = replace(found, blocks=blocks_about_middle(scenes.scene(name).blocks(options.width, options.land)))
+        found = replace(found, blocks=blocks_about_middle(scenes.scene(name).blocks(options)))
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..capture.capture import Capture
-from ..datasets.world import LABELS, Blocks
+from ..datasets.world import LABELS, BlockLabels
 from .cameras import look_at, pinhole
 from .rendering import trace
 from .shapes import Cuboid
@@ -39,7 +39,7 @@ PROBE = 12  # pixels a side of the picture that these are measured in
 MAX_TRIES = 20  # cameras drawn for one that passes
 
 
-def captured(blocks: Blocks, source: str, size: int = 128, views: int = 60, seed: int = 0) -> Capture:
+def captured(blocks: BlockLabels, source: str, size: int = 128, views: int = 60, seed: int = 0) -> Capture:
     """Pictures of blocks with exact labels and depth; lengths of the source are blocks.
 
     size: of the square pictures, pixels; views: number of pictures to learn from; seed: position of their cameras
@@ -50,13 +50,13 @@ def captured(blocks: Blocks, source: str, size: int = 128, views: int = 60, seed
     return replace(found, blocks=blocks_about_middle(blocks))
 
 
-def blocks_about_middle(blocks: Blocks) -> Blocks:
+def blocks_about_middle(blocks: BlockLabels) -> BlockLabels:
     """The blocks in a frame whose origin is the middle of their box."""
     x, y, z = (-n / 2 for n in blocks.labels.shape)
-    return Blocks(blocks.labels, (x, y, z))
+    return BlockLabels(blocks.labels, (x, y, z))
 
 
-def stage_of(blocks: Blocks, size: int, views: int, seed: int, called: str) -> SyntheticStage:
+def stage_of(blocks: BlockLabels, size: int, views: int, seed: int, called: str) -> SyntheticStage:
     """A world of blocks in a box from -1 to 1 along its longest side, and cameras above its ground.
 
     Cameras to learn from are anywhere, those held out walk around the middle. called: name of the kept pictures
@@ -153,7 +153,7 @@ def anywhere(world: World, labels: np.ndarray, count: int, unit: float, random: 
             i, j = random.uniform(0.15, 0.85, 2) * labels.shape[:2]
             ahead = np.array([i - x, j - y])
             drop = height[int(i), int(j)] - eye[2] + random.normal(0, PITCH_SPREAD) * np.linalg.norm(ahead)
-            pose = aimed(eye, ahead, drop, np.linalg.norm(ahead), middle, unit)
+            pose = aimed(eye, ahead, drop, float(np.linalg.norm(ahead)), middle, unit)
             if worth_seeing(world, pose, unit):
                 break
         poses.append(pose)
@@ -189,7 +189,7 @@ def walk(labels: np.ndarray, count: int, unit: float) -> Float[np.ndarray, "came
         flat = ahead[:2] - eye[:2]
         inward = middle[:2] - eye[:2]
         flat = flat / np.linalg.norm(flat) + 0.8 * inward / np.linalg.norm(inward)
-        poses.append(aimed(eye, flat, centre - eye[2], np.linalg.norm(inward), middle, unit))
+        poses.append(aimed(eye, flat, centre - eye[2], float(np.linalg.norm(inward)), middle, unit))
     return np.stack(poses)
 
 

@@ -31,7 +31,7 @@ TEXTURE = 256  # points a side of the noise that textures repeat
 
 
 @dataclass(frozen=True)
-class Style:
+class LandscapeStyle:
     """Light and colours of a landscape; colours as seen on screen (sRGB).
 
     ground: two colours of each label but the sky, between which its texture varies
@@ -49,7 +49,7 @@ class Style:
     clouds: float
 
 
-SUMMER = Style(
+SUMMER = LandscapeStyle(
     (
         ((0.30, 0.43, 0.14), (0.47, 0.54, 0.22)),  # grass
         ((0.40, 0.30, 0.20), (0.54, 0.43, 0.30)),  # dirt
@@ -64,7 +64,7 @@ SUMMER = Style(
 )  # fmt: skip
 STYLES = {
     "summer": SUMMER,
-    "autumn": Style(
+    "autumn": LandscapeStyle(
         (
             ((0.48, 0.40, 0.16), (0.66, 0.56, 0.26)),
             ((0.34, 0.24, 0.16), (0.48, 0.36, 0.25)),
@@ -77,7 +77,7 @@ STYLES = {
         sun=(1.18, 1.04, 0.86), height=30.0, zenith=(0.42, 0.58, 0.80), horizon=(0.90, 0.88, 0.83),
         haze=0.007, clouds=0.5,
     ),
-    "winter": Style(
+    "winter": LandscapeStyle(
         (
             ((0.74, 0.77, 0.82), (0.93, 0.94, 0.96)),
             ((0.44, 0.40, 0.38), (0.70, 0.70, 0.71)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -21,6 +21,7 @@ from ...camera.rays import Rays, Rendering, Samples
 from ...capture.single_image import photograph
 from ...components.fields.kept_photographs import Kept
 from ...components.training.adversarial import discriminator_loss, generator_loss, held
+from ...components.training.row_optimizers import exchange
 from ...datasets.scene import Frame
 from ...datasets.world import LABELS, BlockWorld
 from ...files.ranges import Count, LearningRate, NonNegative, Octaves, Positive, Seed, Share, Width, between
@@ -30,7 +31,7 @@ from ...synthetic.landscapes import STYLES, landscape
 from ...system.progress import track
 from ...system.work import at_work
 from .networks import BORDER, BlockField, NeuralRenderer, SkyNetwork, StyleEncoder, StyleNetwork, divergence, drawn
-from .painter import Adversary, Painter, channels, perceptual
+from .spade import Adversary, LabelPainter, channels, halves, perceptual
 
 MIN_OPACITY = 1e-3  # from which on a ray has a depth
 STYLE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of pictures whose style is shown
@@ -132,13 +133,14 @@ class GANcraft(Method):
             self.renderer = NeuralRenderer(c.output_features, c.hidden_width, c.style)
             widths = [min(c.painter_width << k, 16 * c.painter_width) for k in range(c.painter_levels, -1, -1)]
             sizes = c.encoder_size, c.encoder_width
-            self.painter = Painter(len(LABELS), c.painter_code, widths, c.painter_width, *sizes)
+            self.painter = LabelPainter(len(LABELS), c.painter_code, widths, c.painter_width, *sizes)
             self.adversary, self.painter_adversary = (Adversary(len(LABELS), c.adversary_width) for _ in range(2))
         self.labels = Kept(torch.zeros(1, 1, 1, 1, dtype=torch.uint8))
         self.register_buffer("blocks_from_scene", torch.eye(4, dtype=torch.float64))
         self.register_buffer("styles", torch.zeros(len(STYLES), c.code))
+        self._optimizers: list[torch.optim.Optimizer] = []
         self._progress = 0.0
-        self._world: World | None = None
+        self._world: BlockGrid | None = None
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -148,7 +150,7 @@ class GANcraft(Method):
             samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5,
             encoder_size=32, encoder_width=12,
             painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
-            adversary_width=12, opacity_weight=0.5, momentum=0.5,
+            adversary_width=12, kl_weight=0.005, opacity_weight=0.5, momentum=0.5,
             learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
             painter_learning_rate=2e-3, painter_adversary_learning_rate=1e-3,
         )  # fmt: skip
@@ -173,13 +175,13 @@ class GANcraft(Method):
         self.blocks_from_scene.copy_(data.blocks_from_scene)
         corners = len(self.world.corners)
         values = CORNER_DEVIATION * torch.randn(corners, self.config.features, generator=self.random(1))
-        self.field_network.values = nn.Parameter(values.to(self.device))
+        exchange(self.field_network, "values", values, self._optimizers[0] if self._optimizers else None)
 
     @property
-    def world(self) -> World:
+    def world(self) -> BlockGrid:
         """The blocks as grids for kernels."""
         if self._world is None or self._world.labels is not self.labels.rows:
-            self._world = World.of(self.labels.rows)
+            self._world = BlockGrid.of(self.labels.rows)
         return self._world
 
     def in_blocks_frame(self, rays: Rays) -> Rays:
@@ -288,7 +290,7 @@ class GANcraft(Method):
         rays = shot.camera.rays(bordered(x, y, width, height))
         gallery = landscapes_of(c.landscapes, 2 * c.crop, c.seed)
         chosen = [chance(c.landscapes, generator) for _ in range(c.landscapes_per_step)]
-        parts = [part_of(gallery, k, c.crop, generator) for k in chosen]
+        parts = [part_of(gallery, k, (width, height), generator) for k in chosen]
         rgb, ground = (torch.stack(column) for column in zip(*parts, strict=True))
         styles = [k % len(STYLES) for k in chosen]
         device = self.device
@@ -306,15 +308,16 @@ class GANcraft(Method):
         c, real, labels = self.config, batch.landscapes, channels(batch.ground, len(LABELS))
         mean, log_variance = self.painter.encoder(real)
         fake = self.painter(labels, drawn(mean, log_variance, generator))
-        adversary = self.painter_adversary
-        against = discriminator_loss(adversary(real, labels), adversary(fake.detach(), labels))
-        descend({"painter_adversary": against}, [self._optimizers[3]])
+        adversary, count = self.painter_adversary, len(real)
+        adversary.iterate()
+        for_real, for_fake = adversary(torch.cat([real, fake.detach()]), labels.repeat(2, 1, 1, 1)).split(count)
+        descend({"painter_adversary": discriminator_loss(for_real, for_fake)}, [self._optimizers[3]])
         with held(adversary):
-            like = perceptual(adversary.features(fake), adversary.features(real))
+            of_fake, of_real = halves(adversary.features(torch.cat([fake, real])), count)
             terms = {
-                "painter_gan": generator_loss(adversary(fake, labels)),
+                "painter_gan": generator_loss(adversary.logits(of_fake, labels)),
                 "painter_l2": c.l2_weight * (fake - real).square().mean(),
-                "painter_perceptual": c.perceptual_weight * like,
+                "painter_perceptual": c.perceptual_weight * perceptual(of_fake, of_real),
                 "painter_kl": c.kl_weight * divergence(mean, log_variance),
             }
             descend(terms, [self._optimizers[2]])
@@ -327,23 +330,25 @@ class GANcraft(Method):
         labels = channels(batch.labels, len(LABELS), smooth)
         real, real_labels = batch.landscapes[:1], channels(batch.ground[:1], len(LABELS), smooth)
         with torch.no_grad():
-            pseudo = self.painter(labels, drawn(*self.painter.encoder(real), generator))
+            mean, log_variance = self.painter.encoder(real)
+            pseudo = self.painter(labels, drawn(mean, log_variance, generator))
         mean, log_variance = self.encoder(pseudo)
         self.styles[batch.styles[0]].lerp_(mean[0].detach(), 1 - KEPT_STYLE)
         height, width = batch.labels.shape[1:]
         fake, _, opacity = self.picture(batch.rays, (width, height), drawn(mean, log_variance, generator), generator)
-        adversary = self.adversary
-        logits = adversary(fake.detach(), labels)
-        against = c.gan_weight * discriminator_loss(adversary(real, real_labels), logits)
-        against = against + c.pseudo_gan_weight * discriminator_loss(adversary(pseudo, labels), logits)
+        self.adversary.iterate()
+        shown = torch.cat([real, pseudo, fake.detach()])
+        for_real, for_pseudo, for_fake = self.adversary(shown, torch.cat([real_labels, labels, labels]))
+        against = c.gan_weight * discriminator_loss(for_real, for_fake)
+        against = against + c.pseudo_gan_weight * discriminator_loss(for_pseudo, for_fake)
         descend({"adversary": against}, [self._optimizers[1]])
         error = (fake - pseudo).square().mean()
-        with held(adversary), held(self.painter_adversary):
-            features = self.painter_adversary.features
+        with held(self.adversary), held(self.painter_adversary):
+            like = perceptual(*halves(self.painter_adversary.features(torch.cat([fake, pseudo])), 1))
             terms = {
-                "gan": (c.gan_weight + c.pseudo_gan_weight) * generator_loss(adversary(fake, labels)),
+                "gan": (c.gan_weight + c.pseudo_gan_weight) * generator_loss(self.adversary(fake, labels)),
                 "l2": c.l2_weight * error,
-                "perceptual": c.perceptual_weight * perceptual(features(fake), features(pseudo)),
+                "perceptual": c.perceptual_weight * like,
                 "kl": c.kl_weight * divergence(mean, log_variance),
                 "opacity": c.opacity_weight * ((1 - opacity) * (batch.labels[0] != SKY)).square().mean(),
             }
@@ -356,19 +361,19 @@ class GANcraft(Method):
         corners = {"params": [self.field_network.values], "lr": c.corner_learning_rate}
         own = (self.encoder, self.style, self.field_network, self.sky, self.renderer)
         networks = [self.behind, *(p for m in own for p in m.parameters() if p is not self.field_network.values)]
-        betas = {"betas": (c.momentum, 0.999), "eps": 1e-7}
-        against = {"betas": (0.0, 0.999), "eps": 1e-7}
+        adam = partial(torch.optim.Adam, eps=1e-7)
+        own_betas, other_betas = (c.momentum, 0.999), (0.0, 0.999)
         self._optimizers = [
-            torch.optim.Adam([{"params": networks, "lr": c.learning_rate}, corners], **betas),
-            torch.optim.Adam(self.adversary.parameters(), c.adversary_learning_rate, **against),
-            torch.optim.Adam(self.painter.parameters(), c.painter_learning_rate, **betas),
-            torch.optim.Adam(self.painter_adversary.parameters(), c.painter_adversary_learning_rate, **against),
+            adam([{"params": networks, "lr": c.learning_rate}, corners], betas=own_betas),
+            adam(self.adversary.parameters(), c.adversary_learning_rate, betas=other_betas),
+            adam(self.painter.parameters(), c.painter_learning_rate, betas=own_betas),
+            adam(self.painter_adversary.parameters(), c.painter_adversary_learning_rate, betas=other_betas),
         ]
         return self._optimizers
 
 
 @dataclass(frozen=True)
-class World:
+class BlockGrid:
     """Blocks as grids for kernels.
 
     labels:   (1, x, y, z)
@@ -385,7 +390,7 @@ class World:
     nodes: kernels.Nodes
 
     @staticmethod
-    def of(labels: Tensor) -> World:
+    def of(labels: Tensor) -> BlockGrid:
         solid = labels[0] > SKY
         shape, device = tuple(solid.shape), labels.device
         occupied = torch.zeros((1, *[max(shape)] * 3), dtype=torch.bool, device=device)
@@ -394,8 +399,9 @@ class World:
         for x, y, z in np.ndindex(2, 2, 2):
             near[x : x + shape[0], y : y + shape[1], z : z + shape[2]] |= solid
         corners = near.flatten().nonzero()[:, 0]
-        nodes = kernels.Nodes.of(corners, tuple(near.shape))
-        return World(labels, torch.tensor(shape, device=device).float(), occupied, occupied.float(), corners, nodes)
+        x, y, z = near.shape
+        nodes = kernels.Nodes.of(corners, (x, y, z))
+        return BlockGrid(labels, torch.tensor(shape, device=device).float(), occupied, occupied.float(), corners, nodes)
 
     def sampled(self, rays: Rays, step: float, depth: float, jitter: Float[Tensor, " ray"] | None) -> Samples:
         """Samples of rays within blocks, a step apart; each ray ends after a way of `depth` blocks through them.
@@ -442,12 +448,13 @@ def landscapes_of(count: int, size: int, seed: int) -> list[tuple[Tensor, Tensor
 
 
 def part_of(
-    gallery: list[tuple[Tensor, Tensor]], number: int, size: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "3 size size"], Int[Tensor, "size size"]]:
-    """A random square of a landscape, mirrored or not: colours in [-1, 1] and labels."""
+    gallery: list[tuple[Tensor, Tensor]], number: int, size: tuple[int, int], generator: torch.Generator
+) -> tuple[Float[Tensor, "3 height width"], Int[Tensor, "height width"]]:
+    """A random part of a landscape, (width, height) pixels, mirrored or not: colours in [-1, 1] and labels."""
     rgb, labels = gallery[number]
-    x, y = (chance(n - size + 1, generator) for n in labels.shape[::-1])
-    rgb, labels = rgb[:, y : y + size, x : x + size], labels[y : y + size, x : x + size]
+    x, y = (chance(n - own + 1, generator) for n, own in zip(labels.shape[::-1], size, strict=True))
+    part = slice(y, y + size[1]), slice(x, x + size[0])
+    rgb, labels = rgb[:, *part], labels[part]
     if chance(2, generator):
         rgb, labels = rgb.flip(-1), labels.flip(-1)
     return rgb.float() / 127.5 - 1, labels

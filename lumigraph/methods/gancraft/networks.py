@@ -17,6 +17,7 @@ from ...components.fields.encodings import FrequencyEncoding
 SLOPE = 0.2  # of leaky rectifiers
 BORDER = 4  # pixels by which the neural renderer sees beyond each pixel: four convolutions of 3x3
 SMALLEST = 4  # pixels across, at which the style encoder ends
+MAX_LOG_VARIANCE, FIRST_LOG_VARIANCE = 4.0, -3.0  # of style codes, either way, and before anything is learnt
 FIRST_DENSITY = 4.0  # of all blocks, per block, before anything is learnt
 
 Style = Float[Tensor, "1 style"]
@@ -39,6 +40,7 @@ class StyleEncoder(nn.Module):
         widths = [3, *(min(width << k, 8 * width) for k in range(int(math.log2(size // SMALLEST))))]
         self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths))
         self.out = nn.Linear(widths[-1] * SMALLEST**2, 2 * code)
+        nn.init.constant_(self.out.bias[code:], FIRST_LOG_VARIANCE)
 
     def forward(self, pictures: Pictures) -> tuple[Float[Tensor, "picture code"], Float[Tensor, "picture code"]]:
         """pictures: in [-1, 1]"""
@@ -46,7 +48,7 @@ class StyleEncoder(nn.Module):
         for layer in self.layers:
             x = rectified(layer(x))
         mean, log_variance = self.out(x.flatten(1)).chunk(2, -1)
-        return mean, log_variance
+        return mean, MAX_LOG_VARIANCE * (log_variance / MAX_LOG_VARIANCE).tanh()
 
 
 def drawn(mean: Tensor, log_variance: Tensor, generator: torch.Generator) -> Float[Tensor, "picture code"]:
@@ -151,18 +153,16 @@ class NeuralRenderer(nn.Module):
         super().__init__()
         self.modulation = nn.Linear(style, 4 * width)
         self.first = nn.Conv2d(features, width, 1)
-        self.blocks = nn.ModuleList(
-            nn.ModuleList([nn.Conv2d(width, width, k, 1, k // 2), nn.Conv2d(width, width, k, 1, k // 2)])
-            for k in (3, 3, 1)
+        self.one, self.other = (
+            nn.ModuleList(nn.Conv2d(width, width, kernel, 1, kernel // 2) for kernel in (3, 3, 1)) for _ in range(2)
         )
         self.out = nn.Conv2d(width, 3, 1)
 
     def forward(self, features: Pictures, style: Style) -> Pictures:
         scale_a, shift_a, scale_b, shift_b = self.modulation(style)[..., None, None].chunk(4, 1)
         x = rectified(self.first(features))
-        for (one, other), scale, shift in zip(
-            self.blocks, (scale_a, scale_b, None), (shift_a, shift_b, None), strict=True
-        ):
+        modulations = ((scale_a, shift_a), (scale_b, shift_b), None)
+        for one, other, modulation in zip(self.one, self.other, modulations, strict=True):
             x = x + other(rectified(one(x)))
-            x = rectified(x if scale is None else x * (1 + scale) + shift)
+            x = rectified(x if modulation is None else x * (1 + modulation[0]) + modulation[1])
         return self.out(x).tanh()

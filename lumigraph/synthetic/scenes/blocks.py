@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ...datasets.world import Blocks
+from ...datasets.world import BlockLabels
 from ...files.ranges import Seed, between
 from ..block_stage import stage_of
 from ..stage import Pictures, SyntheticStage
@@ -30,12 +30,12 @@ class Options(Pictures):
     land: Seed = 1
 
 
-def blocks(width: int = 64, land: int = 1) -> Blocks:
+def blocks(options: Options) -> BlockLabels:
     """The world's blocks."""
-    return cubes(terrain(width, land))
+    return cubes(terrain(options.width, options.land))
 
 
-def cubes(land: Terrain) -> Blocks:
+def cubes(land: Terrain) -> BlockLabels:
     """Land as cubes: soil below grass, stone below all, water up to its level, trunks and crowns of trees."""
     height = np.maximum(np.round(land.ground), 1).astype(int)
     side, top = len(height), int(max(height.max(), WATER_LEVEL)) + MARGIN
@@ -52,13 +52,13 @@ def cubes(land: Terrain) -> Blocks:
     labels[wet[:, :, None] & (z >= np.minimum(height, level - 1)[:, :, None]) & (z < level)] = WATER
     for x, y, tall, radius in land.trees:
         plant(labels, int(x), int(y), int(height[int(x), int(y)]), round(tall), radius)
-    return Blocks(labels[:, :, : int(np.flatnonzero((labels > 0).any((0, 1)))[-1]) + 2])
+    return BlockLabels(labels[:, :, : int(np.flatnonzero((labels > 0).any((0, 1)))[-1]) + 2])
 
 
 def plant(labels: np.ndarray, x: int, y: int, ground: int, tall: int, radius: float) -> None:
     """A trunk, and a crown around its upper half."""
     labels[x, y, ground : ground + tall - 1] = TREE
-    i, j, k = np.indices(labels.shape, sparse=True)
+    i, j, k = np.ogrid[tuple(map(slice, labels.shape))]
     centre = ground + 0.65 * tall
     ball = ((i - x) ** 2 + (j - y) ** 2) / (radius + 0.2) ** 2 + ((k + 0.5 - centre) / (0.42 * tall)) ** 2 <= 1
     labels[ball & (labels == 0)] = TREE
@@ -66,4 +66,4 @@ def plant(labels: np.ndarray, x: int, y: int, ground: int, tall: int, radius: fl
 
 def stage(size: int = 128, views: int = 60, seed: int = 0, width: int = 64, land: int = 1) -> SyntheticStage:
     """Cameras above the land; held-out ones walk around its middle."""
-    return stage_of(blocks(width, land), size, views, seed, "blocks")
+    return stage_of(cubes(terrain(width, land)), size, views, seed, "blocks")

@@ -9,8 +9,7 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, instance_norm, interpolate, l1_loss, one_hot
-from torch.nn.utils.parametrizations import spectral_norm
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, instance_norm, interpolate, l1_loss, normalize, one_hot
 
 from .networks import Pictures, StyleEncoder, rectified
 
@@ -22,6 +21,12 @@ def convolution(inputs: int, outputs: int) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, 3, 1, 1, padding_mode="replicate")
 
 
+def pooled(labels: Pictures, like: Pictures) -> Pictures:
+    """Means of label maps over the pixels of other pictures."""
+    height, width = like.shape[-2:]
+    return adaptive_avg_pool2d(labels, (height, width))
+
+
 class Spade(nn.Module):
     """Normalisation whose scale and shift are convolutions of the label map (Park 2019, eq. 1 to 3)."""
 
@@ -31,7 +36,7 @@ class Spade(nn.Module):
         self.modulation = convolution(hidden, 2 * channels)
 
     def forward(self, x: Pictures, labels: Pictures) -> Pictures:
-        scale, shift = self.modulation(rectified(self.shared(adaptive_avg_pool2d(labels, x.shape[-2:])))).chunk(2, 1)
+        scale, shift = self.modulation(rectified(self.shared(pooled(labels, x)))).chunk(2, 1)
         return instance_norm(x) * (1 + scale) + shift
 
 
@@ -51,7 +56,7 @@ class SpadeBlock(nn.Module):
         return self.beside(x) + y
 
 
-class Painter(nn.Module):
+class LabelPainter(nn.Module):
     """Pictures in [-1, 1] from label maps and a style code; its encoder finds the code of a picture.
 
     widths: channels from the coarsest resolution on, each twice as fine as the one before
@@ -70,49 +75,78 @@ class Painter(nn.Module):
     def forward(self, labels: Pictures, code: Float[Tensor, "picture code"]) -> Pictures:
         """labels: one channel for each, 1 where it is"""
         steps = len(self.blocks) - 1
-        size = [n >> steps for n in labels.shape[-2:]]
-        x = self.first(adaptive_avg_pool2d(labels, size)) + self.style(code)[..., None, None]
+        height, width = (n >> steps for n in labels.shape[-2:])
+        x = self.first(adaptive_avg_pool2d(labels, (height, width))) + self.style(code)[..., None, None]
         for k, block in enumerate(self.blocks):
-            x = block(x if k == 0 else interpolate(x, scale_factor=2.0), labels)
+            x = block(interpolate(x, size=[n >> steps - k for n in labels.shape[-2:]]), labels)
         return self.out(rectified(x)).tanh()
 
 
+class SpectralConvolution(nn.Conv2d):
+    """Convolution whose weights have a spectral norm of 1, W / (u^T W v), by power iteration (Miyato 2018, eq. 8)."""
+
+    u: Tensor
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1):
+        super().__init__(inputs, outputs, kernel, stride, kernel // 2)
+        self.register_buffer("u", normalize(torch.randn(outputs), dim=0))
+
+    @torch.no_grad()
+    def iterate(self) -> None:
+        """One step towards the first singular vector."""
+        weights = self.weight.flatten(1)
+        self.u = normalize(weights @ normalize(self.u @ weights, dim=0), dim=0)
+
+    def forward(self, x: Pictures) -> Pictures:
+        norm = (self.u @ self.weight.flatten(1)).norm()  # u^T W v, for v is along u^T W
+        return self._conv_forward(x, self.weight / norm, self.bias)
+
+
 class Adversary(nn.Module):
-    """Logits of patches at three resolutions: a feature pyramid whose features are compared with those of the labels
-    there (Liu 2019, section 3.2). Weights have a spectral norm of 1."""
+    """Features of pictures, and logits of patches at three resolutions: a feature pyramid whose features are compared
+    with those of the labels there (Liu 2019, section 3.2). Weights have a spectral norm of 1."""
 
     def __init__(self, labels: int, width: int):
         super().__init__()
-        widths = [width << min(k, 3) for k in range(5)]
-        lateral = 2 * width
+        widths, lateral = [width << min(k, 3) for k in range(5)], 2 * width
+        self.down = nn.ModuleList(SpectralConvolution(a, b, 3, 2) for a, b in pairwise([3, *widths]))
+        self.lateral = nn.ModuleList(SpectralConvolution(b, lateral, 1) for b in widths[1:])
+        self.last = nn.ModuleList(SpectralConvolution(lateral, lateral, 3) for _ in LEVELS)
+        self.score, self.label = SpectralConvolution(lateral, 1, 1), SpectralConvolution(labels, lateral, 1)
 
-        def normed(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Module:
-            return spectral_norm(nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2))
-
-        self.down = nn.ModuleList(normed(a, b, 3, 2) for a, b in pairwise([3, *widths]))
-        self.lateral = nn.ModuleList(normed(b, lateral, 1) for b in widths[1:])
-        self.last = nn.ModuleList(normed(lateral, lateral, 3) for _ in LEVELS)
-        self.score, self.label = normed(lateral, 1, 1), normed(labels, lateral, 1)
+    def iterate(self) -> None:
+        """Bring the norms of all weights up to date, once a step."""
+        for module in self.modules():
+            if isinstance(module, SpectralConvolution):
+                module.iterate()
 
     def features(self, pictures: Pictures) -> list[Pictures]:
-        """Features from fine to coarse, each half as large as the one before."""
+        """Features from fine to coarse, each half as large as the one before. pictures: in [-1, 1]"""
         found = []
         for layer in self.down:
             pictures = rectified(layer(pictures))
             found.append(pictures)
         return found
 
-    def forward(self, pictures: Pictures, labels: Pictures) -> Float[Tensor, " logit"]:
-        """Logits of all patches. pictures: in [-1, 1]; labels: one channel for each"""
-        features, embedded, logits = self.features(pictures), self.label(labels), []
+    def forward(self, pictures: Pictures, labels: Pictures) -> Float[Tensor, "picture logit"]:
+        """Logits of the patches of each picture. labels: one channel for each"""
+        return self.logits(self.features(pictures), labels)
+
+    def logits(self, features: Sequence[Pictures], labels: Pictures) -> Float[Tensor, "picture logit"]:
+        """Logits of patches, from the features of pictures."""
+        embedded, logits = self.label(labels), []
         x = self.lateral[-1](features[-1])
         for level, last in zip(reversed(LEVELS), self.last, strict=True):
-            x = interpolate(x, size=features[level - 1].shape[-2:], mode="bilinear") + self.lateral[level - 2](
-                features[level - 1]
-            )
+            beside = features[level - 1]
+            x = interpolate(x, size=beside.shape[-2:], mode="bilinear") + self.lateral[level - 2](beside)
             y = rectified(last(x))
-            logits.append(self.score(y)[:, 0] + (y * adaptive_avg_pool2d(embedded, y.shape[-2:])).sum(1))
-        return torch.cat([x.flatten() for x in logits])
+            logits.append(self.score(y)[:, 0] + (y * pooled(embedded, y)).sum(1))
+        return torch.cat([x.flatten(1) for x in logits], -1)
+
+
+def halves(features: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor]]:
+    """Features of the first so many pictures, and of the others."""
+    return [x[:count] for x in features], [x[count:] for x in features]
 
 
 def perceptual(fake: Sequence[Pictures], real: Sequence[Pictures]) -> Tensor:
