@@ -106,6 +106,11 @@ class Runner:
         if running and running.child and (running.item, running.share) == (task.item, task.share):
             running.child.send_signal(signal.SIGINT)
 
+    def extend(self, item: Item, **budget: Any) -> None:
+        """Give a training another budget. Its command saves and ends, and is the next one again."""
+        change_making(item, **{"quality": None, "seconds": None, "steps": None} | budget)
+        self.stop(QueuedJob(item, None), "queued")
+
     def release(self, item: Item) -> None:
         """Stop the jobs of an item that is about to go, and wait until no command works in it."""
         for task in self.queue():

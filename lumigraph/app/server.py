@@ -181,7 +181,7 @@ class App:
     def detail(self, item: Item) -> dict[str, Any]:
         """All that the page of an item shows."""
         record, job = item.record, read_job(item)
-        files = pictures.files_of(item.photographs) if item.kind != "run" else {}
+        files = pictures.photographs_of(item)
         runs = [rows.run_row(path) for path in item.runs]
         current = self.runner.current
         return {
@@ -203,7 +203,7 @@ class App:
         }
 
     def advice(self, item: Item) -> list[dict[str, Any]]:
-        return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.files_of(item.photographs))]
+        return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.photographs_of(item))]
 
     def rename(self, item: Item, body: TitleBody) -> dict[str, Any]:
         return {"key": projects.rename(item, body.title).key}
@@ -218,6 +218,8 @@ class App:
 
     def make(self, item: Item, body: MakeBody) -> dict[str, Any]:
         name = methods.check(body.method)
+        if item.kind == "scene":  # which stays as it is
+            item = projects.new_project(self.root, item.path.name, item.path)
         relocate(item)
         budget = {"seconds": 60 * body.minutes} if body.minutes else {"quality": body.quality}
         rest = {"mapper": body.mapper, "frames": body.frames, "downscale": body.downscale}
@@ -236,6 +238,10 @@ class App:
         budget: dict[str, Any] = {"quality": body.quality} if body.quality else {}
         if body.minutes:
             budget = {"seconds": 60 * body.minutes}
+        job = read_job(item).make
+        if budget and job and (job.state, job.stage) == ("running", "train"):
+            self.runner.extend(item, **budget)
+            return self.detail(item)
         self.views.close(item.path)
         relocate(item)
         jobs.go_on(item, **budget)
