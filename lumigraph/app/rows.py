@@ -54,7 +54,7 @@ def run_row(path: Path) -> dict[str, Any]:
 def making_row(item: Item, job: Making) -> dict[str, Any]:
     row: dict[str, Any] = {
         name: getattr(job, name)
-        for name in ("state", "stage", "quality", "seconds", "method", "mapper", "run", "fault", "begun")
+        for name in ("state", "stage", "quality", "seconds", "method", "mapper", "run", "fault")
     }
     if job.state == "queued":
         return row

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import mimetypes
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -35,9 +34,10 @@ from . import jobs, pictures, progress, projects, rows, sharing, uploads
 from .job_record import JobState, Mapper, read_job
 from .jobs import Runner
 from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
-from .scene_views import SceneViews, forward, forward_messages
+from .scene_views import SceneViews, answers, forward, forward_messages
 
 PAGE = Path(__file__).parent / "page"
+MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 1 << 16  # of a request that is no upload
 SWEEP_SECONDS = 15.0  # between looks for viewers without clients
 CONTENT_SECURITY = (
@@ -206,9 +206,12 @@ class App:
         return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.photographs_of(item))]
 
     def rename(self, item: Item, body: TitleBody) -> dict[str, Any]:
+        self.views.close(item.path)
         return {"key": projects.rename(item, body.title).key}
 
     def duplicate(self, item: Item) -> dict[str, Any]:
+        if (current := self.runner.current) and current.item == item:
+            raise LumigraphError("This scene is being made; pause it first, then duplicate it")
         return {"key": projects.duplicate(item).key}
 
     def delete(self, item: Item) -> dict[str, Any]:
@@ -268,8 +271,6 @@ class App:
         """Address of the scene view of a run, and whether it answers."""
         current = self.runner.current
         if not run and current and current.item == item and current.share is None and (port := current.port):
-            from .scene_views import answers
-
             return {"url": f"/scene/{quote(item.key)}/live/", "ready": answers(port)}
         path = item.run(run) if run else next(iter(reversed(item.runs)), None)
         if path is None:
@@ -320,7 +321,7 @@ def build(app: App) -> ASGIApp:
         if name not in os.listdir(PAGE):
             return PlainTextResponse("There is no such file.\n", 404)
         about = {"Cache-Control": "no-cache", "Content-Security-Policy": CONTENT_SECURITY}
-        return FileResponse(PAGE / name, media_type=mimetypes.guess_type(name)[0], headers=about)
+        return FileResponse(PAGE / name, media_type=MEDIA_TYPES[Path(name).suffix], headers=about)
 
     async def take(request: Request) -> Response:
         item = await asyncio.to_thread(app.item, request.path_params["key"])
