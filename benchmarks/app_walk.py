@@ -34,8 +34,8 @@ PICTURE_BYTES = 150_000  # of a screenshot
 class Walk:
     """The app's process, a browser at two sizes, and the times of its steps."""
 
-    def __init__(self, output: Path, port: int):
-        self.output, self.port = output, port
+    def __init__(self, output: Path, port: int, patience: float):
+        self.output, self.port, self.patience = output, port, patience
         self.url = f"http://127.0.0.1:{port}"
         self.times: dict[str, float] = {}
         self.app: subprocess.Popen[bytes] | None = None
@@ -69,7 +69,7 @@ class Walk:
 
     def shot(self, page: Any, name: str) -> None:
         """Save a screenshot as JPEG of at most PICTURE_BYTES."""
-        image = Image.open(io.BytesIO(page.screenshot(timeout=120_000))).convert("RGB")
+        image = Image.open(io.BytesIO(page.screenshot(timeout=600_000))).convert("RGB")
         for quality in (88, 80, 70, 55):
             image.save(out := io.BytesIO(), "JPEG", quality=quality)
             if out.tell() < PICTURE_BYTES:
@@ -111,13 +111,13 @@ def windows(walk: Walk) -> Iterator[tuple[Any, Any]]:
         desk = browser.new_context(viewport=DESK, accept_downloads=True).new_page()
         phone = browser.new_context(viewport=PHONE, device_scale_factor=2, has_touch=True, is_mobile=True).new_page()
         for page in (desk, phone):
-            page.set_default_timeout(120_000)
+            page.set_default_timeout(1000 * walk.patience)
             page.on("pageerror", lambda error: walk.faults.append(str(error)))
         yield desk, phone
         browser.close()
 
 
-def go(walk: Walk, files: list[Path], minutes: float | None, kill: bool, patience: float) -> None:
+def go(walk: Walk, files: list[Path], minutes: float | None, kill: bool) -> None:
     with windows(walk) as (desk, phone):
         desk.goto(walk.url)
         desk.get_by_text("Drop photographs").first.wait_for()
@@ -126,7 +126,7 @@ def go(walk: Walk, files: list[Path], minutes: float | None, kill: bool, patienc
         drop(desk, files)
         desk.wait_for_url("**/#*")
         key = desk.url.rpartition("#")[2]
-        until(lambda: len(walk.detail(key)["photographs"]) == len(files), patience)
+        until(lambda: len(walk.detail(key)["photographs"]) == len(files), walk.patience)
         desk.get_by_role("button", name="Make the scene").wait_for()
         walk.mark("all files are there")
         desk.wait_for_timeout(3000)
@@ -136,17 +136,17 @@ def go(walk: Walk, files: list[Path], minutes: float | None, kill: bool, patienc
             desk.get_by_label("Minutes of training").fill(str(minutes))
         desk.get_by_role("button", name="Make the scene").click()
         walk.mark("asked to make it")
-        stages(walk, desk, phone, key, kill, patience)
-        crop_and_share(walk, desk, phone, key, patience)
+        stages(walk, desk, phone, key, kill)
+        crop_and_share(walk, desk, phone)
     if walk.faults:
         raise SystemExit("The page complained: " + "; ".join(walk.faults))
 
 
-def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool, patience: float) -> None:
+def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
     """From photographs to a run, with a picture of each stage."""
 
     def making() -> dict[str, Any]:
-        made = walk.detail(key)["make"]
+        made = until(lambda: walk.detail(key)["make"], walk.patience)
         if made["state"] == "failed":
             raise SystemExit(made["fault"])
         return made
@@ -155,19 +155,19 @@ def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool, patience: fl
         states = json.load(urlopen(f"{walk.url}/api/items/{key}/states", timeout=120)).values()
         return sum(bool(one.get("features")) for one in states)
 
-    until(lambda: making()["stage"] == "train" or marks() > 3, patience)
+    until(lambda: making()["stage"] == "train" or marks() > 3, walk.patience)
     walk.mark("details of four photographs")
     if kill:
         before = marks()
         walk.kill("details are found")
-        until(lambda: marks() >= before, patience)
+        until(lambda: marks() >= before, walk.patience)
     desk.wait_for_timeout(1500)
     walk.shots(desk, phone, "3-details")
 
     def cameras() -> int:
         return len(json.load(urlopen(f"{walk.url}/api/items/{key}/model", timeout=120))["cameras"])
 
-    until(lambda: cameras() > 3 or making()["stage"] == "train", patience, 0.2)
+    until(lambda: cameras() > 3 or making()["stage"] == "train", walk.patience, 0.2)
     walk.mark("first cameras in 3-D")
     with contextlib.suppress(Exception):
         desk.get_by_role("tab", name="Cameras").click(timeout=5000)
@@ -175,24 +175,24 @@ def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool, patience: fl
     walk.shots(desk, phone, "4-cameras")
     if kill:
         walk.kill("cameras are placed")
-    until(lambda: making()["stage"] == "train", patience)
+    until(lambda: making()["stage"] == "train", walk.patience)
     walk.mark("all cameras are placed")
-    until(lambda: making()["progress"].get("step", 0) > 20 or making()["state"] == "done", patience)
+    until(lambda: making()["progress"].get("step", 0) > 20 or making()["state"] == "done", walk.patience)
     desk.get_by_role("tab", name="Scene").click()
     desk.frame_locator("iframe").get_by_role("tab", name="Crop").wait_for()
     walk.mark("first picture of the scene")
     if kill:
         step = making()["progress"].get("step", 0)
         walk.kill("it trains")
-        until(lambda: making()["progress"].get("step", 0) >= step or making()["state"] == "done", patience)
+        until(lambda: making()["progress"].get("step", 0) >= step or making()["state"] == "done", walk.patience)
         desk.reload()
     desk.wait_for_timeout(15_000)
     walk.shots(desk, phone, "5-training")
-    until(lambda: making()["state"] == "done", patience)
+    until(lambda: making()["state"] == "done", walk.patience)
     walk.mark("the scene is ready")
 
 
-def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, patience: float) -> None:
+def crop_and_share(walk: Walk, desk: Any, phone: Any) -> None:
     scene = desk.frame_locator("iframe")
     scene.get_by_role("tab", name="Crop").wait_for()
     desk.wait_for_timeout(20_000)
@@ -205,7 +205,7 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, patience: float)
     walk.shot(desk, "7-crop-desk")
     desk.get_by_role("button", name="Make Web page").click()
     link = desk.get_by_role("link", name="Download Web page")
-    link.wait_for(timeout=1000 * patience)
+    link.wait_for()
     walk.mark("the page is made")
     link.scroll_into_view_if_needed()
     walk.shots(desk, phone, "8-share")
@@ -214,7 +214,7 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, patience: float)
     page = walk.output / download.value.suggested_filename
     download.value.save_as(page)
     for window, name in ((desk, "desk"), (phone, "phone")):
-        window.goto(page.resolve().as_uri(), timeout=120_000)
+        window.goto(page.resolve().as_uri(), timeout=600_000)
         window.wait_for_timeout(15_000)
         if name == "desk":
             walk.mark("the downloaded page is open")
@@ -233,10 +233,10 @@ def main() -> None:
     place = given.photographs
     files = [place] if place.is_file() else sorted(path for path in place.iterdir() if not path.name.startswith("."))
     given.output.mkdir(parents=True, exist_ok=True)
-    walk = Walk(given.output, given.port)
+    walk = Walk(given.output, given.port, given.patience)
     walk.start()
     try:
-        go(walk, files, given.minutes, given.kill, given.patience)
+        go(walk, files, given.minutes, given.kill)
     finally:
         if walk.app:
             walk.app.send_signal(signal.SIGINT)

@@ -408,6 +408,34 @@ def test_a_job_is_paused_and_goes_on_by_resume(app, running, project):
     assert calls(app, project)[3][2:4] == ["--seconds", "120.0"]
 
 
+def test_a_training_gets_more_time_while_it_runs(app, running, project):
+    put(running, project, "a.jpg", jpeg())
+    let(app)
+    running.post(f"/api/items/{project}/make", json={})
+    wait(lambda: state(running, project) == "done")
+    (app.root / "go").unlink()
+    running.post(f"/api/items/{project}/more", json={"minutes": 1})
+    wait(lambda: len(calls(app, project)) == 3)
+    running.post(f"/api/items/{project}/more", json={"quality": "good"})
+    wait(lambda: len(calls(app, project)) == 4)
+    assert state(running, project) == "running"
+    let(app)
+    wait(lambda: state(running, project) == "done")
+    assert calls(app, project)[3][0] == "resume" and calls(app, project)[3][2:4] == ["--quality", "good"]
+
+
+def test_a_scene_with_poses_is_trained_without_a_capture(app, running, ball_folder):
+    scene = app.root / "scenes" / "ball"
+    shutil.copytree(ball_folder, scene)
+    let(app)
+    (card,) = running.get("/api/home").json()["cards"]
+    assert (card["kind"], card["key"]) == ("scene", "scenes:ball")
+    made = running.post("/api/items/scenes:ball/make", json={"minutes": 1}).json()
+    wait(lambda: state(running, made["key"]) == "done")
+    (train,) = calls(app, made["key"])
+    assert train[:3] == ["train", "gaussian-splatting", str(scene)] and train[5:7] == ["--seconds", "60.0"]
+
+
 def test_jobs_wait_for_each_other_and_go_with_their_project(app, running):
     keys = [new_project(app.root, name).key for name in ("one", "two")]
     for key in keys:

@@ -132,7 +132,8 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "jump": ("jump procedural:ring,size=24,views=6 pair.png --size 128", ("pair.png",)),
 }
 WRITE_NOTHING = {"info", "methods"}
-WITHIN_RUNS = {"resume", "view"}  # see the tests of checkpoints and of what is saved in the viewer
+# See the tests of checkpoints, of what is saved in the viewer, and of the app, which makes folders of its own.
+WITHIN_RUNS = {"app", "resume", "view"}
 
 
 @pytest.fixture(scope="module")

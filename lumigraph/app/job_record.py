@@ -41,7 +41,6 @@ class Making:
     run: str = ""
     fault: str = ""
     process: int = 0
-    begun: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,6 @@ class ShareJob:
     asked: float
     fault: str = ""
     process: int = 0
-    begun: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,11 @@ class Runner:
         if running and running.child and (running.item, running.share) == (task.item, task.share):
             running.child.send_signal(signal.SIGINT)
 
+    def extend(self, item: Item, **budget: Any) -> None:
+        """Give a training another budget. Its command saves and ends, and is the next one again."""
+        change_making(item, **{"quality": None, "seconds": None, "steps": None} | budget)
+        self.stop(QueuedJob(item, None), "queued")
+
     def release(self, item: Item) -> None:
         """Stop the jobs of an item that is about to go, and wait until no command works in it."""
         for task in self.queue():
@@ -153,7 +158,7 @@ class Runner:
     def _run(self, task: QueuedJob) -> None:
         """The commands of a job, until it is done, was paused, or the app ends."""
         while not self._ended and (job := task.job) and job.state in ("queued", "running"):
-            task.set(state="running", fault="", begun=job.begun or time.time())
+            task.set(state="running", fault="")
             words, task.port = self._command(task)
             code = self._call(task, words)
             job = task.job
@@ -297,7 +302,7 @@ def go_on(item: Item, **options: Any) -> JobRecord:
             raise LumigraphError("This scene is being made already")
         assert job.make is not None
         budget = {"quality": None, "seconds": None, "steps": None} if options.keys() & BUDGETS else {}
-        queued = replace(job.make, **{**budget, **options, "state": "queued", "asked": time.time(), "begun": 0.0})
+        queued = replace(job.make, **{**budget, **options, "state": "queued", "asked": time.time()})
         return replace(job, make=replace(queued, fault=""))
 
     return change(item, again)

@@ -47,6 +47,14 @@ def files_of(folder: Path) -> dict[str, Path]:
     return {name: found[name] for name in sorted(found, key=natural)}
 
 
+def photographs_of(item: Item) -> dict[str, Path]:
+    """Photographs or the video of an item by name; of a scene those in its folder of images."""
+    if item.kind == "run":
+        return {}
+    images = item.path / "images"
+    return files_of(images if item.kind == "scene" and images.is_dir() else item.photographs)
+
+
 def is_film(path: Path) -> bool:
     return path.suffix.lower() in VIDEOS and path.is_file() and not path.name.startswith(".")
 

@@ -108,6 +108,11 @@ def capture_result(item: Item) -> dict[str, Any] | None:
     return read_json(path) if path.is_file() else None
 
 
+def progress_of(item: Item, job: Making) -> dict[str, Any]:
+    """Stage of a making and the share of it that is over, with the figures of its kind."""
+    return capture_progress(item) if job.stage == "capture" else training_progress(item, job)
+
+
 def capture_progress(item: Item) -> dict[str, Any]:
     """Stage of a capture under way: its name, the share of the whole that is over, seconds that are left if known."""
     marks = item.path / SCENE / "work" / "stages.json"

@@ -28,8 +28,7 @@ def card(item: Item) -> dict[str, Any]:
     except LumigraphError as fault:
         return {"key": item.key, "kind": item.kind, "title": item.path.name, "fault": str(fault), "age": 0, "bytes": 0}
     picture = next((path for run in reversed(runs) if (path := progress.picture_of_run(run))), None)
-    if picture is None and item.kind != "run":
-        picture = next(iter(pictures.files_of(item.photographs).values()), None)
+    picture = picture or next(iter(pictures.photographs_of(item).values()), None)
     return {
         "key": item.key,
         "kind": item.kind,
@@ -38,6 +37,7 @@ def card(item: Item) -> dict[str, Any]:
         "age": progress.age(item.path),
         "bytes": size,
         "state": job.state if job else "",
+        "share": progress.progress_of(item, job)["share"] if job and job.state == "running" else None,
         "fault": job.fault if job else "",
         "runs": len(runs),
         **about,
@@ -54,13 +54,11 @@ def run_row(path: Path) -> dict[str, Any]:
 def making_row(item: Item, job: Making) -> dict[str, Any]:
     row: dict[str, Any] = {
         name: getattr(job, name)
-        for name in ("state", "stage", "quality", "seconds", "method", "mapper", "run", "fault", "begun")
+        for name in ("state", "stage", "quality", "seconds", "method", "mapper", "run", "fault")
     }
     if job.state == "queued":
         return row
-    row["progress"] = (
-        progress.capture_progress(item) if job.stage == "capture" else progress.training_progress(item, job)
-    )
+    row["progress"] = progress.progress_of(item, job)
     if job.quality in QUALITIES[:-1]:
         row["next"] = QUALITIES[QUALITIES.index(job.quality) + 1]
     row["messages"] = log_lines(item)[-MAX_MESSAGES:]
@@ -93,13 +91,12 @@ def picture(item: Item, name: str, run: str) -> Path:
     found: Path | None = None
     if name:
         made = pictures.files_of(item.path / SCENE / "images")
-        found = pictures.files_of(item.photographs).get(name) or made.get(name)
+        found = pictures.photographs_of(item).get(name) or made.get(name)
     elif run:
         found = progress.picture_of_run(item.run(run))
     else:
         found = next(filter(None, map(progress.picture_of_run, reversed(item.runs))), None)
-        if found is None and item.kind != "run":
-            found = next(iter(pictures.files_of(item.photographs).values()), None)
+        found = found or next(iter(pictures.photographs_of(item).values()), None)
     if found is None:
         raise LumigraphError("There is no such picture; load the page again")
     return found

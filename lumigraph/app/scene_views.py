@@ -11,6 +11,7 @@ import http.client
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -49,9 +50,14 @@ class SceneViews:
     def __init__(self, folder: Path, program: Sequence[str] = PROGRAM):
         self.folder, self.program = folder, list(program)
         self.views: dict[Path, SceneView] = {}
+        self._opening = threading.Lock()
 
     def open(self, path: Path) -> SceneView:
         """The viewer of a run or a splat file, which may still be starting."""
+        with self._opening:
+            return self._open(path)
+
+    def _open(self, path: Path) -> SceneView:
         view = self.views.get(path)
         if view is None or view.child.poll() is not None:
             self._make_room()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import mimetypes
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -35,9 +34,10 @@ from . import jobs, pictures, progress, projects, rows, sharing, uploads
 from .job_record import JobState, Mapper, read_job
 from .jobs import Runner
 from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
-from .scene_views import SceneViews, forward, forward_messages
+from .scene_views import SceneViews, answers, forward, forward_messages
 
 PAGE = Path(__file__).parent / "page"
+MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 1 << 16  # of a request that is no upload
 SWEEP_SECONDS = 15.0  # between looks for viewers without clients
 CONTENT_SECURITY = (
@@ -181,7 +181,7 @@ class App:
     def detail(self, item: Item) -> dict[str, Any]:
         """All that the page of an item shows."""
         record, job = item.record, read_job(item)
-        files = pictures.files_of(item.photographs) if item.kind != "run" else {}
+        files = pictures.photographs_of(item)
         runs = [rows.run_row(path) for path in item.runs]
         current = self.runner.current
         return {
@@ -203,12 +203,15 @@ class App:
         }
 
     def advice(self, item: Item) -> list[dict[str, Any]]:
-        return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.files_of(item.photographs))]
+        return [{"text": one.text, "names": one.names} for one in pictures.advice(pictures.photographs_of(item))]
 
     def rename(self, item: Item, body: TitleBody) -> dict[str, Any]:
+        self.views.close(item.path)
         return {"key": projects.rename(item, body.title).key}
 
     def duplicate(self, item: Item) -> dict[str, Any]:
+        if (current := self.runner.current) and current.item == item:
+            raise LumigraphError("This scene is being made; pause it first, then duplicate it")
         return {"key": projects.duplicate(item).key}
 
     def delete(self, item: Item) -> dict[str, Any]:
@@ -218,6 +221,8 @@ class App:
 
     def make(self, item: Item, body: MakeBody) -> dict[str, Any]:
         name = methods.check(body.method)
+        if item.kind == "scene":  # which stays as it is
+            item = projects.new_project(self.root, item.path.name, item.path)
         relocate(item)
         budget = {"seconds": 60 * body.minutes} if body.minutes else {"quality": body.quality}
         rest = {"mapper": body.mapper, "frames": body.frames, "downscale": body.downscale}
@@ -236,6 +241,10 @@ class App:
         budget: dict[str, Any] = {"quality": body.quality} if body.quality else {}
         if body.minutes:
             budget = {"seconds": 60 * body.minutes}
+        job = read_job(item).make
+        if budget and job and (job.state, job.stage) == ("running", "train"):
+            self.runner.extend(item, **budget)
+            return self.detail(item)
         self.views.close(item.path)
         relocate(item)
         jobs.go_on(item, **budget)
@@ -262,8 +271,6 @@ class App:
         """Address of the scene view of a run, and whether it answers."""
         current = self.runner.current
         if not run and current and current.item == item and current.share is None and (port := current.port):
-            from .scene_views import answers
-
             return {"url": f"/scene/{quote(item.key)}/live/", "ready": answers(port)}
         path = item.run(run) if run else next(iter(reversed(item.runs)), None)
         if path is None:
@@ -314,7 +321,7 @@ def build(app: App) -> ASGIApp:
         if name not in os.listdir(PAGE):
             return PlainTextResponse("There is no such file.\n", 404)
         about = {"Cache-Control": "no-cache", "Content-Security-Policy": CONTENT_SECURITY}
-        return FileResponse(PAGE / name, media_type=mimetypes.guess_type(name)[0], headers=about)
+        return FileResponse(PAGE / name, media_type=MEDIA_TYPES[Path(name).suffix], headers=about)
 
     async def take(request: Request) -> Response:
         item = await asyncio.to_thread(app.item, request.path_params["key"])

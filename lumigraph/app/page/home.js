@@ -103,7 +103,8 @@ const STATES = { running: "being made", queued: "waiting", paused: "paused", fai
 
 function Card({ card, act, say, load, queue }) {
   const [title, setTitle] = useState(null);
-  const state = STATES[card.state] || "";
+  const share = card.share ? ` · ${Math.round(100 * card.share)} %` : "";
+  const state = STATES[card.state] ? STATES[card.state] + share : "";
   const score = card.psnr ? `${card.psnr.toFixed(1)} dB` : "";
   const facts = [card.method, score, bytes(card.bytes), ago(card.age)].filter(Boolean);
   const rename = (event) => {

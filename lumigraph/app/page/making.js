@@ -88,6 +88,7 @@ function Progress({ detail, act, show }) {
     <div class="row">
       <button onClick=${() => act(() => api("POST", `${of(detail.key)}/pause`))}>Pause</button>
       <button onClick=${() => act(() => api("POST", `${of(detail.key)}/stop`))}>${training ? "Stop here" : "Stop"}</button>
+      ${training && make.next && html`<button onClick=${() => act(() => api("POST", `${of(detail.key)}/more`, { quality: make.next }))}>More time: ${make.next}</button>`}
     </div>
     <${Messages} lines=${make.messages} />
   </section>`;

@@ -4,7 +4,9 @@ import { html, useEffect, useRef, useState } from "./preact.js";
 import { api, bytes, counted, of, pictureUrl } from "./common.js";
 import { isUploading, stateOf } from "./uploads.js";
 
-export function Photographs({ detail, states, advice, choose, act }) {
+const safe = (name) => name.replace(/[\s#]/g, "_"); // its name in the scene
+
+export function Photographs({ detail, states, advice, choose, act, marked }) {
   const [open, setOpen] = useState(null);
   const up = stateOf(detail.key);
   const sending = isUploading(detail.key);
@@ -13,7 +15,7 @@ export function Photographs({ detail, states, advice, choose, act }) {
   const named = Object.keys(states).length > 0 && detail.photographs.some((one) => one.video)
     ? Object.keys(states).map((name) => ({ name, version: detail.result ? "made" : "now" }))
     : detail.photographs;
-  const stateFor = (name) => states[name] || states[name.replace(/[\s#]/g, "_")] || {};
+  const stateFor = (name) => states[name] || states[safe(name)] || {};
   return html`<div class="pad">
     ${own && html`<div class="row">
       <label class="button">Add photographs<input type="file" multiple accept="image/*,video/*,.heic,.heif,.dng,.nef,.cr2,.cr3,.arw" onChange=${(event) => choose(event.target.files, detail.key)} /></label>
@@ -27,7 +29,7 @@ export function Photographs({ detail, states, advice, choose, act }) {
       ${up.faults.length > 5 && html`<li>and ${up.faults.length - 5} more</li>`}</ul>`}
     ${advice.length > 0 && html`<ul class="advice" aria-label="Advice">${advice.map((one) => html`<li>${one.text}</li>`)}</ul>`}
     <ul class="photographs" aria-label="Photographs">
-      ${named.map((one) => html`<${Photograph} key=${one.name} item=${detail.key} one=${one} state=${stateFor(one.name)} warned=${warned.has(one.name)}
+      ${named.map((one) => html`<${Photograph} key=${one.name} item=${detail.key} one=${one} state=${stateFor(one.name)} warned=${warned.has(one.name)} marked=${marked}
         open=${() => setOpen(one)} />`)}
     </ul>
     ${!named.length && !sending && html`<p class="faint">Drop photographs, a folder or a video here.</p>`}
@@ -44,10 +46,25 @@ function words(state) {
   return ["", ""];
 }
 
-function Photograph({ item, one, state, warned, open }) {
+// A photograph, small; while cameras are looked for, with its details as dots.
+function Photograph({ item, one, state, warned, marked, open }) {
   const [kind, text] = words(state);
+  const dots = useRef(null);
+  const found = marked && state.features ? state.features : 0;
+  useEffect(() => {
+    if (!found) return;
+    api("GET", `${of(item)}/features?${new URLSearchParams({ name: safe(one.name) })}`).then((features) => {
+      if (!dots.current) return;
+      const [width, height] = [264, 198];
+      Object.assign(dots.current, { width, height });
+      const context = dots.current.getContext("2d");
+      context.fillStyle = getComputedStyle(dots.current).getPropertyValue("--mark");
+      for (const [x, y] of features) context.fillRect(x * width - 1, y * height - 1, 2, 2);
+    }, () => {});
+  }, [found]);
   return html`<li><button class=${`photograph ${kind} ${warned ? "warned" : ""}`} onClick=${open} aria-label=${`${one.name}${text ? `, ${text}` : ""}${warned ? ", see the advice" : ""}`}>
     <img loading="lazy" alt="" src=${pictureUrl(item, { name: one.name, v: one.version })} onError=${(event) => (event.target.style.visibility = "hidden")} />
+    ${found > 0 && html`<canvas ref=${dots} aria-hidden="true"></canvas>`}
     ${one.video && html`<span class="badge">video</span>`}
     ${text && html`<span class=${`mark ${kind}`}>${text}</span>`}
   </button></li>`;
@@ -60,8 +77,7 @@ function Large({ detail, one, state, close, act, own }) {
   const [features, setFeatures] = useState([]);
   useEffect(() => {
     dialog.current.showModal();
-    const name = one.name.replace(/[\s#]/g, "_");
-    api("GET", `${of(detail.key)}/features?${new URLSearchParams({ name })}`).then(setFeatures, () => {});
+    api("GET", `${of(detail.key)}/features?${new URLSearchParams({ name: safe(one.name) })}`).then(setFeatures, () => {});
   }, []);
   const draw = () => {
     const image = dialog.current?.querySelector("img");

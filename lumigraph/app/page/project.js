@@ -58,6 +58,7 @@ export function Project({ item, say, choose, go }) {
     try {
       const found = await doing();
       if (found?.key === item) setDetail(found);
+      else if (found?.make) go(found.key); // a scene of the command line is made in a project of its own
       return found;
     } catch (error) {
       say(error.message);
@@ -109,7 +110,7 @@ export function Project({ item, say, choose, go }) {
         <div class=${`view on-${active}`} id="stage" role="tabpanel" aria-labelledby=${`tab-${active}`}>
           ${active === "scene" && html`<${SceneView} key=${detail.live ? "live" : viewed} item=${item} run=${detail.live ? "" : viewed} live=${detail.live} />`}
           ${active === "cameras" && html`<${Cameras} model=${model} />`}
-          ${active === "photographs" && html`<${Photographs} detail=${detail} states=${states} advice=${advice} choose=${choose} act=${act} />`}
+          ${active === "photographs" && html`<${Photographs} detail=${detail} states=${states} advice=${advice} choose=${choose} act=${act} marked=${capturing} />`}
           ${!active && html`<p class="faint pad">Nothing to show yet.</p>`}
         </div>
       </section>
