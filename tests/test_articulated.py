@@ -12,8 +12,6 @@ from bodies import BEND, bent, frame, skeleton
 from budgets import budget
 
 from lumigraph.components.skinning.bone_motion import BoneMotion, BoneNumbers, exponential, rotation_vectors
-from lumigraph.components.skinning.contact import bodies_of, contact_map, gaps
-from lumigraph.components.skinning.skinned_cloud import skinned
 from lumigraph.components.skinning.weight_volume import WeightNumbers, WeightVolume, distance
 from lumigraph.datasets.skeleton import rigid_inverse, rigid_product
 from lumigraph.errors import LumigraphError
@@ -22,6 +20,8 @@ from lumigraph.figures import ramp
 from lumigraph.gaussians.cloud import BAND_0
 from lumigraph.geometry import rotated, to_matrix
 from lumigraph.methods.articulated_splatting import ArticulatedSplatting
+from lumigraph.methods.articulated_splatting.contact import bodies_of, contact_map, gaps
+from lumigraph.methods.articulated_splatting.skinned_cloud import skinned
 from lumigraph.methods.humannerf import HumanNeRF
 from lumigraph.methods.humannerf.fields import NonRigidNumbers, NonRigidOffset
 
