@@ -12,8 +12,6 @@ from bodies import BEND, bent, frame, skeleton
 from budgets import budget
 
 from lumigraph.components.skinning.bone_motion import BoneMotion, BoneNumbers, exponential, rotation_vectors
-from lumigraph.components.skinning.contact import bodies_of, contact_map, gaps
-from lumigraph.components.skinning.skinned_cloud import skinned
 from lumigraph.components.skinning.weight_volume import WeightNumbers, WeightVolume, distance
 from lumigraph.datasets.skeleton import rigid_inverse, rigid_product
 from lumigraph.errors import LumigraphError
@@ -22,7 +20,10 @@ from lumigraph.figures import ramp
 from lumigraph.gaussians.cloud import BAND_0
 from lumigraph.geometry import rotated, to_matrix
 from lumigraph.methods.articulated_splatting import ArticulatedSplatting
+from lumigraph.methods.articulated_splatting.contact import bodies_of, contact_map, gaps
+from lumigraph.methods.articulated_splatting.skinned_cloud import skinned
 from lumigraph.methods.humannerf import HumanNeRF
+from lumigraph.methods.humannerf.fields import NonRigidNumbers, NonRigidOffset
 
 pytestmark = budget("methods", 6)
 KINDS = (ArticulatedSplatting, HumanNeRF)
@@ -109,7 +110,7 @@ def test_density_without_gradients_is_the_same():
 
 
 def test_the_offset_joins_over_its_share_of_the_budget():
-    offset = HumanNeRF(frame(), HumanNeRF.smallest()).network.offset
+    offset = NonRigidOffset(3, NonRigidNumbers(2, 8, 1, 2, 0.1, 0.5, 1e-3))
     points, angles = torch.rand(5, 3), torch.rand(5, 3)
     torch.nn.init.ones_(offset.network.last.bias)
     offset.before_step(None, 0, 0.05)

@@ -92,7 +92,7 @@ class Skin(msgspec.Struct, rename="camel"):
 
 
 class Target(msgspec.Struct, rename="camel"):
-    """What a channel moves."""
+    """Node, and its property, that a channel moves."""
 
     path: str
     node: Index | None = None

@@ -40,7 +40,7 @@ Joints = Float[np.ndarray, "bone 3 4"]  # joint-to-world matrices
 
 
 @dataclass(frozen=True)
-class Posed(Pictures):
+class CharacterOptions(Pictures):
     """Options of every scene, and of characters.
 
     rig:          cameras of a rig, which photograph every moment; 0 for one moving camera

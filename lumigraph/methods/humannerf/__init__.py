@@ -90,7 +90,7 @@ class HumanNeRF(Articulated, FieldMethod):
             c, bones=BoneNumbers(pose_lr=1e-3, pose_width=8, pose_depth=1), weights=WeightNumbers(8, 4, 1e-2, 0.2)
         )
         c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1024))
-        return replace(c, nonrigid=NonRigidNumbers(2, 8, 1, 2, 0.1, 0.5, 1e-3))
+        return replace(c, nonrigid=NonRigidNumbers(2, 8, 1, 2, 0.0, 0.5, 1e-3))
 
     # Moments
 

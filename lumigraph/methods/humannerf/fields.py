@@ -19,6 +19,7 @@ from ...method import Field, Part
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
 MIN_BODY = 1e-3  # sum of weights f(x) up to which a point is outside the body
+OFF = -1.0  # in place of the number of octaves, before the offset begins
 POINTS_PER_CHUNK = 1 << 14  # whose places in all bones' frames are held at a time
 
 
@@ -38,7 +39,7 @@ class NonRigidNumbers:
 class NonRigidOffset(Part):
     """x' = x + MLP(gamma(x; tau), Omega), whose octaves join under a Hann window (eqs. 8 to 10).
 
-    alpha: octaves that have joined; 0 leaves points where they are
+    alpha: octaves that have joined; OFF leaves points where they are
     """
 
     alpha: Tensor
@@ -49,15 +50,15 @@ class NonRigidOffset(Part):
         self.angles = angles
         shape = n.nonrigid_depth, n.nonrigid_width, n.nonrigid_skip
         self.network = DeformationNetwork(n.nonrigid_frequencies, angles, *shape, 3)
-        self.register_buffer("alpha", torch.tensor(0.0))
+        self.register_buffer("alpha", torch.tensor(OFF))
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
         n = self.numbers
         grown = (progress - n.nonrigid_from) / max(n.nonrigid_until - n.nonrigid_from, 1e-9)
-        self.alpha.fill_(min(max(grown, 0.0), 1.0) * n.nonrigid_frequencies)
+        self.alpha.fill_(min(grown, 1.0) * n.nonrigid_frequencies if grown >= 0 else OFF)
 
     def forward(self, points: Points, angles: Float[Tensor, "point angle"]) -> Points:
-        if not self.alpha:
+        if self.alpha < 0:
             return points
         return points + self.network(points, angles, window(self.numbers.nonrigid_frequencies, self.alpha))
 

@@ -8,13 +8,13 @@ from typing import Annotated
 
 from ...errors import LumigraphError
 from ...files.ranges import between
-from ..characters import Posed, photographed
+from ..characters import CharacterOptions, photographed
 from ..skinned import SkinnedBody
 from ..stage import SyntheticStage
 
 
 @dataclass(frozen=True)
-class Options(Posed):
+class Options(CharacterOptions):
     """Options of every character; file: of a skinned mesh, .glb; clip: number of its animation"""
 
     file: str = ""

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from ...datasets.skeleton import ROOT, BonePose, Skeleton, posed
-from ..characters import FILL, KEY, SKY, Joints, Posed, photographed
+from ..characters import FILL, KEY, SKY, CharacterOptions, Joints, photographed
 from ..shapes import Cuboid, Cylinder, SoftCapsule, SolidShape
 from ..stage import SyntheticStage
 from ..textures import Mottle, Plain, Sectors, Texture
 from ..world import Material, Object, Pose, World, nested, rotation_about
 
-Options = Posed
+Options = CharacterOptions
 SKIN, BLUSH, NAIL = (0.86, 0.64, 0.52), (0.74, 0.46, 0.38), (0.95, 0.78, 0.74)
 RED, CREAM = (0.78, 0.16, 0.14), (0.95, 0.91, 0.82)
 CAN = "can"
@@ -32,13 +32,14 @@ FINGERS = {
 }
 CURL = (58.0, 52.0, 40.0)  # degrees of a finger's joints in the grasp
 THUMB_CURL = (30.0, 42.0, 36.0)
+REST_AWAY = 0.5  # of the hand at rest from where it grasps, so that each body is nearest to its own bones
 
 
 def bones() -> tuple[tuple[str, ...], tuple[int, ...], Joints]:
     """Names, parents and joints at rest, the hand open; axes along the world's."""
-    names, parents, places = ["wrist"], [ROOT], [(0.0, 0.0, -0.26)]
+    names, parents, places = ["wrist"], [ROOT], [(0.0, REST_AWAY, -0.26)]
     for finger, (start, lengths, _) in FINGERS.items():
-        along, place, parent = direction(finger), np.array(start), 0
+        along, place, parent = direction(finger), np.array(start) + (0.0, REST_AWAY, 0.0), 0
         for number, length in enumerate(lengths):
             names.append(f"{finger} {number + 1}")
             parents.append(parent)
@@ -81,14 +82,14 @@ class Grasp:
             elif finger in FINGERS:
                 local[number, :, :3] = rotation_about((1, 0, 0), closed * CURL[int(joint) - 1])
         away = 0.25 * (1 - closed)
-        local[0, 1, 3] += away  # the hand comes from behind
+        local[0, 1, 3] += away - REST_AWAY  # the hand comes from behind
         return posed(parents, torch.from_numpy(local)).numpy()
 
     def parts(self) -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
         """Shapes at rest, with the bone that moves each."""
         names, _, joints = bones()
         skin = Mottle(SKIN, BLUSH, size=0.25, contrast=2.0)
-        yield "wrist", Cuboid(PALM, 0.065), skin, Pose.at(0, 0, 0)
+        yield "wrist", Cuboid(PALM, 0.065), skin, Pose.at(0, REST_AWAY, 0)
         for finger, (_, lengths, radius) in FINGERS.items():
             along = direction(finger)
             side = np.cross([0.0, 1.0, 0.0], along)

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from ...datasets.skeleton import ROOT, BonePose, Skeleton, posed
-from ..characters import FILL, KEY, SKY, Joints, Posed, photographed
+from ..characters import FILL, KEY, SKY, CharacterOptions, Joints, photographed
 from ..shapes import Ball, Cuboid, SoftCapsule, SolidShape
 from ..stage import SyntheticStage
 from ..textures import Checker, Mottle, Plain, Stripes, Texture
 from ..world import Material, Object, Pose, World, nested, rotation_about
 
-Options = Posed
+Options = CharacterOptions
 STRIDES = 5  # walking cycles in a capture
 SKIN, HAIR, EYE, LIP = (0.86, 0.64, 0.52), (0.25, 0.15, 0.10), (0.10, 0.12, 0.20), (0.70, 0.22, 0.24)
 SHIRT, STRIPE = (0.16, 0.34, 0.66), (0.93, 0.90, 0.82)

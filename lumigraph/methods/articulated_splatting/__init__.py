@@ -10,26 +10,26 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from ..camera import Camera
-from ..camera.rays import Rendering
-from ..components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
-from ..components.clouds.appearance import AppearanceNumbers
-from ..components.clouds.cloud import RateNumbers
-from ..components.clouds.cloud_method import BLACK, CloudMethod
-from ..components.clouds.density_control import RefineNumbers
-from ..components.clouds.initialization import Initialization, round_gaussians
-from ..components.clouds.tidying import Tidying, TidyingNumbers
-from ..components.skinning.articulated import Articulated
-from ..components.skinning.bone_motion import BoneNumbers
-from ..components.skinning.contact import PICTURE, bodies_of, contact_control, contact_map
-from ..components.skinning.skinned_cloud import SkinnedCloud
-from ..components.skinning.weight_volume import WeightNumbers
-from ..datasets.scene import Frame, Photograph, Scene
-from ..files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between
-from ..gaussians import Gaussians
-from ..gaussians.moving import MovingGaussians, fitted
-from ..gaussians.splatting import render
-from ..method.controls import Control
+from ...camera import Camera
+from ...camera.rays import Rendering
+from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.appearance import AppearanceNumbers
+from ...components.clouds.cloud import RateNumbers
+from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.initialization import Initialization, round_gaussians
+from ...components.clouds.tidying import Tidying, TidyingNumbers
+from ...components.skinning.articulated import Articulated
+from ...components.skinning.bone_motion import BoneNumbers
+from ...components.skinning.weight_volume import WeightNumbers
+from ...datasets.scene import Frame, Photograph, Scene
+from ...files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between
+from ...gaussians import Gaussians
+from ...gaussians.moving import MovingGaussians, fitted
+from ...gaussians.splatting import render
+from ...method.controls import Control
+from .contact import PICTURE, bodies_of, contact_control, contact_map
+from .skinned_cloud import SkinnedCloud
 
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
 

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ...components.clouds.addition import Addition, Step
+from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
+from ...components.skinning.weight_volume import WeightNumbers, WeightVolume, segments
 from ...datasets.scene import Frame
 from ...gaussians import Gaussians
 from ...geometry import multiply, to_quaternion
-from ..clouds.addition import Addition, Step
-from .bone_motion import BoneMotion, BoneNumbers
-from .weight_volume import WeightNumbers, WeightVolume, segments
 
 
 class SkinnedCloud(Addition):
