@@ -19,7 +19,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import safetensors.torch
 import torch
@@ -45,7 +45,7 @@ from lumigraph.run import Run, build
 from lumigraph.training import fit
 
 ANGLES = 15, 30, 60  # degrees between two views of a consistency
-BACKGROUND = 1.0  # of procedural collections
+FIGURES = "drawn", "consistency", "inversion", "fid", "nearest"
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class Options:
     snapshot: int = 250  # steps from one snapshot to the next
     film: bool = False  # train pi-GAN's field instead of planes
     figures: Path | None = None  # folder of the figures; none trains
+    only: tuple[Literal["drawn", "consistency", "inversion", "fid", "nearest"], ...] = FIGURES
     pictures: int = 500  # of each set that FID compares
     snapshots: int = 12  # at most, evenly over training, that FID is computed for
     seeds: int = 16
@@ -237,12 +238,17 @@ def main(options: Options) -> None:
     run = Run(options.run)
     method = run.method("cpu").eval()
     assert isinstance(method, EG3D)
-    sheet(options, method, options.figures)
-    found: dict[str, Any] = {"steps": run.state.step}
-    found["inversion"] = inversion(options, method, data, options.figures)
-    found["consistency"] = consistency(options, method, options.figures)
-    found["nearest"] = nearest(options, method, data, options.figures)
-    found["FID over training"] = fid_over_training(options, run, data, options.figures)
+    found: dict[str, Any] = {"steps": run.state.step, "pictures": run.state.step * method.config.pictures_per_step}
+    if "drawn" in options.only:
+        sheet(options, method, options.figures)
+    if "consistency" in options.only:
+        found["consistency"] = consistency(options, method, options.figures)
+    if "inversion" in options.only:
+        found["inversion"] = inversion(options, method, data, options.figures)
+    if "fid" in options.only:
+        found["FID over training"] = fid_over_training(options, run, data, options.figures)
+    if "nearest" in options.only:
+        found["nearest"] = nearest(options, method, data, options.figures)
     write_json(options.figures / "figures.json", found)
     return None
 
