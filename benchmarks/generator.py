@@ -124,7 +124,9 @@ def sheet(options: Options, method: EG3D, folder: Path) -> None:
 def carried(method: EG3D, one: Camera, other: Camera) -> tuple[float, float, Tensor, list[Tensor]]:
     """PSNR of a view carried into another by its depth, over the pixels that both show; the same of a constant colour,
     their mean; which pixels; and pictures to look at."""
-    maps = [DepthMap.of_rendering(camera, method.render(camera), method.frame.background) for camera in (one, other)]
+    seen = [method.render(camera) for camera in (one, other)]
+    behind = method.frame.background
+    maps = [DepthMap.of_rendering(camera, each, behind) for camera, each in zip((one, other), seen, strict=True)]
     points = maps[1].positions()
     rgb = maps[1].rgb[maps[1].solid]
     pixels, _, _ = maps[0].project(points)
@@ -138,7 +140,7 @@ def carried(method: EG3D, one: Camera, other: Camera) -> tuple[float, float, Ten
     picture = torch.full((height, width, 3), 0.5)
     solid = maps[1].solid.nonzero()[visible]
     picture[solid[:, 0], solid[:, 1]] = shown
-    return psnr(shown, truth), psnr(truth.mean(0).expand_as(truth), truth), visible, [maps[0].rgb, picture, maps[1].rgb]
+    return psnr(shown, truth), psnr(truth.mean(0).expand_as(truth), truth), visible, [seen[0].rgb, picture, seen[1].rgb]
 
 
 def consistency(options: Options, method: EG3D, folder: Path) -> dict[str, Any]:
