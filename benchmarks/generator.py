@@ -91,12 +91,17 @@ def fid_over_training(options: Options, run: Run, data: Collection, folder: Path
         "photographs of unseen objects": photographs_of(data, count, 2, "test")[0],
     }
     found: dict[str, Any] = {name: [x.value for x in distances(real, other, network)] for name, other in floors.items()}
-    method, rows = run.method("cpu"), []
-    for path in evenly(sorted((options.run / "snapshots").glob("*.safetensors")), options.snapshots):
-        weights = {name: value.float() for name, value in safetensors.torch.load_file(path).items()}
-        method.averaged.load_state_dict(weights, strict=False)
+    states: dict[int, Path | None] = {0: None}  # the generator before any step, snapshots, and the run as it is
+    snapshots = sorted((options.run / "snapshots").glob("*.safetensors"))
+    states |= {int(path.stem): path for path in evenly(snapshots, options.snapshots)}
+    rows = []
+    for step in [*states, *([run.state.step] if run.state.step not in states else [])]:
+        method, path = run.method("cpu") if step else run.new_method("cpu"), states.get(step)
+        if path:
+            weights = {name: value.float() for name, value in safetensors.torch.load_file(path).items()}
+            method.averaged.load_state_dict(weights, strict=False)
         fid, kid = distances(real, drawn_pictures(method, cameras, 0), network)
-        rows.append((int(path.stem) * method.config.pictures_per_step, fid.value, kid.value))
+        rows.append((step * method.config.pictures_per_step, fid.value, kid.value))
         print("pictures, FID, KID:", *rows[-1], flush=True)
     seen, fids, kids = zip(*rows, strict=True)
     ends = (seen[0], seen[-1])
