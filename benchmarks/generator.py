@@ -19,7 +19,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import safetensors.torch
 import torch
@@ -45,7 +45,7 @@ from lumigraph.run import Run, build
 from lumigraph.training import fit
 
 ANGLES = 15, 30, 60  # degrees between two views of a consistency
-BACKGROUND = 1.0  # of procedural collections
+FIGURES = "drawn", "consistency", "inversion", "fid", "nearest"
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class Options:
     snapshot: int = 250  # steps from one snapshot to the next
     film: bool = False  # train pi-GAN's field instead of planes
     figures: Path | None = None  # folder of the figures; none trains
+    only: tuple[Literal["drawn", "consistency", "inversion", "fid", "nearest"], ...] = FIGURES
     pictures: int = 500  # of each set that FID compares
     snapshots: int = 12  # at most, evenly over training, that FID is computed for
     seeds: int = 16
@@ -90,12 +91,17 @@ def fid_over_training(options: Options, run: Run, data: Collection, folder: Path
         "photographs of unseen objects": photographs_of(data, count, 2, "test")[0],
     }
     found: dict[str, Any] = {name: [x.value for x in distances(real, other, network)] for name, other in floors.items()}
-    method, rows = run.method("cpu"), []
-    for path in evenly(sorted((options.run / "snapshots").glob("*.safetensors")), options.snapshots):
-        weights = {name: value.float() for name, value in safetensors.torch.load_file(path).items()}
-        method.averaged.load_state_dict(weights, strict=False)
+    states: dict[int, Path | None] = {0: None}  # the generator before any step, snapshots, and the run as it is
+    snapshots = sorted((options.run / "snapshots").glob("*.safetensors"))
+    states |= {int(path.stem): path for path in evenly(snapshots, options.snapshots)}
+    rows = []
+    for step in [*states, *([run.state.step] if run.state.step not in states else [])]:
+        method, path = run.method("cpu") if step else run.new_method("cpu"), states.get(step)
+        if path:
+            weights = {name: value.float() for name, value in safetensors.torch.load_file(path).items()}
+            method.averaged.load_state_dict(weights, strict=False)
         fid, kid = distances(real, drawn_pictures(method, cameras, 0), network)
-        rows.append((int(path.stem) * method.config.pictures_per_step, fid.value, kid.value))
+        rows.append((step * method.config.pictures_per_step, fid.value, kid.value))
         print("pictures, FID, KID:", *rows[-1], flush=True)
     seen, fids, kids = zip(*rows, strict=True)
     ends = (seen[0], seen[-1])
@@ -123,7 +129,9 @@ def sheet(options: Options, method: EG3D, folder: Path) -> None:
 def carried(method: EG3D, one: Camera, other: Camera) -> tuple[float, float, Tensor, list[Tensor]]:
     """PSNR of a view carried into another by its depth, over the pixels that both show; the same of a constant colour,
     their mean; which pixels; and pictures to look at."""
-    maps = [DepthMap.of_rendering(camera, method.render(camera), method.frame.background) for camera in (one, other)]
+    seen = [method.render(camera) for camera in (one, other)]
+    behind = method.frame.background
+    maps = [DepthMap.of_rendering(camera, each, behind) for camera, each in zip((one, other), seen, strict=True)]
     points = maps[1].positions()
     rgb = maps[1].rgb[maps[1].solid]
     pixels, _, _ = maps[0].project(points)
@@ -137,7 +145,7 @@ def carried(method: EG3D, one: Camera, other: Camera) -> tuple[float, float, Ten
     picture = torch.full((height, width, 3), 0.5)
     solid = maps[1].solid.nonzero()[visible]
     picture[solid[:, 0], solid[:, 1]] = shown
-    return psnr(shown, truth), psnr(truth.mean(0).expand_as(truth), truth), visible, [maps[0].rgb, picture, maps[1].rgb]
+    return psnr(shown, truth), psnr(truth.mean(0).expand_as(truth), truth), visible, [seen[0].rgb, picture, seen[1].rgb]
 
 
 def consistency(options: Options, method: EG3D, folder: Path) -> dict[str, Any]:
@@ -237,12 +245,17 @@ def main(options: Options) -> None:
     run = Run(options.run)
     method = run.method("cpu").eval()
     assert isinstance(method, EG3D)
-    sheet(options, method, options.figures)
-    found: dict[str, Any] = {"steps": run.state.step}
-    found["inversion"] = inversion(options, method, data, options.figures)
-    found["consistency"] = consistency(options, method, options.figures)
-    found["nearest"] = nearest(options, method, data, options.figures)
-    found["FID over training"] = fid_over_training(options, run, data, options.figures)
+    found: dict[str, Any] = {"steps": run.state.step, "pictures": run.state.step * method.config.pictures_per_step}
+    if "drawn" in options.only:
+        sheet(options, method, options.figures)
+    if "consistency" in options.only:
+        found["consistency"] = consistency(options, method, options.figures)
+    if "inversion" in options.only:
+        found["inversion"] = inversion(options, method, data, options.figures)
+    if "fid" in options.only:
+        found["FID over training"] = fid_over_training(options, run, data, options.figures)
+    if "nearest" in options.only:
+        found["nearest"] = nearest(options, method, data, options.figures)
     write_json(options.figures / "figures.json", found)
     return None
 

@@ -170,8 +170,8 @@ def octree_run(folder: Path) -> Run:
     return run_of(method, folder)
 
 
-def prior_run(folder: Path) -> Run:
-    return run_of(tiny_method("tinted-grid"), folder, tiny_collection.collection())
+def prior_run(folder: Path, name: str = "tinted-grid") -> Run:
+    return run_of(tiny_method(name), folder, tiny_collection.collection())
 
 
 def tiny_method(name: str) -> Method:
