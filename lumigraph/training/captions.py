@@ -37,14 +37,14 @@ class CaptionNumbers:
     """Numbers of the model and of its training."""
 
     pictures: Count = 3000  # pictures that are traced to learn from; more generalise better, and take longer
-    steps: Steps = 700  # steps of learning; more recognise more
+    steps: Steps = 2000  # steps of learning; more recognise more
     batch: BatchSize = 64  # pictures in a step, each the wrong one for all other captions
     width: Width = 16  # channels of the residual network's stem; wider recognises more, and costs time
     embedding: Width = 64  # of the shared space
-    learning_rate: LearningRate = 2e-3  # AdamW's learning rate at its highest
+    learning_rate: LearningRate = 1e-3  # AdamW's learning rate at its highest
     weight_decay: NonNegative = 0.05  # of AdamW
     perturbation: Share = 8 / 255  # largest change of a colour against the model; 0 is faster, its gradients are noise
-    perturbed_from: Share = 0.6  # share of the steps after which pictures are perturbed
+    perturbed_from: Share = 0.8  # share of the steps after which pictures are perturbed
     seed: Seed = 0
 
 
