@@ -60,8 +60,8 @@ def region_files(folder: Path) -> list[Path]:
 def read(path: Path) -> Capture:
     """The part of a region file, or of a world's folder, that has most chunks: at most 64 blocks each way."""
     labels, notes = read_blocks(path)
-    stage = import_module("..synthetic.block_stage", __package__)  # a room above this one
-    found = stage.captured(BlockLabels(labels), str(path))
+    synthetic = import_module("..synthetic", __package__)  # a room above this one
+    found = synthetic.block_capture(BlockLabels(labels), str(path))
     return replace(found, notes=notes)
 
 

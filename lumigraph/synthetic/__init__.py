@@ -39,11 +39,12 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..capture.capture import Capture, PixelPlane, Shot
 from ..capture.raw import RawPhoto, facts, planes
+from ..datasets.world import BlockLabels
 from ..geometry import Similarity
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes
-from .block_stage import blocks_about_middle
+from .block_stage import blocks_about_middle, stage_of
 from .depth_camera import MILLIMETRES, UNMEASURED
 from .members import is_category as is_category
 from .members import is_collection as is_collection
@@ -102,6 +103,15 @@ def read(request: str) -> Capture:
     if is_block_world(request):
         found = replace(found, blocks=blocks_about_middle(scenes.scene(name).blocks(options)))
     return found
+
+
+def block_capture(blocks: BlockLabels, source: str, size: int = 128, views: int = 60, seed: int = 0) -> Capture:
+    """Pictures of blocks with exact labels and depth; lengths of the source are blocks.
+
+    size: of the square pictures, pixels; views: number of pictures to learn from; seed: position of their cameras
+    """
+    found = capture(stage_of(blocks, size, views, seed, source), source, kept=True)
+    return replace(found, blocks=blocks_about_middle(blocks))
 
 
 def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:

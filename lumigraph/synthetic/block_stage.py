@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..capture.capture import Capture
 from ..datasets.world import LABELS, BlockLabels
 from .cameras import look_at, pinhole
 from .rendering import trace
@@ -37,17 +35,6 @@ CLEARANCE = 2  # blocks around a camera above which it must be
 MIN_ENTROPY, MIN_DISTANCE = 0.75, 2.0  # of labels in a picture, nats; mean depth, blocks (Hao 2021, published code)
 PROBE = 12  # pixels a side of the picture that these are measured in
 MAX_TRIES = 20  # cameras drawn for one that passes
-
-
-def captured(blocks: BlockLabels, source: str, size: int = 128, views: int = 60, seed: int = 0) -> Capture:
-    """Pictures of blocks with exact labels and depth; lengths of the source are blocks.
-
-    size: of the square pictures, pixels; views: number of pictures to learn from; seed: position of their cameras
-    """
-    from . import capture  # which imports this module
-
-    found = capture(stage_of(blocks, size, views, seed, source), source, kept=True)
-    return replace(found, blocks=blocks_about_middle(blocks))
 
 
 def blocks_about_middle(blocks: BlockLabels) -> BlockLabels:
