@@ -196,10 +196,12 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any) -> None:
     scene = desk.frame_locator("iframe")
     scene.get_by_role("tab", name="Crop").wait_for()
     desk.wait_for_timeout(20_000)
+    with contextlib.suppress(Exception):  # viser's notice of slow graphics
+        scene.locator(".mantine-Notification-closeButton").first.click(timeout=5000)
     walk.mark("the finished scene is open")
     walk.shots(desk, phone, "6-scene")
     scene.get_by_role("tab", name="Crop").click()
-    scene.get_by_role("combobox").first.click()
+    scene.get_by_label("Show", exact=True).filter(visible=True).first.click()
     scene.get_by_role("option", name="inside a sphere").click()
     desk.wait_for_timeout(10_000)
     walk.shot(desk, "7-crop-desk")
