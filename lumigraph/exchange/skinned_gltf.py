@@ -32,7 +32,7 @@ SPOTS /= SPOTS.sum(1, keepdims=True)
 
 
 @dataclass(frozen=True)
-class Clip:
+class AnimationClip:
     """An animation: keyframes of nodes by (node, path). seconds: of its last keyframe"""
 
     name: str
@@ -56,7 +56,7 @@ class SkinnedCharacter:
     weights: Float[np.ndarray, "vertex bone"]
     colours: UInt8[np.ndarray, "face 3"]
     skeleton: Skeleton
-    clips: tuple[Clip, ...]
+    clips: tuple[AnimationClip, ...]
     nodes: _Nodes
 
     def pose(self, clip: int, seconds: float) -> Float[np.ndarray, "bone 3 4"]:
@@ -95,7 +95,7 @@ class _Nodes:
     parents: tuple[int, ...]
     bones: tuple[int, ...]
 
-    def worlds(self, clip: Clip | None, seconds: float) -> Float[np.ndarray, "bone 4 4"]:
+    def worlds(self, clip: AnimationClip | None, seconds: float) -> Float[np.ndarray, "bone 4 4"]:
         """From the bones' frames to the scene, +z up."""
         found: dict[int, np.ndarray] = {}
 
@@ -107,7 +107,7 @@ class _Nodes:
 
         return np.stack([world(index) for index in self.bones])
 
-    def local(self, index: int, clip: Clip | None, seconds: float) -> Float[np.ndarray, "4 4"]:
+    def local(self, index: int, clip: AnimationClip | None, seconds: float) -> Float[np.ndarray, "4 4"]:
         node = self.file.about.nodes[index]
         keys = {} if clip is None else {path: clip.keys[index, path] for path in PATHS if (index, path) in clip.keys}
         if not keys:
@@ -116,7 +116,7 @@ class _Nodes:
         fields = {path: changed.get(path, getattr(node, path)) for path in PATHS}
         return node_matrix(self.file, gltf.Node(**fields))
 
-    def joints(self, clip: Clip, seconds: float) -> Float[np.ndarray, "bone 3 4"]:
+    def joints(self, clip: AnimationClip, seconds: float) -> Float[np.ndarray, "bone 3 4"]:
         """Rigid joint frames in the scene."""
         return rigid(self.worlds(clip, seconds))
 
@@ -221,7 +221,7 @@ def colours_of(file: gltf.File, primitive: gltf.Primitive, corners: Int[np.ndarr
     return (pixels[row, column].mean(1) * factor).round().clip(0, 255).astype(np.uint8)
 
 
-def clip_of(file: gltf.File, animation: gltf.Animation) -> Clip:
+def clip_of(file: gltf.File, animation: gltf.Animation) -> AnimationClip:
     """Keyframes of an animation's nodes; of cubic splines the values at keyframes alone."""
     keys = {}
     for channel in animation.channels:
@@ -236,7 +236,7 @@ def clip_of(file: gltf.File, animation: gltf.Animation) -> Clip:
         if not len(moments) or len(values) != len(moments):
             raise LumigraphError(f"{file.path} has {len(moments)} keyframes of {len(values)} values; export it again")
         keys[node, path] = moments, values, sampler.interpolation == "STEP"
-    return Clip(animation.name, max((float(key[0][-1]) for key in keys.values()), default=0.0), keys)
+    return AnimationClip(animation.name, max((float(key[0][-1]) for key in keys.values()), default=0.0), keys)
 
 
 def sampled(
@@ -270,7 +270,9 @@ def rigid(matrices: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "bone 3 
     return np.concatenate([u @ vt, matrices[:, :3, 3:]], -1)
 
 
-def check_scales(path: Path, nodes: _Nodes, clips: tuple[Clip, ...], bind: Float[np.ndarray, "bone 4 4"]) -> None:
+def check_scales(
+    path: Path, nodes: _Nodes, clips: tuple[AnimationClip, ...], bind: Float[np.ndarray, "bone 4 4"]
+) -> None:
     """Raise LumigraphError where an animation scales bones, or by different amounts along their axes."""
     for clip in clips or (None,):
         for seconds in np.linspace(0, clip.seconds if clip else 0.0, 4):
