@@ -70,7 +70,7 @@ class DiffusionGuide:
         return self.encoder.states(self.tokenizer([prompt]).to(self.kept.device))
 
     def latents(self, pictures: Pictures, generator: torch.Generator) -> Float[Tensor, "picture channel h w"]:
-        """What the model denoises: pictures in [-1, 1], encoded where it has an encoder."""
+        """Input of the model: pictures in [-1, 1], encoded where it has an encoder."""
         x = 2 * pictures - 1
         if self.vae is None:
             return x
