@@ -201,7 +201,7 @@ def gallery(
     """
     if missing := [name for name in names if name not in SHOWPIECES]:
         raise LumigraphError(f"{', '.join(missing)} has no place in the gallery; name others: {', '.join(SHOWPIECES)}")
-    files.claim(output / PAGE, "gallery")
+    files.claim(output / PAGE, "benchmark")
     cells = [cell_of(name, seconds, output) for name in SHOWPIECES if name in names]
     sources = {SHOWPIECES[name].source for name in names}
     guided = any(CAPTIONS in SHOWPIECES[name].options for name in names)
@@ -232,11 +232,11 @@ def prepare(
 
         knot = trimesh.creation.torus(0.7, 0.25, 64, 32)
         (output / MESH).parent.mkdir(parents=True, exist_ok=True)
-        files.write_bytes(output / MESH, knot.export(file_type="ply"), "gallery")
+        files.write_bytes(output / MESH, knot.export(file_type="ply"), "benchmark")
     if PICTURE in sources and not (output / PICTURE).exists():
         (output / PICTURE).parent.mkdir(parents=True, exist_ok=True)
         scene = open_scene(OBJECT)
-        save_picture(output / PICTURE, scene.photograph(0).before(scene.frame.background), "gallery")
+        save_picture(output / PICTURE, scene.photograph(0).before(scene.frame.background), "benchmark")
     if guided and not (output / CAPTIONS).exists():
         tell("A model of captions, for the methods that learn from words")
         lasting = f"{max(seconds, MIN_CAPTION_SECONDS):g}"
@@ -257,7 +257,7 @@ def write_gallery(cells: Sequence[Cell], output: Path) -> None:
         if cards := "".join(card(name, piece, found[name], output) for name, piece in section.items() if name in found):
             body += f"<section><h2>{escape(title)}</h2><div class='gallery'>{cards}</div></section>"
     trained = sorted({row["trained_on"] for row in found.values() if not row["failed"]})
-    files.write_bytes(output / PAGE, page("Gallery", body, " · ".join(trained)), "gallery")
+    files.write_bytes(output / PAGE, page("Gallery", body, " · ".join(trained)), "benchmark")
 
 
 def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
