@@ -35,7 +35,7 @@ from lumigraph.run import Run
 from lumigraph.synthetic import captions
 from lumigraph.training.captions import CaptionNumbers, learn_captions, perturbed
 
-pytestmark = budget("methods", 8)
+pytestmark = budget("methods", 20)
 CPU = torch.device("cpu")
 
 
