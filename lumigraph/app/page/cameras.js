@@ -63,7 +63,7 @@ function paint(canvas, model, state, now) {
   context.clearRect(0, 0, width, height);
   const [ct, st, cp, sp] = [Math.cos(state.turn), Math.sin(state.turn), Math.cos(state.tilt), Math.sin(state.tilt)];
   const far = 3.6;
-  const focal = 1.5 * Math.min(width, height) * state.zoom;
+  const focal = 1.9 * Math.min(width, height) * state.zoom;
   const project = (x, y, z) => {
     const across = ct * x + st * y;
     const away = -st * x + ct * y;
