@@ -29,6 +29,7 @@ from lumigraph.method import Method
 from lumigraph.metrics import psnr
 from lumigraph.run import build
 from lumigraph.synthetic.characters import ROUNDS
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 SAME_MOMENT = 1e-5  # difference of times that are one moment
@@ -78,10 +79,10 @@ def trained(name: str, scene: Scene, options: Options) -> dict:
     """Scores of a method after training, by what is held out."""
     kind = methods.find(name)
     method = build(kind, scene.frame, kind.cpu_preset(), torch.device("cpu"), 0, learning=True)
-    fit(method, scene, steps=1, show=False)  # compiles
+    go_on_unless(fit(method, scene, steps=1, show=False).signal)  # compiles
     method = build(kind, scene.frame, kind.cpu_preset(), torch.device("cpu"), 0, learning=True)
     begin = time.process_time()
-    fit(method, scene, steps=options.steps, show=False, rehearsal=False)
+    go_on_unless(fit(method, scene, steps=options.steps, show=False, rehearsal=False).signal)
     spent = time.process_time() - begin
     method.eval()
     assert scene.cameras.time is not None

@@ -33,6 +33,7 @@ from lumigraph.methods.articulated_splatting.contact import SOLID_OPACITY, gaps
 from lumigraph.run import build
 from lumigraph.synthetic import SyntheticStage, World, scenes, signed_distance, trace
 from lumigraph.synthetic.scenes.grasp import CAN, CAN_HALF, CAN_RADIUS
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 PLACES = 4000  # over the can's surface
@@ -56,7 +57,7 @@ def main(options: Options) -> None:
     config = replace(kind.cpu_preset(), contact_distance=options.distance)
     method = build(kind, scene.frame, config, torch.device("cpu"), 0, learning=True)
     begin = time.process_time()
-    fit(method, scene, steps=options.steps, show=False)
+    go_on_unless(fit(method, scene, steps=options.steps, show=False).signal)
     spent = time.process_time() - begin
     method.eval()
     assert isinstance(method, ArticulatedSplatting)

@@ -34,6 +34,7 @@ from lumigraph.method import Method
 from lumigraph.run import build
 from lumigraph.synthetic import captions
 from lumigraph.system.progress import track
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 from lumigraph.training.captions import TRACED_PIXELS, augmented
 
@@ -111,7 +112,7 @@ def dreamt(o: Options, caption: str, prior: bool) -> tuple[Method, float]:
         config = replace(config, guidance=replace(config.guidance, transmittance_weight=0.0))
     method = build(kind, words.frame, config, CPU, o.seed, learning=True)
     begin = time.process_time()
-    fit(method, words, None, steps=o.steps, seed=o.seed, show=False, rehearsal=False)
+    go_on_unless(fit(method, words, None, steps=o.steps, seed=o.seed, show=False, rehearsal=False).signal)
     return method, time.process_time() - begin
 
 

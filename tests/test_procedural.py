@@ -428,7 +428,10 @@ def test_open_scene_makes_a_scene_in_the_worlds_own_frame():
 @pytest.mark.parametrize(
     ("request_", "sentence"),
     [
-        ("still-lif", "choose one of city, clockwork, courtyard, fog, head, jelly, materials, night, ring, room"),
+        (
+            "still-lif",
+            "choose one of blocks, character, city, clockwork, courtyard, fog, grasp, head, jelly",
+        ),
         ("still-life,colour=3", "no option 'colour'; there are size, views, seed"),
         ("still-life,size=big", "size must be a whole number, as in size=20; got 'big'"),
         ("still-life,views=0", "views is 0, and should be from 1"),
