@@ -85,7 +85,7 @@ class Walk:
 
 
 def until(told: Callable[[], Any], seconds: float, pause: float = 0.5) -> Any:
-    """What a function gives, as soon as it gives anything."""
+    """Result of a function, as soon as it has one."""
     end = time.monotonic() + seconds
     while not (found := told()):
         if time.monotonic() > end:

@@ -27,7 +27,7 @@ def drawn(count: int, mean: float, deviation: float, seed: int) -> torch.Tensor:
 
 
 def test_the_distance_of_gaussians_is_known():
-    """Of N(m, s^2) in each of three features: 3 ((m - m')^2 + (s - s')^2)."""
+    """Distance of N(m, s^2) in each of three features: 3 ((m - m')^2 + (s - s')^2)."""
     a, b = drawn(200_000, 0.0, 1.0, 0), drawn(200_000, 0.5, 2.0, 1)
     assert frechet_distance(a, b) == pytest.approx(3 * (0.25 + 1.0), rel=0.02)
     assert frechet_distance(a, a) == pytest.approx(0, abs=1e-9)

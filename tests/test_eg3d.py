@@ -55,7 +55,7 @@ def test_losses_are_logarithms_of_probabilities():
 
 
 def test_r1_of_a_linear_function_is_half_its_squared_slope():
-    """Of logits a . x + b . y the gradient is (a, b) at every picture, and the penalty reaches a and b."""
+    """Logits a . x + b . y have the gradient (a, b) at every picture, and the penalty reaches a and b."""
     a, b = random(3, 4, 4).requires_grad_(), random(3, 2, 2, seed=1).requires_grad_()
     x, y = random(6, 3, 4, 4).requires_grad_(), random(6, 3, 2, 2, seed=2).requires_grad_()
     penalty = r1_penalty((a * x).sum((1, 2, 3)) + (b * y).sum((1, 2, 3)), [x, y])
@@ -126,7 +126,7 @@ def test_upsampling_is_a_transposed_convolution_and_the_filter():
 
 
 class Plain(torch.nn.Module):
-    """What the planes hold, as it is."""
+    """Contents of the planes, unchanged."""
 
     def forward(self, x):
         return x[:, 0], x

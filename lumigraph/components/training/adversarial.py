@@ -15,7 +15,7 @@ from torch.nn.functional import conv2d, leaky_relu, linear, pixel_shuffle, softp
 
 SLOPE, GAIN = 0.2, math.sqrt(2)  # of the leaky rectifier, which keeps a variance of one
 DEVIATION_GROUP = 4  # pictures over which the minibatch deviation is taken (Karras 2018, section 3)
-SMALLEST = 4  # pixels across, at which the discriminator decides
+MIN_PICTURE_SIDE = 4  # pixels across, at which the discriminator decides
 EPSILON = 1e-8
 
 Pictures = Float[Tensor, "picture _ _ _"]
@@ -206,7 +206,7 @@ class Discriminator(nn.Module):
         self.blocks = nn.ModuleList(DiscriminatorBlock(a, b) for a, b in pairwise(widths))
         last = widths[-1]
         self.convolution = EqualisedConvolution(last + 1, last)
-        self.dense = EqualisedLinear(last * SMALLEST**2, last)
+        self.dense = EqualisedLinear(last * MIN_PICTURE_SIDE**2, last)
         self.mapping = Mapping(0, label, last, layers) if label else None
         self.logit = EqualisedLinear(last, last if label else 1)
 
@@ -223,4 +223,4 @@ class Discriminator(nn.Module):
 
 def widths_of(size: int, base: int, most: int) -> list[int]:
     """Channels at each size from `size` pixels down to 4x4: base / size, and no more than `most` (Karras 2020)."""
-    return [min(base // n, most) for n in (size >> k for k in range(int(math.log2(size // SMALLEST)) + 1))]
+    return [min(base // n, most) for n in (size >> k for k in range(int(math.log2(size // MIN_PICTURE_SIDE)) + 1))]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv_transpose2d, interpolate, softplus
 
-from ...components.training.adversarial import EPSILON, SMALLEST, EqualisedLinear, doubled, rectified
+from ...components.training.adversarial import EPSILON, MIN_PICTURE_SIDE, EqualisedLinear, doubled, rectified
 
 Style = Float[Tensor, "picture style"]
 Styles = Float[Tensor, "picture layer style"]
@@ -95,10 +95,13 @@ class SynthesisNetwork(nn.Module):
     def __init__(self, channels: int, widths: Sequence[int], style: int):
         super().__init__()
         smallest, *_ = rising = list(reversed(widths))
-        self.constant = nn.Parameter(torch.randn(smallest, SMALLEST, SMALLEST))
-        layers, pictures = [SynthesisLayer(smallest, smallest, style, SMALLEST)], [ToPicture(smallest, channels, style)]
+        self.constant = nn.Parameter(torch.randn(smallest, MIN_PICTURE_SIDE, MIN_PICTURE_SIDE))
+        layers, pictures = (
+            [SynthesisLayer(smallest, smallest, style, MIN_PICTURE_SIDE)],
+            [ToPicture(smallest, channels, style)],
+        )
         for octave, (a, b) in enumerate(pairwise(rising), start=1):
-            size = SMALLEST << octave
+            size = MIN_PICTURE_SIDE << octave
             layers += [SynthesisLayer(a, b, style, size, up=True), SynthesisLayer(b, b, style, size)]
             pictures.append(ToPicture(b, channels, style))
         self.layers, self.pictures = nn.ModuleList(layers), nn.ModuleList(pictures)

@@ -16,7 +16,7 @@ from ...components.fields.encodings import FrequencyEncoding
 
 SLOPE = 0.2  # of leaky rectifiers
 BORDER = 4  # pixels by which the neural renderer sees beyond each pixel: four convolutions of 3x3
-SMALLEST = 4  # pixels across, at which the style encoder ends
+MIN_ENCODER_SIDE = 4  # pixels across, at which the style encoder ends
 MAX_LOG_VARIANCE, FIRST_LOG_VARIANCE = 4.0, -3.0  # of style codes, either way, and before anything is learnt
 FIRST_DENSITY = 4.0  # of all blocks, per block, before anything is learnt
 
@@ -37,9 +37,9 @@ class StyleEncoder(nn.Module):
     def __init__(self, size: int, width: int, code: int):
         super().__init__()
         self.size = size
-        widths = [3, *(min(width << k, 8 * width) for k in range(int(math.log2(size // SMALLEST))))]
+        widths = [3, *(min(width << k, 8 * width) for k in range(int(math.log2(size // MIN_ENCODER_SIDE))))]
         self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths))
-        self.out = nn.Linear(widths[-1] * SMALLEST**2, 2 * code)
+        self.out = nn.Linear(widths[-1] * MIN_ENCODER_SIDE**2, 2 * code)
         nn.init.constant_(self.out.bias[code:], FIRST_LOG_VARIANCE)
 
     def forward(self, pictures: Pictures) -> tuple[Float[Tensor, "picture code"], Float[Tensor, "picture code"]]:
