@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
 from collections.abc import Callable
@@ -54,6 +55,7 @@ class StrokesPanel:
         self._part: Bool[Tensor, " point"] | None = None
         self._node: Any = None
         self._working = threading.Lock()
+        self._clicks = asyncio.Lock()
         gui = client.gui
         with shared.tabs["Select"]:
             self._kind = gui.add_dropdown("Stroke", (WANTED, UNWANTED))
@@ -78,9 +80,9 @@ class StrokesPanel:
         self._draw.label = STOP if self._drawing else DRAW
         if self._drawing:
             self._about.content = ABOUT
-            self._client.scene.on_click()(self.clicked)
+            self._client.scene.on_click()(self._queue_click)
         else:
-            self._client.scene.remove_click_callback(self.clicked)
+            self._client.scene.remove_click_callback(self._queue_click)
             self._last = None
 
     def _ready(self) -> Selection:
@@ -94,6 +96,11 @@ class StrokesPanel:
                 points = distil_features(self._shared.method, [scene.photograph(int(i)) for i in chosen], describe)
                 self._selection = Selection(self._shared.method, points)
         return self._selection
+
+    async def _queue_click(self, event: Any) -> None:
+        """Answer a click after those before it; viser would answer each in a thread of its own, in any order."""
+        async with self._clicks:
+            await asyncio.to_thread(self.clicked, event)
 
     def clicked(self, event: Any) -> None:
         """Add a click to the strokes: a dab, or the line from the last click of the same kind on the same view."""

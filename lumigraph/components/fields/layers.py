@@ -68,9 +68,15 @@ class _Layer(torch.autograd.Function):
         return to_x, (grad.t() @ x).float(), grad.sum(0).float(), None
 
 
+@cache
+def _onednn_has_bfloat16() -> bool:
+    """True if oneDNN multiplies in bfloat16 on this processor: it asks for AVX-512."""
+    return torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 def _activated(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
     """max(0, x W^T + b), in one pass over the output where oneDNN offers it: half the time of two."""
-    if x.dtype == torch.bfloat16 and x.device.type == "cpu" and len(x) and torch.backends.mkldnn.is_available():
+    if x.dtype == torch.bfloat16 and x.device.type == "cpu" and len(x) and _onednn_has_bfloat16():
         return torch.ops.mkldnn._linear_pointwise(x, w, b, "relu", [], "")
     return F.linear(x, w, b).relu_()
 
