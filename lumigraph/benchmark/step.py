@@ -1,4 +1,4 @@
-"""One training step taken apart: milliseconds of each kernel and PyTorch operation, and bytes against the memory's rate.
+"""One training step taken apart: time of each kernel and PyTorch operation, and bytes against the memory's rate.
 
 Time is that of PyTorch's profiler, which sees a span for each kernel (`kernels.watching`) and for each part of a step
 (`training.advance`). Bytes are counted in a step of its own: each tensor that an operation reads or writes, once. So a
@@ -92,10 +92,8 @@ class Anatomy:
             | ({"bytes": r.bytes, "memory_share": self.memory_share(r)} if r.bytes else {})
             for r in self.rows
         ]
-        numbers = {
-            name: getattr(self, name) for name in ("ms", "processor_ms", "profiled_ms", "waiting", "memory_rate")
-        }
-        return numbers | {"rows": rows}
+        names = "ms", "processor_ms", "profiled_ms", "waiting", "memory_rate"
+        return {name: getattr(self, name) for name in names} | {"rows": rows}
 
     def memory_share(self, row: Row) -> float:
         """Rate of a row's bytes as a share of the memory's. Above 1 where they come from a cache."""
@@ -120,9 +118,9 @@ class Anatomy:
         rest = sum(r.ms for r in small)
         table.add_row(f"{len(small)} smaller ones", "", "", f"{rest:.2f}", f"{100 * rest / self.profiled_ms:.1f}")
         table.caption = (
-            f"a step takes {self.ms:.1f} ms and runs for {self.processor_ms:.1f} ms of them; {self.profiled_ms:.1f} ms with "
-            f"the profiler; memory moves {self.memory_rate / 1e9:.1f} GB/s; other programs had the processor for "
-            f"{100 * self.waiting:.0f} % of the time"
+            f"a step takes {self.ms:.1f} ms and runs for {self.processor_ms:.1f} ms of them; with the profiler "
+            f"{self.profiled_ms:.1f} ms; memory moves {self.memory_rate / 1e9:.1f} GB/s; other programs had the "
+            f"processor for {100 * self.waiting:.0f} % of the time"
         )
         return table
 
@@ -243,9 +241,9 @@ def add(event: Any, around: list[Span], row: Row | None, rows: dict[str, Row], w
 
 def inner(around: Span, name: str, kind: int) -> Span:
     """The span of a name inside another."""
-    for span in around.inside:
-        if span.name == name:
-            return span
+    for one in around.inside:
+        if one.name == name:
+            return one
     around.inside.append(Span(name, 0.0, kind))
     return around.inside[-1]
 

@@ -1,4 +1,4 @@
-"""`lumigraph bench`: the speed of kernels, a step taken apart, the quality of methods, PSNR against the number of photographs; shapes."""
+"""`lumigraph bench`: speed of kernels and steps, quality of methods, PSNR against the number of photographs; shapes."""
 
 from __future__ import annotations
 
