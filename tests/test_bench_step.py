@@ -73,7 +73,7 @@ def test_bytes_are_those_of_inputs_and_outputs():
 
     step()
     rows = by_name(take_apart(step, [optimizer], 2))
-    assert rows["mul"].bytes == 5 * 4 * count + 4  # a, b, their product; the sum's gradient (one number), b, a's gradient
+    assert rows["mul"].bytes == 5 * 4 * count + 4  # a, b, the product; back: one number, b, a gradient
     assert rows["photometric forward"].bytes == 2 * picture.numel() * 4 + 8
     assert "view" in rows and rows["view"].bytes == 0
     assert rows["Adam.step"].bytes == 7 * 4 * count + 8  # the number of steps is a moment too
