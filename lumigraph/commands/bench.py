@@ -83,19 +83,20 @@ class BenchStep:
         from ..files import write_bytes, write_json
         from ..run import Run, build
 
-        for path, kind in ((self.output, "benchmark"), (self.flame, "figure")):
-            if path is not None:
-                claim(path, kind, self.overwrite)
+        if self.output is not None:
+            claim(self.output, "benchmark", self.overwrite)
+        if self.flame is not None:
+            claim(self.flame, "figure", self.overwrite)
         device = choose_device(self.device)
         if self.scene is None:
             run = Run(Path(self.method))
             data, method, name = run.dataset(), run.new_method(device), run.method_name
         else:
             run, name = None, methods.check(self.method)
-            kind = methods.find(name)
-            data = open_dataset(posed(self.scene), kind.learns_from, downscale=self.downscale, reader=self.reader)
-            config = kind.preset(preset_device(self.device, self.preset))
-            method = build(kind, data.frame, config, device, self.seed, learning=True)
+            learner = methods.find(name)
+            data = open_dataset(posed(self.scene), learner.learns_from, downscale=self.downscale, reader=self.reader)
+            config = learner.preset(preset_device(self.device, self.preset))
+            method = build(learner, data.frame, config, device, self.seed, learning=True)
         found = bench_step(method, data, run, self.warmup, self.steps, self.progress, self.seed)
         show_table(found.table(f"A step of {name} on {scene_name(data.source)}"))
         if self.output is not None:
