@@ -45,7 +45,7 @@ NODE, ATEN, UPDATE = "autograd::engine::evaluate_function: ", "aten::", "Optimiz
 
 
 @dataclass(frozen=True)
-class Row:
+class StepRow:
     """A kernel, an operation or another part of a step, per step.
 
     kind:  one of KINDS
@@ -60,7 +60,7 @@ class Row:
     bytes: float = 0.0
     processor_ms: float = 0.0
 
-    def plus(self, calls: float = 0.0, ms: float = 0.0, bytes: float = 0.0) -> Row:
+    def plus(self, calls: float = 0.0, ms: float = 0.0, bytes: float = 0.0) -> StepRow:
         return replace(self, calls=self.calls + calls, ms=self.ms + ms, bytes=self.bytes + bytes)
 
 
@@ -77,7 +77,7 @@ class Anatomy:
     memory_rate: bytes per second that the memory moves, in a large copy
     """
 
-    rows: list[Row]
+    rows: list[StepRow]
     tree: Span
     ms: float
     processor_ms: float
@@ -95,7 +95,7 @@ class Anatomy:
         names = "ms", "processor_ms", "profiled_ms", "waiting", "memory_rate"
         return {name: getattr(self, name) for name in names} | {"rows": rows}
 
-    def memory_share(self, row: Row) -> float:
+    def memory_share(self, row: StepRow) -> float:
         """Rate of a row's bytes as a share of the memory's. Above 1 where they come from a cache."""
         return row.bytes / (row.ms / 1e3) / self.memory_rate if row.ms else 0.0
 
@@ -166,7 +166,7 @@ def take_apart(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimiz
     waiting = contention()
     steps = sorted((e for e in profiler.events() if e.name == STEP), key=lambda e: e.cpu_time_total)
     quick = steps[: (count + 1) // 2]
-    rows, tree = dict[str, Row](), Span(STEP, 0.0, KINDS.index("Python"))
+    rows, tree = dict[str, StepRow](), Span(STEP, 0.0, KINDS.index("Python"))
     for event in quick:
         add(event, [tree], None, rows, 1 / len(quick))
     for name, moved in traffic(step, optimizers):
@@ -216,7 +216,7 @@ def update_of(optimizer: torch.optim.Optimizer) -> str:
     return f"{type(optimizer).__name__}.step"
 
 
-def add(event: Any, around: list[Span], row: Row | None, rows: dict[str, Row], weight: float) -> None:
+def add(event: Any, around: list[Span], row: StepRow | None, rows: dict[str, StepRow], weight: float) -> None:
     """Add a profiled event, and all inside it, to the tree and the rows.
 
     around: spans that the event lies in, the whole step first
@@ -253,21 +253,21 @@ def plain(event: str) -> str:
     return event.removeprefix(NODE).removeprefix(ATEN).removeprefix(UPDATE)
 
 
-def whole(event: str) -> Row | None:
+def whole(event: str) -> StepRow | None:
     """The row that an event with all inside it belongs to; None for spans that are taken apart."""
     name = plain(event)
     if name in WHOLE:
-        return Row(WHOLE[name], name)
+        return StepRow(WHOLE[name], name)
     if event.startswith(UPDATE):
-        return Row(name, "optimizer")
+        return StepRow(name, "optimizer")
     if name.removesuffix(" forward").removesuffix(" backward") in operations() and " " in name:
-        return Row(name, "kernel")
-    return Row(name, "operation") if event.startswith(ATEN) else None
+        return StepRow(name, "kernel")
+    return StepRow(name, "operation") if event.startswith(ATEN) else None
 
 
-def remainder(name: str) -> Row:
+def remainder(name: str) -> StepRow:
     """The row of a span's own time, in which nothing runs that has a row."""
-    return Row(f"{name}, between", "Python") if name in PARTS else Row("graph of gradients", "autograd")
+    return StepRow(f"{name}, between", "Python") if name in PARTS else StepRow("graph of gradients", "autograd")
 
 
 def traffic(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimizer]) -> Iterator[tuple[str, int]]:
@@ -283,7 +283,7 @@ def traffic(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimizer]
         yield update_of(optimizer), sum(moved_by(optimizer))
 
 
-def row_around(event: Any) -> Row | None:
+def row_around(event: Any) -> StepRow | None:
     """The row that an event belongs to: that of the outermost event around it which has one."""
     found = None
     while event := event.cpu_parent:
