@@ -15,7 +15,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import torch
@@ -158,12 +158,12 @@ def take_apart(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimiz
     step: makes the next step, by `training.advance`. On a GPU each launch must wait: CUDA_LAUNCH_BLOCKING=1.
     """
     alone, running = (statistics.median(column) for column in zip(*(seconds(step) for _ in range(count)), strict=True))
-    contention, clock = Contention() if TASKS_FOLDER.exists() else lambda: 0.0, RunningClock()
+    clock, contention = RunningClock(), Contention() if TASKS_FOLDER.exists() else None
     with watching(clock.kernel), clock.of(optimizers), profile(activities=[ProfilerActivity.CPU]) as profiler:
         for _ in range(count):
             with span(STEP):
                 step()
-    waiting = contention()
+    waiting = contention() if contention else 0.0
     steps = sorted((e for e in profiler.events() if e.name == STEP), key=lambda e: e.cpu_time_total)
     quick = steps[: (count + 1) // 2]
     rows, tree = dict[str, StepRow](), Span(STEP, 0.0, KINDS.index("Python"))
@@ -260,9 +260,15 @@ def whole(event: str) -> StepRow | None:
         return StepRow(WHOLE[name], name)
     if event.startswith(UPDATE):
         return StepRow(name, "optimizer")
-    if name.removesuffix(" forward").removesuffix(" backward") in operations() and " " in name:
+    if name in kernel_spans():
         return StepRow(name, "kernel")
     return StepRow(name, "operation") if event.startswith(ATEN) else None
+
+
+@cache
+def kernel_spans() -> frozenset[str]:
+    """Names of the spans of all kernels."""
+    return frozenset(f"{name} {way}" for name in operations() for way in ("forward", "backward"))
 
 
 def remainder(name: str) -> StepRow:
