@@ -73,8 +73,8 @@ CHANGES = {
     ),
     # The error before was a mean over channels and had half of eq. 6. In units of the sum its weights are these.
     "regnerf": Change(
-        "procedural:still-life,size=24",
-        {"hidden_width": 32, "rays_per_step": 16, "unseen_patches": 1, "coarse_samples": 16, "fine_samples": 16},
+        OBJECT,
+        {"hidden_width": 64, "rays_per_step": 24, "unseen_patches": 1},
         {"depth_weight_start": 15.0, "depth_weight": 0.15, "depth_settling": 0.05, "likelihood_weight": 3e-3}
         | {"annealing": 0.01, "warmup": 0.0025, "density_noise": 0.0, "gradient_clip": 0.0},
         without={"unseen_patches": 0, "likelihood_weight": 0.0},
