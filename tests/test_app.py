@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from app_uploads import make_malformed
 from budgets import budget
 from PIL import Image
 from starlette.testclient import TestClient
@@ -222,6 +223,23 @@ def test_a_bomb_of_pixels_is_refused(client, project):
     header += zlib.crc32(header[12:]).to_bytes(4, "big") + b"\0\0\0\0IEND\xaeB`\x82"
     refused = put(client, project, "bomb.png", header)
     assert refused.status_code == 400 and "3600000000 pixels" in refused.json()["fault"]
+
+
+def test_malformed_photographs_are_refused_or_opened(app, client, project, tmp_path):
+    """Bent by the fuzzer; `benchmarks/app_uploads.py` drops a hundred onto the page."""
+    refused = {}
+    for path in make_malformed(tmp_path / "made", 30):
+        answer = put(client, project, path.name, path.read_bytes())
+        if answer.status_code != 200:
+            refused[path.name] = answer.json()["fault"]
+            assert answer.status_code == 400 and 20 < len(refused[path.name]) < 400 and "\n" not in refused[path.name]
+    taken = names(app, project)
+    assert refused and taken and len(refused) + len(taken) == 30
+    for name in taken:
+        shown = client.get(f"/api/items/{project}/picture", params={"name": name})
+        assert shown.status_code == 200 or name in shown.json()["fault"]
+    assert client.get(f"/api/items/{project}/advice").status_code == 200
+    assert not [path for path in (app.root / project).rglob("*.part")]
 
 
 def test_sizes_are_kept_to(app, client, project):

@@ -125,20 +125,21 @@ def capture_progress(item: Item) -> dict[str, Any]:
         if done[name]["done"]:
             share += 0.95 * WEIGHTS[name]
         else:
-            stage, within = title, within_stage(item, name, said)
-            share += 0.95 * WEIGHTS[name] * within
+            stage, (count, total) = title, within_stage(item, name, said)
+            share += 0.95 * WEIGHTS[name] * min(1.0, count / max(total, 1))
+            said = f": {count} of {total}" if name == "features" and total else said
     else:
         stage = "Writing the scene"
     return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2]}
 
 
-def within_stage(item: Item, stage: str, said: str) -> float:
-    """Share of a stage that is over: by photographs with features, else by the last line of the log."""
-    if stage == "features":
+def within_stage(item: Item, stage: str, said: str) -> tuple[int, int]:
+    """Count and total of a stage: of photographs with features, else by the last line of the log."""
+    if stage == "features":  # those of an earlier start count too, unlike in the log
         rows = rows_of(item.path / SCENE / "work" / "database.db")
-        return sum(features is not None for _, features, _ in rows) / max(len(rows), 1)
+        return sum(features is not None for _, features, _ in rows), len(rows)
     found = PERCENT.search(said)
-    return min(1.0, int(found[1]) / max(int(found[2]), 1)) if found else 0.0
+    return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
 def model_folder(item: Item) -> Path | None:
@@ -252,7 +253,8 @@ def card_of_run(folder: Path) -> dict[str, Any]:
 
 def newest(folder: Path) -> tuple[int, ...]:
     """By which a run's card is known to be current."""
-    places = (folder / name for name in ("metrics.jsonl", "eval.json", "config.json", "checkpoints", "blocks.json"))
+    names = "metrics.jsonl", "eval.json", "eval-train.json", "config.json", "checkpoints", "blocks.json"
+    places = (folder / name for name in names)
     return tuple(place.stat().st_mtime_ns for place in places if place.exists())
 
 

@@ -9,6 +9,7 @@ from ..budget import QUALITIES
 from ..errors import LumigraphError
 from ..exchange import size_of
 from . import pictures, progress
+from .comparison import comparison, rendering
 from .job_record import Making, ShareJob, read_job
 from .jobs import log_lines
 from .projects import SCENE, SHARED, Item
@@ -48,6 +49,7 @@ def run_row(path: Path) -> dict[str, Any]:
     about = progress.card_of_run(path) if path.is_dir() else {"method": path.suffix, "psnr": None, "trained": True}
     picture = progress.picture_of_run(path)
     row = {"name": path.name, "bytes": size_of(path), "age": progress.age(path), **about}
+    row["compared"] = comparison(path)
     return row | {"picture": pictures.version_of(picture) if picture else ""}
 
 
@@ -87,11 +89,17 @@ def result_of(item: Item) -> dict[str, Any] | None:
 
 
 def picture(item: Item, name: str, run: str) -> Path:
-    """File of a photograph by name, a run's preview, or the picture of a card. Raises LumigraphError without one."""
+    """File of a photograph by name, its rendering by a run, a run's preview, or the picture of a card.
+
+    Raises LumigraphError without one.
+    """
     found: Path | None = None
-    if name:
+    if name and run:
+        found = rendering(item.run(run), name)
+    elif name:
         made = pictures.files_of(item.path / SCENE / "images")
-        found = pictures.photographs_of(item).get(name) or made.get(name)
+        plain = name.removeprefix("images/")  # as a scene names it
+        found = pictures.photographs_of(item).get(plain) or made.get(plain)
     elif run:
         found = progress.picture_of_run(item.run(run))
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -149,6 +150,12 @@ class App:
     def is_local(self) -> bool:
         return not self.address.token
 
+    @property
+    def phone_url(self) -> str:
+        """Address, with the token, for other machines on the network; empty if none can reach the app."""
+        url = self.address.urls[-1]  # the address in use stands last
+        return "" if self.is_local or "://127.0.0.1:" in url else url
+
     # Home
 
     def home(self) -> dict[str, Any]:
@@ -157,6 +164,7 @@ class App:
         return {
             "folder": str(self.root),
             "local": self.is_local,
+            "phone": self.phone_url,
             "cards": found,
             "trash": projects.trash(self.root),
             "queue": waiting,
@@ -188,6 +196,7 @@ class App:
             "key": item.key,
             "kind": item.kind,
             "title": record.title,
+            "phone": f"{url}#{item.key}" if (url := self.phone_url) else "",
             "folder": str(item.path),
             "source": record.source,
             "photographs": [
@@ -349,6 +358,13 @@ def build(app: App) -> ASGIApp:
         item, name = app.item(request.path_params["key"]), request.query_params.get("name", "")
         return JSONResponse(await asyncio.to_thread(progress.features, item, name))
 
+    async def code(request: Request) -> Response:
+        if not app.phone_url:
+            raise LumigraphError("Other machines cannot reach the app; start it with --host 0.0.0.0")
+        key = request.query_params.get("key", "")
+        url = f"{app.phone_url}#{app.item(key).key}" if key else app.phone_url
+        return Response(qr_code(url), media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
+
     async def shared(request: Request) -> Response:
         item, name = app.item(request.path_params["key"]), request.path_params["name"]
         place = item.path / SHARED / name
@@ -390,6 +406,7 @@ def build(app: App) -> ASGIApp:
         Route("/", page),
         Route("/static/{name}", page),
         Route("/api/home", asked(None, app.home)),
+        Route("/api/phone.svg", code),
         Route("/api/projects", asked(NewBody, app.new), methods=["POST"]),
         Route("/api/trash", asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
         Route("/api/trash/{name}", restore, methods=["POST"]),
@@ -440,6 +457,15 @@ def picture_of(item: Item, request: Request) -> Response:
     found = rows.picture(item, query.get("name", ""), query.get("run", ""))
     kept = "max-age=86400" if "v" in query else "no-cache"
     return Response(pictures.thumbnail(found, side), media_type="image/jpeg", headers={"Cache-Control": kept})
+
+
+def qr_code(text: str) -> bytes:
+    """SVG of a QR code."""
+    import segno
+
+    out = io.BytesIO()
+    segno.make(text, error="m", micro=False).save(out, kind="svg", scale=5, border=3, light="#fff")
+    return out.getvalue()
 
 
 async def body_of(request: Request, kind: Any) -> Any:
