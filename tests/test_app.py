@@ -27,7 +27,7 @@ from lumigraph.app import jobs, progress, projects, uploads
 from lumigraph.app.job_record import read_job
 from lumigraph.app.projects import find_item, new_project
 from lumigraph.app.scene_views import SceneView
-from lumigraph.app.server import App, build
+from lumigraph.app.server import App, build, qr_code
 from lumigraph.errors import LumigraphError
 from lumigraph.viewer.address import Address, free_port
 
@@ -59,7 +59,7 @@ if words[0] == "capture":
 elif words[0] in ("train", "resume"):
     run = pathlib.Path(words[1]) if words[0] == "resume" else option("--output")
     shutil.copytree((here.parent.parent / "ball.txt").read_text(), run, dirs_exist_ok=True)
-else:
+elif words[0] != "eval":
     pathlib.Path(words[3] if words[0] == "export" else option("--output")).write_bytes(b"<p>made</p>")
 """
 
@@ -161,6 +161,20 @@ def test_others_need_the_token_and_name_no_path(tmp_path):
     (tmp_path / "pictures" / "a.jpg").write_bytes(jpeg())
     refused = client.post("/api/projects", json={"title": "x", "path": str(tmp_path / "pictures")})
     assert refused.status_code == 400 and "on this machine" in refused.json()["fault"]
+
+
+def test_a_phone_gets_the_address_with_its_token_as_a_code(tmp_path, client, project, monkeypatch):
+    monkeypatch.setattr("lumigraph.viewer.address.own_addresses", lambda: ["127.0.0.1", "192.0.2.7"])
+    app = App(tmp_path, Address("0.0.0.0", 8080, TOKEN))
+    phone, key = TestClient(build(app), base_url=BASE), new_project(tmp_path, "Garden").key
+    assert phone.get("/api/phone.svg").status_code == 403
+    url = f"http://192.0.2.7:8080/?token={TOKEN}"
+    assert phone.get(f"/api/home?token={TOKEN}").json()["phone"] == url
+    assert phone.get(f"/api/items/{key}").json()["phone"] == f"{url}#{key}"
+    code = phone.get("/api/phone.svg", params={"key": key})
+    assert code.headers["Content-Type"] == "image/svg+xml" and code.content == qr_code(f"{url}#{key}")
+    assert phone.get("/api/phone.svg", params={"key": "no"}).status_code == 400
+    assert client.get("/api/home").json()["phone"] == "" and client.get("/api/phone.svg").status_code == 400
 
 
 # Uploads
@@ -282,7 +296,7 @@ def test_advice_comes_while_photographs_arrive(client, project):
     said = {one["text"].partition(":")[0]: one["names"] for one in client.get(f"/api/items/{project}/advice").json()}
     assert said["Blurred"] == ["soft.jpg"] and said["Very dark"] == ["dark.jpg"]
     assert said["Shown twice"] in (["again.jpg"], ["3.jpg"])
-    assert any("8 photographs" in text for text in said)
+    assert any("8 photographs" in text for text in said) and "No two show enough of the same. Take them" in str(said)
     left = client.delete(f"/api/items/{project}/photographs", params={"name": "soft.jpg"}).json()
     assert "soft.jpg" not in [one["name"] for one in left["photographs"]]
     shown = client.get(f"/api/items/{project}/picture", params={"name": "0.jpg", "side": 99})
@@ -394,6 +408,31 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     assert "sandbox" in file.headers["Content-Security-Policy"]
     assert running.get(f"/api/items/{project}/shares/..%2fproject.json").status_code in (400, 404)
     assert running.delete(f"/api/items/{project}/shares/{row['name']}").json()["shares"] == []
+
+
+def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run):
+    import tiny
+
+    from lumigraph.evaluation import evaluate_run
+    from lumigraph.run import Run
+
+    place = find_item(app.root, project).path / "runs" / "a"
+    shutil.copytree(ball_run.path, place)
+    assert running.get(f"/api/items/{project}").json()["runs"][0]["compared"] is None
+    let(app)
+    running.post(f"/api/items/{project}/shares", json={"kind": "compare", "run": "a"})
+    wait(lambda: running.get(f"/api/items/{project}").json()["shares"][0]["state"] == "done")
+    (words,) = calls(app, project)
+    assert words == ["eval", str(place), "--split", "test", "--views", "12", "--save-images", "--overwrite"]
+    run = Run(place)
+    evaluate_run(run, run.method("cpu"), tiny.scene(), "test", True, 2)  # as the command does
+    compared = running.get(f"/api/items/{project}").json()["runs"][0]["compared"]
+    assert len(compared["views"]) == 2 and not compared["stale"] and compared["views"][0]["held_out"]
+    about = {"run": "a", "name": compared["views"][0]["name"]}
+    shown = running.get(f"/api/items/{project}/picture", params=about)
+    assert Image.open(io.BytesIO(shown.content)).size == (tiny.SIZE, tiny.SIZE)
+    astray = running.get(f"/api/items/{project}/picture", params=about | {"name": "../../previews/000060"})
+    assert astray.status_code == 400
 
 
 def test_a_failure_is_the_sentence_of_the_command(app, running, project):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .pictures import version_of
-from .progress import newest
+from .projects import newest
 
 COMPARE = "compare"  # kind of the job
 VIEWS = 12  # at most

@@ -24,7 +24,7 @@ from ..geometry import evenly
 from ..metrics.rows import last_psnr
 from .job_record import Making
 from .jobs import log_lines, run_folder
-from .projects import SCENE, Item
+from .projects import SCENE, Item, newest
 
 STAGES = {
     "features": "Finding details",
@@ -249,13 +249,6 @@ def card_of_run(folder: Path) -> dict[str, Any]:
     with contextlib.suppress(LumigraphError):
         return _card(folder, newest(folder))
     return {"method": "", "psnr": None}
-
-
-def newest(folder: Path) -> tuple[int, ...]:
-    """By which a run's card is known to be current."""
-    names = "metrics.jsonl", "eval.json", "eval-train.json", "config.json", "checkpoints", "blocks.json"
-    places = (folder / name for name in names)
-    return tuple(place.stat().st_mtime_ns for place in places if place.exists())
 
 
 @lru_cache(512)

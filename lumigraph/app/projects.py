@@ -122,6 +122,13 @@ def is_splats(path: Path) -> bool:
     return path.suffix.lower() in (".ply", ".spz", ".sog", ".splat") and path.is_file()
 
 
+def newest(folder: Path) -> tuple[int, ...]:
+    """By which a run's card is known to be current."""
+    names = "metrics.jsonl", "eval.json", "eval-train.json", "config.json", "checkpoints", "blocks.json"
+    places = (folder / name for name in names)
+    return tuple(place.stat().st_mtime_ns for place in places if place.exists())
+
+
 def items(root: Path) -> list[Item]:
     """Projects, runs and scenes of a folder, the latest first."""
     found = [Item(root, path) for shelf in SHELVES for path in candidates(root / shelf)]
