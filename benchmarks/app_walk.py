@@ -5,7 +5,7 @@ cropped, shared, and the page downloaded and opened. Screenshots of each step at
 
 --kill ends the app by SIGKILL while photographs arrive, while features are found, while cameras are placed, while it
 trains and while a page is made. Each time the app is started again and its page is loaded again. The walk fails if
-anything is lost. The browser draws in software: it gets a lower priority than the app, and its note of that is hidden.
+anything is lost. The browser draws in software: it gets the app's priority, and its note of that is hidden.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from browser import ARGUMENTS, find_chromium
 
 DESK, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 PICTURE_BYTES = 150_000  # of a screenshot
-NICENESS = 10  # of the browser's processes, whose drawing in software would hold up the app
+NICENESS = 0  # of the browser: its drawing in software takes a higher priority of its own
 # Hides the name of the graphics card, by which viser would show a note of drawing in software.
 NO_CARD_NAME = """
 for (const kind of [WebGLRenderingContext, WebGL2RenderingContext]) {

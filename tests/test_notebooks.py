@@ -52,7 +52,7 @@ def test_the_notebook_of_the_documents_runs(ball_folder, tmp_path, monkeypatch):
     changes = {
         "lumigraph.capture(": "lumigraph.open_scene(",
         "seconds=60": "steps=40, initial_gaussians=400",
-        "seconds=30": "steps=2, log2_hashmap_size=10",
+        "seconds=30": "steps=2, initial_gaussians=400",
     }
     done = notebook.execute(nbformat.read(notebook.NOTEBOOK, 4), tmp_path, changes, 300)
     scene, run, view, score, page, own = (notebook.outputs(cell) for cell in done.cells if cell.cell_type == "code")

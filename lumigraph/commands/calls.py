@@ -84,10 +84,12 @@ def train(
         methods.register(method)
         method = methods.name_of(method)
     command = understood(["train", method, str(scene), *typed({"output": output, **options})])
-    if progress is None and in_notebook():
-        progress = NotebookBar()
-    watch = None if progress is None else Told(progress)
-    return open_any(conducted(command, lambda: command.run(watch))["run"])
+    bar = NotebookBar() if progress is None and in_notebook() else None
+    told = progress or bar
+    rows = conducted(command, lambda: command.run(Told(told) if told else None))
+    if bar:
+        bar.end()
+    return open_any(rows["run"])
 
 
 def open(path: str | Path) -> Opened:
