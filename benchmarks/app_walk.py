@@ -111,15 +111,18 @@ class Walk:
                 break
         (self.output / f"{name}.jpg").write_bytes(out.getvalue())
 
-    def shots(self, desk: Any, phone: Any, name: str, scroll: str = "") -> None:
-        """Save screenshots at both sizes. scroll: a panel that the phone scrolls to"""
+    def shots(self, desk: Any, phone: Any, name: str, panel: str = "", scene: str = "") -> None:
+        """Save screenshots at both sizes. panel: shown on the phone; scene: title of its viewer, once that is open"""
         give_way()
         self.shot(desk, f"{name}-desk")
         phone.goto(desk.url)
         phone.locator("main").wait_for()
-        phone.wait_for_timeout(6000)
-        if scroll:
-            phone.get_by_label(scroll, exact=True).scroll_into_view_if_needed()
+        if panel:
+            phone.get_by_label(panel, exact=True).scroll_into_view_if_needed()
+        if scene:
+            phone.frame_locator("iframe").get_by_text(scene).first.wait_for(state="attached")
+            phone.wait_for_timeout(15_000)
+        phone.wait_for_timeout(5000)
         self.shot(phone, f"{name}-phone")
         phone.goto("about:blank")
 
@@ -195,7 +198,7 @@ def go(walk: Walk, files: list[Path], advanced: dict[str, float], kill: bool) ->
         desk.get_by_role("button", name="Make the scene").click()
         walk.mark("asked to make it")
         stages(walk, desk, phone, key, kill)
-        crop_and_share(walk, desk, phone, kill)
+        crop_and_share(walk, desk, phone, key, kill)
     if walk.faults:
         raise SystemExit("The page complained: " + "; ".join(walk.faults))
 
@@ -243,23 +246,29 @@ def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
         step = making()["progress"].get("step", 0)
         walk.kill("it trains", desk)
         until(lambda: making()["progress"].get("step", 0) >= step or making()["state"] == "done", walk.patience)
-    desk.wait_for_timeout(15_000)
-    walk.shots(desk, phone, "5-training")
+    desk.wait_for_timeout(10_000)
+    walk.shots(desk, phone, "5-training", panel="Progress" if making()["state"] == "running" else "")
     until(lambda: making()["state"] == "done", walk.patience)
     walk.mark("the scene is ready")
 
 
-def crop_and_share(walk: Walk, desk: Any, phone: Any, kill: bool) -> None:
+def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
+    """From a scene to a page of a part of it, downloaded and opened."""
     scene = desk.frame_locator("iframe")
     scene.get_by_role("tab", name="Crop").wait_for()
     desk.wait_for_timeout(20_000)
     walk.mark("the finished scene is open")
-    walk.shots(desk, phone, "6-scene")
+    run = walk.detail(key)["runs"][-1]["name"]
+    walk.shots(desk, phone, "6-scene", scene=run)
     scene.get_by_role("tab", name="Crop").click()
     scene.get_by_label("Show", exact=True).filter(visible=True).first.click()
     scene.get_by_role("option", name="inside a sphere").click()
     desk.wait_for_timeout(10_000)
     walk.shot(desk, "7-crop-desk")
+    scene.get_by_role("button", name="Save", exact=True).filter(visible=True).first.click()
+    part = until(lambda: next((one for one in walk.detail(key)["runs"] if one["name"].endswith(".ply")), None), 600)
+    walk.mark("the crop is saved")
+    desk.get_by_label("Version").filter(has_text=part["name"]).wait_for()
     desk.get_by_role("button", name="Make Web page").click()
     if kill:
         desk.get_by_text("Making").wait_for()
@@ -268,7 +277,7 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, kill: bool) -> None:
     link.wait_for()
     walk.mark("the page is made")
     link.scroll_into_view_if_needed()
-    walk.shots(desk, phone, "8-share")
+    walk.shots(desk, phone, "8-share", panel="Share")
     with desk.expect_download() as download:
         link.click()
     page = walk.output / download.value.suggested_filename
