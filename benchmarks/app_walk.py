@@ -283,8 +283,9 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> N
     page = walk.output / download.value.suggested_filename
     download.value.save_as(page)
     for window, name in ((desk, "desk"), (phone, "phone")):
-        window.goto(page.resolve().as_uri(), timeout=600_000)
-        window.wait_for_timeout(15_000)
+        window.goto(page.resolve().as_uri())
+        window.wait_for_function("document.body.classList.contains('open')")
+        window.wait_for_timeout(5000)
         if name == "desk":
             walk.mark("the downloaded page is open")
         walk.shot(window, f"9-page-{name}")

@@ -38,7 +38,7 @@ export function Project({ item, say, choose, go }) {
       const arrived = found.photographs.length;
       if (latest.current.arrived !== arrived && found.kind !== "run") {
         latest.current.arrived = arrived;
-        setAdvice(await api("GET", `${of(item)}/advice`));
+        api("GET", `${of(item)}/advice`).then(setAdvice, () => {}); // takes longer than other requests
       }
     } catch (error) {
       setFault(error.message);
