@@ -235,7 +235,7 @@ def elevation_at(height, x, y):
     return total
 
 
-@njit(**COMPILE_OPTIONS)
+@njit(cache=True, **COMPILE_OPTIONS)
 def march(height, highest, origins, directions, far, found):
     """Fill `found` with the distance along each ray to the height field; see `distances`."""
     for r in range(len(origins)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -190,11 +191,12 @@ class Playback:
         """Move the slider until `stop`, or until it is played again; whoever drags it goes on from there."""
         self._number += 1
         number, (first, last), before = self._number, self._span, time.perf_counter()
-        while number == self._number:
-            time.sleep(STEP_SECONDS)
-            now = time.perf_counter()
-            share = (self._slider.value - first) / (last - first) + (now - before) / self._seconds.value
-            self._slider.value, before = first + share % 1.0 * (last - first), now
+        with suppress(RuntimeError):  # of a slider that is removed meanwhile, with its client
+            while number == self._number:
+                time.sleep(STEP_SECONDS)
+                now = time.perf_counter()
+                share = (self._slider.value - first) / (last - first) + (now - before) / self._seconds.value
+                self._slider.value, before = first + share % 1.0 * (last - first), now
 
 
 def add(gui: Any, control: Control, value: Value) -> Any:

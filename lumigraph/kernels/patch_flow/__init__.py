@@ -50,7 +50,7 @@ def cases(generator: torch.Generator):
     start, first, second, gradient, *others = _inputs(16, 20, 8, 4, 2, generator)
     yield start, first, second, torch.zeros_like(gradient), *others
     yield start + 100, first, second, gradient, *others
-    yield start, first, second + 5, 0.05 * gradient, *others  # all of them leap, and return
+    yield start, first, 50 * second, 0.05 * gradient, *others  # all of them leap, and return
     yield start[:0], first, second, gradient, *others
 
 
