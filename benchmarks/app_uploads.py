@@ -125,12 +125,10 @@ def make_photographs(folder: Path, count: int) -> list[Path]:
     y, x = np.mgrid[: SIZE[1] // 8, : SIZE[0] // 8]
     made = []
     for i in range(count):
+        made.append(folder / f"IMG_{i:04}.jpg")
         wave = 90 + 60 * np.sin(x / (17 + i % 31) + i) * np.cos(y / (11 + i % 23))
         smooth = np.asarray(Image.fromarray(wave.astype(np.uint8)).resize(SIZE, Image.Resampling.BILINEAR))
-        Image.fromarray(smooth[..., None] + np.roll(noise, 97 * i, 1)).save(
-            folder / f"IMG_{i:04}.jpg", quality=QUALITY, subsampling=0
-        )
-        made.append(folder / f"IMG_{i:04}.jpg")
+        Image.fromarray(smooth[..., None] + np.roll(noise, 97 * i, 1)).save(made[-1], quality=QUALITY, subsampling=0)
     return made
 
 

@@ -284,7 +284,7 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> N
     download.value.save_as(page)
     for window, name in ((desk, "desk"), (phone, "phone")):
         window.goto(page.resolve().as_uri())
-        window.wait_for_function("document.body.classList.contains('open')")
+        window.locator("body.open").wait_for()
         window.wait_for_timeout(5000)
         if name == "desk":
             walk.mark("the downloaded page is open")

@@ -15,7 +15,7 @@ from ..capture.masks import MASKS
 from ..capture.motion.reconstruction import BLACK, MIN_VIEWS
 from ..capture.photos.gather import PHOTOGRAPHS, walk
 from ..capture.photos.judge import Judgement, blurred, duplicates, exposure_jumps, judge
-from ..capture.photos.overlap import Descriptors, apart, details
+from ..capture.photos.overlap import Descriptors, apart, details, shared
 from ..capture.photos.video import VIDEOS
 from ..capture.pictures import eight_bits, reads_heic
 from ..errors import LumigraphError
@@ -27,7 +27,7 @@ DARK = -6.5  # mean log2 of the luminance, below which noise of a photograph has
 USUAL_VIEWS = 20  # photographs of a scene that has no gaps
 MAX_NAMED = 3  # photographs that a piece of advice names
 MAX_KEPT = 4096  # thumbnails and judgements in memory
-MAX_COMPARED = 150  # photographs; more of them leave no gaps, and take long to compare
+MAX_COMPARED = 100  # photographs; more of them leave no gaps, and take long to compare
 
 
 @dataclass(frozen=True)
@@ -119,18 +119,23 @@ def version_of(path: Path) -> str:
     return hashlib.blake2b(f"{about.st_mtime_ns} {about.st_size}".encode(), digest_size=6).hexdigest()
 
 
-@lru_cache(MAX_KEPT)
+@lru_cache(MAX_COMPARED)
 def _details(path: Path, modified: int, size: int) -> Descriptors:
     with Image.open(path) as image:
         return details(image)
+
+
+@lru_cache(MAX_COMPARED**2)
+def _shared(one: tuple[Path, int, int], other: tuple[Path, int, int]) -> int:
+    return shared(_details(*one), _details(*other))
 
 
 def too_far(files: Mapping[str, Path]) -> list[str]:
     """Names of photographs that share too little with every other one; none of too many photographs to compare."""
     if not MIN_VIEWS <= len(files) <= MAX_COMPARED:
         return []
-    abouts = {name: path.stat() for name, path in files.items()}
-    return apart({name: _details(files[name], x.st_mtime_ns, x.st_size) for name, x in abouts.items()})
+    about = {name: (path, path.stat().st_mtime_ns, path.stat().st_size) for name, path in files.items()}
+    return apart(list(files), lambda a, b: _shared(*sorted((about[a], about[b]))))
 
 
 @lru_cache(MAX_KEPT)

@@ -38,7 +38,8 @@ export function Project({ item, say, choose, go }) {
       const arrived = found.photographs.length;
       if (latest.current.arrived !== arrived && found.kind !== "run") {
         latest.current.arrived = arrived;
-        api("GET", `${of(item)}/advice`).then(setAdvice, () => {}); // takes longer than other requests
+        clearTimeout(latest.current.asking); // at the end of a burst, for advice takes longer than other requests
+        latest.current.asking = setTimeout(() => api("GET", `${of(item)}/advice`).then(setAdvice, () => {}), 1500);
       }
     } catch (error) {
       setFault(error.message);

@@ -7,12 +7,12 @@ Chance alone gives up to 11 on the bananas of a carpet; neighbours of a walk aro
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
 from ..pictures import eight_bits
@@ -20,9 +20,8 @@ from ..pictures import eight_bits
 SIDE, COUNT = 480, 800  # pixels of the longer side; details of a photograph
 RATIO = 0.8  # of the distances to the nearest and second nearest (Lowe 2004, section 7.1)
 MIN_SHARED = 15  # details, below which two photographs do not count as neighbours
-NEIGHBOURS = 2  # photographs before and after, which are compared first
 
-Descriptors = Float[np.ndarray, "_ 128"]  # of the details of a photograph
+Descriptors = UInt8[np.ndarray, "_ 128"]  # of the details of a photograph
 
 
 @cache
@@ -37,22 +36,26 @@ def extractor() -> Any:
 
 
 def details(image: Image.Image) -> Descriptors:
-    """Unit descriptors of the largest details. Raises whatever Pillow raises for damaged files."""
+    """Descriptors of the largest details. Raises whatever Pillow raises for damaged files."""
     image.draft("L", (SIDE, SIDE))
     grey = eight_bits(image).convert("L")
     grey.thumbnail((SIDE, SIDE))
     _, descriptors = extractor().extract_from_uint8_array(np.ascontiguousarray(grey))
-    chosen = np.asarray(descriptors.data, np.float32).reshape(-1, 128)
-    return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
+    return np.array(descriptors.data, np.uint8).reshape(-1, 128)
 
 
 def shared(one: Descriptors, other: Descriptors) -> int:
     """Number of details that two photographs share."""
     if min(len(one), len(other)) < 2:
         return 0
-    similar = one @ other.T
+    similar = unit(one) @ unit(other).T
     (there, clear), (back, _) = nearest(similar), nearest(similar.T)
     return int((clear & (back[there] == np.arange(len(one)))).sum())
+
+
+def unit(descriptors: Descriptors) -> Float[np.ndarray, "_ 128"]:
+    vectors = descriptors.astype(np.float32)
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
 
 
 def nearest(similar: Float[np.ndarray, "a b"]) -> tuple[Int[np.ndarray, " a"], Bool[np.ndarray, " a"]]:
@@ -63,16 +66,15 @@ def nearest(similar: Float[np.ndarray, "a b"]) -> tuple[Int[np.ndarray, " a"], B
     return first, 1 - best <= RATIO**2 * (1 - second)  # |a - b|² = 2 - 2 cos
 
 
-def apart(descriptors: Mapping[str, Descriptors]) -> list[str]:
-    """Names of photographs that share too little with every other one; given in the order of the walk.
+def apart(names: Sequence[str], count: Callable[[str, str], int]) -> list[str]:
+    """Names of photographs that share too little with every other one.
 
-    Neighbours in order are compared first, and the others only for photographs without a neighbour.
+    names: in the order of the walk: neighbours are compared first, the others only for photographs without a neighbour
+    count: number of details that two photographs share
     """
-    names = list(descriptors)
     found = []
     for i, name in enumerate(names):
-        near = [j for k in range(1, NEIGHBOURS + 1) for j in (i - k, i + k) if 0 <= j < len(names)]
-        rest = [j for j in range(len(names)) if j != i and j not in near]
-        if not any(shared(descriptors[name], descriptors[names[j]]) >= MIN_SHARED for j in [*near, *rest]):
+        others = sorted((j for j in range(len(names)) if j != i), key=lambda j: abs(j - i))
+        if not any(count(name, names[j]) >= MIN_SHARED for j in others):
             found.append(name)
     return found
