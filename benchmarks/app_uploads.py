@@ -159,7 +159,10 @@ def many(walk: Uploads, page: Any, files: list[Path]) -> None:
     def ask() -> None:
         while not ended.wait(2):
             begin = time.monotonic()
-            urlopen(f"{walk.url}/api/home", timeout=600).read()
+            try:
+                urlopen(f"{walk.url}/api/home", timeout=600).read()
+            except OSError as error:
+                walk.expect(False, f"the home page got no answer: {error}")
             slowest[0] = max(slowest[0], time.monotonic() - begin)
 
     asking = threading.Thread(target=ask)

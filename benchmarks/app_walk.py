@@ -96,7 +96,7 @@ class Walk:
         self.mark(f"goes on after a kill while {when}")
 
     def detail(self, key: str) -> dict[str, Any]:
-        return json.load(urlopen(f"{self.url}/api/items/{key}", timeout=120))
+        return json.load(urlopen(f"{self.url}/api/items/{key}", timeout=600))
 
     def mark(self, step: str) -> None:
         self.times[step] = round(time.monotonic() - self.begun, 1)

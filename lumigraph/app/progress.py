@@ -276,5 +276,8 @@ def picture_of_run(folder: Path) -> Path | None:
 
 def age(path: Path) -> float:
     """Seconds since a folder, or something just inside it, changed."""
-    newest = max((one.stat().st_mtime for one in path.iterdir()), default=path.stat().st_mtime) if path.is_dir() else 0
-    return max(0.0, time.time() - max(newest, path.stat().st_mtime))
+    times = [path.stat().st_mtime]
+    for one in path.iterdir() if path.is_dir() else ():
+        with contextlib.suppress(OSError):  # a file that is being replaced
+            times.append(one.stat().st_mtime)
+    return max(0.0, time.time() - max(times))

@@ -8,6 +8,7 @@ import io
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
@@ -40,6 +41,7 @@ from .scene_views import SceneViews, answers, forward, forward_messages
 PAGE = Path(__file__).parent / "page"
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 1 << 16  # of a request that is no upload
+SLOW_THREADS = 2  # that decode photographs
 SWEEP_SECONDS = 15.0  # between looks for viewers without clients
 CONTENT_SECURITY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -145,6 +147,11 @@ class App:
         program = program or list(jobs.PROGRAM)
         self.runner = Runner(self.root, program)
         self.views = SceneViews(self.root / APP_FOLDER, program)
+        self._slow = ThreadPoolExecutor(SLOW_THREADS, "slow")
+
+    async def later(self, answer: Callable[..., Any], *arguments: Any) -> Any:
+        """Result of work that takes long, in threads of its own, so that uploads need not wait for it."""
+        return await asyncio.get_running_loop().run_in_executor(self._slow, answer, *arguments)
 
     @property
     def is_local(self) -> bool:
@@ -352,7 +359,10 @@ def build(app: App) -> ASGIApp:
         return JSONResponse(await asyncio.to_thread(app.leave_out, item, request.query_params.get("name", "")))
 
     async def picture(request: Request) -> Response:
-        return await asyncio.to_thread(picture_of, app.item(request.path_params["key"]), request)
+        return await app.later(picture_of, app.item(request.path_params["key"]), request)
+
+    async def advice(request: Request) -> Response:
+        return JSONResponse(await app.later(app.advice, app.item(request.path_params["key"])))
 
     async def marks(request: Request) -> Response:
         item, name = app.item(request.path_params["key"]), request.query_params.get("name", "")
@@ -417,7 +427,7 @@ def build(app: App) -> ASGIApp:
         Route(f"{item}/photographs", take, methods=["PUT"]),
         Route(f"{item}/photographs", have),
         Route(f"{item}/photographs", leave_out, methods=["DELETE"]),
-        Route(f"{item}/advice", asked(None, app.advice)),
+        Route(f"{item}/advice", advice),
         Route(f"{item}/picture", picture),
         Route(f"{item}/states", asked(None, progress.photographs_state)),
         Route(f"{item}/features", marks),

@@ -38,12 +38,18 @@ export function Project({ item, say, choose, go }) {
       const arrived = found.photographs.length;
       if (latest.current.arrived !== arrived && found.kind !== "run") {
         latest.current.arrived = arrived;
-        clearTimeout(latest.current.asking); // at the end of a burst, for advice takes longer than other requests
-        latest.current.asking = setTimeout(() => api("GET", `${of(item)}/advice`).then(setAdvice, () => {}), 1500);
+        latest.current.stale = true;
       }
+      advise();
     } catch (error) {
       setFault(error.message);
     }
+  };
+  const advise = async () => {
+    if (!latest.current.stale || latest.current.asking) return; // one at a time: it takes longer than other requests
+    Object.assign(latest.current, { stale: false, asking: true });
+    await api("GET", `${of(item)}/advice`).then(setAdvice, () => {});
+    latest.current.asking = false;
   };
   useEffect(() => repeat(1, load), [item]);
   useEffect(() => {
