@@ -25,7 +25,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOK = ROOT / "docs" / "photographs-to-page.ipynb"
-SCENE, METHOD, STEPS = "procedural:still-life", "instant-ngp", (100, 500)
+SCENE, METHOD, STEPS = "procedural:still-life", "instant-ngp", (50, 250)
 CELL = """import time, lumigraph
 begin = time.process_time()
 lumigraph.train({scene!r}, {method!r}, {output!r}, steps={steps})
