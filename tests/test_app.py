@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from app_uploads import make_malformed
 from budgets import budget
 from PIL import Image
 from starlette.testclient import TestClient
@@ -26,7 +27,7 @@ from lumigraph.app import jobs, progress, projects, uploads
 from lumigraph.app.job_record import read_job
 from lumigraph.app.projects import find_item, new_project
 from lumigraph.app.scene_views import SceneView
-from lumigraph.app.server import App, build
+from lumigraph.app.server import App, build, qr_code
 from lumigraph.errors import LumigraphError
 from lumigraph.viewer.address import Address, free_port
 
@@ -58,7 +59,7 @@ if words[0] == "capture":
 elif words[0] in ("train", "resume"):
     run = pathlib.Path(words[1]) if words[0] == "resume" else option("--output")
     shutil.copytree((here.parent.parent / "ball.txt").read_text(), run, dirs_exist_ok=True)
-else:
+elif words[0] != "eval":
     pathlib.Path(words[3] if words[0] == "export" else option("--output")).write_bytes(b"<p>made</p>")
 """
 
@@ -162,6 +163,20 @@ def test_others_need_the_token_and_name_no_path(tmp_path):
     assert refused.status_code == 400 and "on this machine" in refused.json()["fault"]
 
 
+def test_a_phone_gets_the_address_with_its_token_as_a_code(tmp_path, client, project, monkeypatch):
+    monkeypatch.setattr("lumigraph.viewer.address.own_addresses", lambda: ["127.0.0.1", "192.0.2.7"])
+    app = App(tmp_path, Address("0.0.0.0", 8080, TOKEN))
+    phone, key = TestClient(build(app), base_url=BASE), new_project(tmp_path, "Garden").key
+    assert phone.get("/api/phone.svg").status_code == 403
+    url = f"http://192.0.2.7:8080/?token={TOKEN}"
+    assert phone.get(f"/api/home?token={TOKEN}").json()["phone"] == url
+    assert phone.get(f"/api/items/{key}").json()["phone"] == f"{url}#{key}"
+    code = phone.get("/api/phone.svg", params={"key": key})
+    assert code.headers["Content-Type"] == "image/svg+xml" and code.content == qr_code(f"{url}#{key}")
+    assert phone.get("/api/phone.svg", params={"key": "no"}).status_code == 400
+    assert client.get("/api/home").json()["phone"] == "" and client.get("/api/phone.svg").status_code == 400
+
+
 # Uploads
 
 
@@ -224,6 +239,23 @@ def test_a_bomb_of_pixels_is_refused(client, project):
     assert refused.status_code == 400 and "3600000000 pixels" in refused.json()["fault"]
 
 
+def test_malformed_photographs_are_refused_or_opened(app, client, project, tmp_path):
+    """Bent by the fuzzer; `benchmarks/app_uploads.py` drops a hundred onto the page."""
+    refused = {}
+    for path in make_malformed(tmp_path / "made", 30):
+        answer = put(client, project, path.name, path.read_bytes())
+        if answer.status_code != 200:
+            refused[path.name] = answer.json()["fault"]
+            assert answer.status_code == 400 and 20 < len(refused[path.name]) < 400 and "\n" not in refused[path.name]
+    taken = names(app, project)
+    assert refused and taken and len(refused) + len(taken) == 30
+    for name in taken:
+        shown = client.get(f"/api/items/{project}/picture", params={"name": name})
+        assert shown.status_code == 200 or name in shown.json()["fault"]
+    assert client.get(f"/api/items/{project}/advice").status_code == 200
+    assert not [path for path in (app.root / project).rglob("*.part")]
+
+
 def test_sizes_are_kept_to(app, client, project):
     assert put(client, project, "a.jpg", jpeg(), size=10).status_code == 400  # more than announced
     assert put(client, project, "a.jpg", jpeg(), size=10**12).status_code == 400
@@ -264,7 +296,7 @@ def test_advice_comes_while_photographs_arrive(client, project):
     said = {one["text"].partition(":")[0]: one["names"] for one in client.get(f"/api/items/{project}/advice").json()}
     assert said["Blurred"] == ["soft.jpg"] and said["Very dark"] == ["dark.jpg"]
     assert said["Shown twice"] in (["again.jpg"], ["3.jpg"])
-    assert any("8 photographs" in text for text in said)
+    assert any("8 photographs" in text for text in said) and "No two show enough of the same. Take them" in str(said)
     left = client.delete(f"/api/items/{project}/photographs", params={"name": "soft.jpg"}).json()
     assert "soft.jpg" not in [one["name"] for one in left["photographs"]]
     shown = client.get(f"/api/items/{project}/picture", params={"name": "0.jpg", "side": 99})
@@ -376,6 +408,31 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     assert "sandbox" in file.headers["Content-Security-Policy"]
     assert running.get(f"/api/items/{project}/shares/..%2fproject.json").status_code in (400, 404)
     assert running.delete(f"/api/items/{project}/shares/{row['name']}").json()["shares"] == []
+
+
+def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run):
+    import tiny
+
+    from lumigraph.evaluation import evaluate_run
+    from lumigraph.run import Run
+
+    place = find_item(app.root, project).path / "runs" / "a"
+    shutil.copytree(ball_run.path, place)
+    assert running.get(f"/api/items/{project}").json()["runs"][0]["compared"] is None
+    let(app)
+    running.post(f"/api/items/{project}/shares", json={"kind": "compare", "run": "a"})
+    wait(lambda: running.get(f"/api/items/{project}").json()["shares"][0]["state"] == "done")
+    (words,) = calls(app, project)
+    assert words == ["eval", str(place), "--split", "test", "--views", "12", "--save-images", "--overwrite"]
+    run = Run(place)
+    evaluate_run(run, run.method("cpu"), tiny.scene(), "test", True, 2)  # as the command does
+    compared = running.get(f"/api/items/{project}").json()["runs"][0]["compared"]
+    assert len(compared["views"]) == 2 and not compared["stale"] and compared["views"][0]["held_out"]
+    about = {"run": "a", "name": compared["views"][0]["name"]}
+    shown = running.get(f"/api/items/{project}/picture", params=about)
+    assert Image.open(io.BytesIO(shown.content)).size == (tiny.SIZE, tiny.SIZE)
+    astray = running.get(f"/api/items/{project}/picture", params=about | {"name": "../../previews/000060"})
+    assert astray.status_code == 400
 
 
 def test_a_failure_is_the_sentence_of_the_command(app, running, project):

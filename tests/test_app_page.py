@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 import threading
+from collections import namedtuple
 
 import pytest
 import uvicorn
+from app_uploads import UPLOAD_NAMED
+from app_walk import drop
 from budgets import budget
 from test_app import PROGRAM, jpeg
 
@@ -43,10 +47,7 @@ def test_photographs_are_dropped_made_and_a_failure_is_told(served, page, faults
         (photographs / f"{i}.jpg").write_bytes(jpeg(i, (160, 120)))
     page.goto(served.address.url)
     assert page.get_by_role("heading", name="Drop photographs").is_visible()
-    session = page.context.new_cdp_session(page)
-    data = {"items": [], "files": [str(photographs)], "dragOperationsMask": 1}
-    for kind in ("dragEnter", "dragOver", "drop"):
-        session.send("Input.dispatchDragEvent", {"type": kind, "x": 300, "y": 200, "data": data})
+    drop(page, [photographs])
     page.wait_for_url("**/#garden")
     page.get_by_role("list", name="Photographs").get_by_role("button").nth(2).wait_for()
     page.get_by_text("3 photographs").wait_for()  # the advice: more of them
@@ -70,6 +71,29 @@ def test_photographs_are_dropped_made_and_a_failure_is_told(served, page, faults
     page.get_by_role("button", name="Undo").click()
     card.get_by_role("link", name=re.compile("Open garden")).wait_for()
     assert faults == []
+
+
+def test_refused_uploads_are_sentences_on_the_page(served, page, faults, tmp_path, monkeypatch):
+    photographs = tmp_path / "garden"
+    photographs.mkdir()
+    (photographs / "good.jpg").write_bytes(jpeg(0, (160, 120)))
+    (photographs / "text.jpg").write_text("no photograph")
+    page.goto(served.address.url)
+    drop(page, [photographs])
+    page.get_by_role("alert").get_by_text("text.jpg is no photograph that can be read").wait_for()
+    page.get_by_role("button", name="good.jpg").wait_for()
+    page.evaluate(UPLOAD_NAMED, ["garden", ["../up.jpg", "/etc/up.jpg"]])
+    page.get_by_role("alert").get_by_text("'../up.jpg' cannot be the name of a photograph here").wait_for()
+    assert not list(tmp_path.rglob("up.jpg"))
+
+    usage = namedtuple("Usage", "total used free")
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda place: usage(1 << 40, 1 << 40, 1000))
+        (tmp_path / "late.jpg").write_bytes(jpeg(1, (160, 120)))
+        drop(page, [tmp_path / "late.jpg"])
+        page.get_by_text("is full; free some space, and the upload goes on").wait_for()
+    page.get_by_role("button", name="late.jpg").wait_for()
+    assert all("status of 40" in one or "status of 507" in one for one in faults)
 
 
 def test_the_page_is_labelled_and_fits_a_phone(served, page, faults):

@@ -29,5 +29,5 @@ def test_rates_and_ratios(tmp_path):
             slow = engines["reference"][f"{direction}_per_second"]
             assert engines["cpu"][f"{direction}_ratio"] == pytest.approx(rate / slow)
         assert ("backward_per_second" in engines["cpu"]) == backward
-    assert result["operations"]["ssim"]["count"] == 256  # pixels, not rows of them
+    assert result["operations"]["photometric"]["count"] == 256  # pixels, not rows of them
     assert result["protocol"]["numba_threads"] >= 1

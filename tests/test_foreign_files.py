@@ -94,6 +94,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "explain activation": ("explain activation --steps 2 --output edge.png", ("edge.png",)),
     "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),
+    "bench step": (
+        "bench step voxel-grid photographs --warmup 1 --steps 1 --output step.json --flame step.svg",
+        ("step.json", "step.svg"),
+    ),
     "bench methods": (
         "bench methods --methods voxel-grid --scenes photographs --output bench --steps 1",
         ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png", "bench/lock.json")

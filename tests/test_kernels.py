@@ -100,21 +100,22 @@ def test_marching_ends_where_rays_never_enter(engine):
 
 
 @pytest.mark.parametrize("engine", ["reference", *ENGINES])
-@kept(lambda engine: interpreted("ssim", engine))
+@kept(lambda engine: interpreted("photometric", engine))
 def test_an_image_is_like_itself(engine, generator):
     image = torch.rand(13, 29, 3, generator=generator)
     with kernels.using(engine):
-        assert kernels.ssim(image, image.clone()).item() == pytest.approx(1, abs=1e-6)
+        ssim, gap = kernels.photometric(image, image.clone())
+    assert ssim.item() == pytest.approx(1, abs=1e-6) and gap.item() == 0
 
 
 @pytest.mark.parametrize("engine", ["reference", *ENGINES])
-@kept(lambda engine: interpreted("ssim", engine))
+@kept(lambda engine: interpreted("photometric", engine))
 def test_similarity_is_the_score_of_images_with_a_black_margin(engine, generator):
     """Around an image's own pixels the score's windows then lie inside the picture."""
     a, b = torch.rand(2, 12, 90, 3, generator=generator)
     margins = (torch.nn.functional.pad(image, (0, 0, 5, 5, 5, 5)) for image in (a, b))
     with kernels.using(engine):
-        assert kernels.ssim(a, b).item() == pytest.approx(metrics.ssim(*margins), abs=1e-6)
+        assert kernels.photometric(a, b)[0].item() == pytest.approx(metrics.ssim(*margins), abs=1e-6)
 
 
 def test_similarity_does_not_depend_on_the_number_of_threads(generator):
@@ -124,8 +125,8 @@ def test_similarity_does_not_depend_on_the_number_of_threads(generator):
     for number in (1, threads):
         numba.set_num_threads(number)
         with kernels.using("cpu"):
-            value = kernels.ssim(a, b)
-        found.append((value, *torch.autograd.grad(value, a)))
+            ssim, gap = kernels.photometric(a, b)
+        found.append((ssim, gap, *torch.autograd.grad(gap - ssim, a)))
     assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
 
 

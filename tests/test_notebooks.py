@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import io
+import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import tiny
 import torch
 from budgets import budget
@@ -37,3 +40,28 @@ def test_a_run_shows_its_preview_and_what_it_is(ball_run):
 
 def test_a_run_before_its_first_state_shows_itself(tmp_path):
     assert "0 steps" in tiny.new_run(tmp_path / "run")._repr_html_()
+
+
+def test_the_notebook_of_the_documents_runs(ball_folder, tmp_path, monkeypatch):
+    """Executed as Jupyter does, on a small scene with poses and for few steps."""
+    nbformat, _ = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    import notebook
+
+    monkeypatch.setenv("PYTHONPATH", str(notebook.ROOT))
+    (tmp_path / "photographs").symlink_to(ball_folder)
+    changes = {
+        "lumigraph.capture(": "lumigraph.open_scene(",
+        "seconds=60": "steps=40, initial_gaussians=400",
+        "seconds=30": "steps=2, initial_gaussians=400",
+    }
+    done = notebook.execute(nbformat.read(notebook.NOTEBOOK, 4), tmp_path, changes, 300)
+    scene, run, view, score, page, own = (notebook.outputs(cell) for cell in done.cells if cell.cell_type == "code")
+    assert re.search(r"\d+ photographs of \[\d+, \d+\] pixels", scene["text/plain"])
+    shown = "".join(run["text/html"])
+    assert "gaussian-splatting" in shown and "40 steps in" in shown
+    bar = next(one for cell in done.cells for one in cell.get("outputs", ()) if "<progress" in str(one))
+    assert "100 % · step 40" in str(bar)
+    sizes = [Image.open(io.BytesIO(base64.b64decode(one["image/png"]))).size for one in (view, own)]
+    assert sizes == [(tiny.SIZE, tiny.SIZE)] * 2
+    assert 5 < float(re.search(r"([\d.]+) dB", score["text/plain"])[1]) < 60
+    assert 'src="page.html"' in "".join(page["text/html"]) and (tmp_path / "page.html").stat().st_size > 10_000

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tiny
 import torch
 from budgets import budget
 
@@ -20,7 +21,7 @@ from lumigraph import methods
 pytestmark = budget("house", 3)
 PAGES = Path(__file__).parent.parent / "docs" / "methods"
 FILES = {path.stem for path in Path(methods.__file__).parent.iterdir()}
-NAMES = [name for name in methods.available() if name.replace("-", "_") in FILES]  # other tests add some of their own
+NAMES = [name for name in methods.available() if name.replace("-", "_") in FILES]  # tiny adds some of the tests' own
 
 WORDS: dict[str, Any] = {
     "guidance.render_width": 168,
@@ -794,6 +795,13 @@ def test_the_preset_paper_has_the_published_numbers(name):
     config = methods.find(name).preset(torch.device("cuda"))
     found = {path: attrgetter(path)(config) for path in PUBLISHED[name]}
     assert found == PUBLISHED[name]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_preset_paper_says_its_memory(name):
+    """Training asks for it first: a number of the paper's parts that it misses would end every run."""
+    kind = methods.find(name)
+    assert kind.further_bytes(tiny.scene().frame, kind.preset(torch.device("cuda")), learning=True) >= 0
 
 
 @pytest.mark.parametrize("name", NAMES)

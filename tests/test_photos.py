@@ -22,6 +22,7 @@ from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from lumigraph.capture.photos import Intake, gather, is_bare, is_video
 from lumigraph.capture.photos.judge import MIN_SHARPNESS, blurred, judge, sharpness
+from lumigraph.capture.photos.overlap import MIN_SHARED, apart, details, shared
 from lumigraph.capture.photos.video import Odometer, choose, extract
 from lumigraph.capture.pictures import find_file, list_images, read_image, reads_heic, upright_size
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -433,6 +434,21 @@ def test_neighbours_are_no_duplicates(tmp_path):
     walk_past(tmp_path / "photos", 6, step=6)
     intake = gather([tmp_path / "photos"], tmp_path / "work")
     assert intake.duplicates == {} and intake.blurred == {}
+
+
+def test_photographs_too_far_from_every_other_are_named():
+    found = {f"{i}.jpg": details(view(40 + 120 * i, 3 * i)) for i in range(5)}
+    found["far.jpg"] = details(view(900, 1000))  # another place of the wall
+
+    def count(one, other):
+        return shared(found[one], found[other])
+
+    walk = [name for name in found if name != "far.jpg"]
+    assert apart(walk, count) == [] and count("0.jpg", "1.jpg") > 4 * MIN_SHARED
+    assert apart([*walk, "far.jpg"], count) == ["far.jpg"]
+    assert apart(["far.jpg", "0.jpg", "3.jpg", "1.jpg", "4.jpg", "2.jpg"], count) == ["far.jpg"]  # in any order
+    nothing = details(Image.new("RGB", (300, 200), (90, 150, 240)))
+    assert shared(nothing, found["far.jpg"]) == 0 and details(Image.new("RGB", (1, 1))).shape == (0, 128)
 
 
 def test_pictures_of_nothing_do_no_harm(tmp_path):

@@ -295,10 +295,12 @@ def test_views_are_counted_as_sets(generator):
 
 
 def test_unobserved_harmonics_are_zero(generator):
-    harmonics = torch.randn(4, 16, 3, generator=generator)
+    counts = 0, MIN_VIEWS[1] - 1, MIN_VIEWS[1], MIN_VIEWS[4] - 1, MIN_VIEWS[4], VIEW_BITS
+    harmonics = torch.randn(len(counts), 16, 3, generator=generator)
     before = harmonics.clone()
-    zero_unobserved_sh(harmonics, torch.tensor([0, MIN_VIEWS[1], MIN_VIEWS[4], 20]))
-    kept = [1, 4, 16, 16]
+    # bits are set from the highest down, so that each count has other bits than a number as large
+    zero_unobserved_sh(harmonics, torch.tensor([sum(1 << VIEW_BITS - 1 - k for k in range(n)) for n in counts]))
+    kept = [1, 1, 4, 4, 16, 16]
     for row, count in enumerate(kept):
         assert torch.equal(harmonics[row, :count], before[row, :count]) and not harmonics[row, count:].any()
 

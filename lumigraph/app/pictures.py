@@ -15,6 +15,7 @@ from ..capture.masks import MASKS
 from ..capture.motion.reconstruction import BLACK, MIN_VIEWS
 from ..capture.photos.gather import PHOTOGRAPHS, walk
 from ..capture.photos.judge import Judgement, blurred, duplicates, exposure_jumps, judge
+from ..capture.photos.overlap import Descriptors, apart, details, shared
 from ..capture.photos.video import VIDEOS
 from ..capture.pictures import eight_bits, reads_heic
 from ..errors import LumigraphError
@@ -26,6 +27,7 @@ DARK = -6.5  # mean log2 of the luminance, below which noise of a photograph has
 USUAL_VIEWS = 20  # photographs of a scene that has no gaps
 MAX_NAMED = 3  # photographs that a piece of advice names
 MAX_KEPT = 4096  # thumbnails and judgements in memory
+MAX_COMPARED = 100  # photographs; more of them leave no gaps, and take long to compare
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,25 @@ def version_of(path: Path) -> str:
     return hashlib.blake2b(f"{about.st_mtime_ns} {about.st_size}".encode(), digest_size=6).hexdigest()
 
 
+@lru_cache(MAX_COMPARED)
+def _details(path: Path, modified: int, size: int) -> Descriptors:
+    with Image.open(path) as image:
+        return details(image)
+
+
+@lru_cache(MAX_COMPARED**2)
+def _shared(one: tuple[Path, int, int], other: tuple[Path, int, int]) -> int:
+    return shared(_details(*one), _details(*other))
+
+
+def too_far(files: Mapping[str, Path]) -> list[str]:
+    """Names of photographs that share too little with every other one; none of too many photographs to compare."""
+    if not MIN_VIEWS <= len(files) <= MAX_COMPARED:
+        return []
+    about = {name: (path, path.stat().st_mtime_ns, path.stat().st_size) for name, path in files.items()}
+    return apart(list(files), lambda a, b: _shared(*sorted((about[a], about[b]))))
+
+
 @lru_cache(MAX_KEPT)
 def _judged(path: Path, modified: int, size: int) -> tuple[Judgement, tuple[int, int]] | None:
     reads_heic()
@@ -137,7 +158,8 @@ def judged(path: Path) -> tuple[Judgement, tuple[int, int]] | None:
 
 
 def advice(files: Mapping[str, Path]) -> list[Advice]:
-    """Advice about photographs before cameras are looked for: too few, blurred, too dark, other exposure, repeated."""
+    """Advice about photographs before cameras are looked for: too few, blurred, too dark, other exposure, repeated, too
+    far from every other."""
     photographs = {name: path for name, path in files.items() if not is_film(path) and MASKS not in Path(name).parts}
     known = {name: found for name, path in photographs.items() if (found := judged(path)) is not None}
     said = [*about_number(len(photographs), len(files) - len(photographs))]
@@ -160,6 +182,13 @@ def advice(files: Mapping[str, Path]) -> list[Advice]:
     same = duplicates(signatures, {name: size for name, (_, size) in known.items()}) if known else {}
     if same:
         said.append(Advice(f"Shown twice: {named(list(same))}. Repeats are passed over.", list(same)))
+    others = {name: path for name, path in photographs.items() if name in known and name not in same}
+    alone = too_far(others)
+    if alone and len(alone) == len(others):
+        said.append(Advice("No two show enough of the same. Take them a step apart, around one thing.", []))
+    elif alone:
+        text = "Take more from places between them and their neighbours, a step apart."
+        said.append(Advice(f"Too far from every other: {named(alone)}. {text}", alone))
     return said
 
 

@@ -24,7 +24,7 @@ from ..geometry import evenly
 from ..metrics.rows import last_psnr
 from .job_record import Making
 from .jobs import log_lines, run_folder
-from .projects import SCENE, Item
+from .projects import SCENE, Item, newest
 
 STAGES = {
     "features": "Finding details",
@@ -125,20 +125,21 @@ def capture_progress(item: Item) -> dict[str, Any]:
         if done[name]["done"]:
             share += 0.95 * WEIGHTS[name]
         else:
-            stage, within = title, within_stage(item, name, said)
-            share += 0.95 * WEIGHTS[name] * within
+            stage, (count, total) = title, within_stage(item, name, said)
+            share += 0.95 * WEIGHTS[name] * min(1.0, count / max(total, 1))
+            said = f": {count} of {total}" if name == "features" and total else said
     else:
         stage = "Writing the scene"
     return {"stage": stage, "share": min(share, 1.0), "said": said.partition(": ")[2]}
 
 
-def within_stage(item: Item, stage: str, said: str) -> float:
-    """Share of a stage that is over: by photographs with features, else by the last line of the log."""
-    if stage == "features":
+def within_stage(item: Item, stage: str, said: str) -> tuple[int, int]:
+    """Count and total of a stage: of photographs with features, else by the last line of the log."""
+    if stage == "features":  # those of an earlier start count too, unlike in the log
         rows = rows_of(item.path / SCENE / "work" / "database.db")
-        return sum(features is not None for _, features, _ in rows) / max(len(rows), 1)
+        return sum(features is not None for _, features, _ in rows), len(rows)
     found = PERCENT.search(said)
-    return min(1.0, int(found[1]) / max(int(found[2]), 1)) if found else 0.0
+    return (int(found[1]), int(found[2])) if found else (0, 0)
 
 
 def model_folder(item: Item) -> Path | None:
@@ -250,12 +251,6 @@ def card_of_run(folder: Path) -> dict[str, Any]:
     return {"method": "", "psnr": None}
 
 
-def newest(folder: Path) -> tuple[int, ...]:
-    """By which a run's card is known to be current."""
-    places = (folder / name for name in ("metrics.jsonl", "eval.json", "config.json", "checkpoints", "blocks.json"))
-    return tuple(place.stat().st_mtime_ns for place in places if place.exists())
-
-
 @lru_cache(512)
 def _card(folder: Path, version: tuple[int, ...]) -> dict[str, Any]:
     from ..run import Run, is_block_run
@@ -281,5 +276,8 @@ def picture_of_run(folder: Path) -> Path | None:
 
 def age(path: Path) -> float:
     """Seconds since a folder, or something just inside it, changed."""
-    newest = max((one.stat().st_mtime for one in path.iterdir()), default=path.stat().st_mtime) if path.is_dir() else 0
-    return max(0.0, time.time() - max(newest, path.stat().st_mtime))
+    times = [path.stat().st_mtime]
+    for one in path.iterdir() if path.is_dir() else ():
+        with contextlib.suppress(OSError):  # a file that is being replaced
+            times.append(one.stat().st_mtime)
+    return max(0.0, time.time() - max(times))

@@ -7,11 +7,11 @@ from typing import Any
 
 from ..budget import QUALITIES
 from ..errors import LumigraphError
-from ..exchange import size_of
 from . import pictures, progress
+from .comparison import comparison, rendering
 from .job_record import Making, ShareJob, read_job
 from .jobs import log_lines
-from .projects import SCENE, SHARED, Item
+from .projects import SCENE, SHARED, Item, disk_bytes
 
 MIN_PLACED_SHARE = 0.9  # of the photographs, below which the other mapper is offered
 MAX_MESSAGES = 30  # lines of a log on the page
@@ -24,7 +24,7 @@ def card(item: Item) -> dict[str, Any]:
         runs = [path for path in item.runs if path.is_dir()]
         about = progress.card_of_run(runs[-1]) if runs else {"method": "", "psnr": None}
         job = read_job(item).make
-        size = size_of(item.path)
+        size = disk_bytes(item.path)
     except LumigraphError as fault:
         return {"key": item.key, "kind": item.kind, "title": item.path.name, "fault": str(fault), "age": 0, "bytes": 0}
     picture = next((path for run in reversed(runs) if (path := progress.picture_of_run(run))), None)
@@ -47,7 +47,8 @@ def card(item: Item) -> dict[str, Any]:
 def run_row(path: Path) -> dict[str, Any]:
     about = progress.card_of_run(path) if path.is_dir() else {"method": path.suffix, "psnr": None, "trained": True}
     picture = progress.picture_of_run(path)
-    row = {"name": path.name, "bytes": size_of(path), "age": progress.age(path), **about}
+    row = {"name": path.name, "bytes": disk_bytes(path), "age": progress.age(path), **about}
+    row["compared"] = comparison(path)
     return row | {"picture": pictures.version_of(picture) if picture else ""}
 
 
@@ -87,11 +88,17 @@ def result_of(item: Item) -> dict[str, Any] | None:
 
 
 def picture(item: Item, name: str, run: str) -> Path:
-    """File of a photograph by name, a run's preview, or the picture of a card. Raises LumigraphError without one."""
+    """File of a photograph by name, its rendering by a run, a run's preview, or the picture of a card.
+
+    Raises LumigraphError without one.
+    """
     found: Path | None = None
-    if name:
+    if name and run:
+        found = rendering(item.run(run), name)
+    elif name:
         made = pictures.files_of(item.path / SCENE / "images")
-        found = pictures.photographs_of(item).get(name) or made.get(name)
+        plain = name.removeprefix("images/")  # as a scene names it
+        found = pictures.photographs_of(item).get(plain) or made.get(plain)
     elif run:
         found = progress.picture_of_run(item.run(run))
     else:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
@@ -39,6 +41,7 @@ from .scene_views import SceneViews, answers, forward, forward_messages
 PAGE = Path(__file__).parent / "page"
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 1 << 16  # of a request that is no upload
+SLOW_THREADS = 2  # that decode photographs
 SWEEP_SECONDS = 15.0  # between looks for viewers without clients
 CONTENT_SECURITY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -144,10 +147,21 @@ class App:
         program = program or list(jobs.PROGRAM)
         self.runner = Runner(self.root, program)
         self.views = SceneViews(self.root / APP_FOLDER, program)
+        self._slow = ThreadPoolExecutor(SLOW_THREADS, "slow")
+
+    async def later(self, answer: Callable[..., Any], *arguments: Any) -> Any:
+        """Result of work that takes long, in threads of its own, so that uploads need not wait for it."""
+        return await asyncio.get_running_loop().run_in_executor(self._slow, answer, *arguments)
 
     @property
     def is_local(self) -> bool:
         return not self.address.token
+
+    @property
+    def phone_url(self) -> str:
+        """Address, with the token, for other machines on the network; empty if none can reach the app."""
+        url = self.address.urls[-1]  # the address in use stands last
+        return "" if self.is_local or "://127.0.0.1:" in url else url
 
     # Home
 
@@ -157,6 +171,7 @@ class App:
         return {
             "folder": str(self.root),
             "local": self.is_local,
+            "phone": self.phone_url,
             "cards": found,
             "trash": projects.trash(self.root),
             "queue": waiting,
@@ -188,6 +203,7 @@ class App:
             "key": item.key,
             "kind": item.kind,
             "title": record.title,
+            "phone": f"{url}#{item.key}" if (url := self.phone_url) else "",
             "folder": str(item.path),
             "source": record.source,
             "photographs": [
@@ -343,11 +359,21 @@ def build(app: App) -> ASGIApp:
         return JSONResponse(await asyncio.to_thread(app.leave_out, item, request.query_params.get("name", "")))
 
     async def picture(request: Request) -> Response:
-        return await asyncio.to_thread(picture_of, app.item(request.path_params["key"]), request)
+        return await app.later(picture_of, app.item(request.path_params["key"]), request)
+
+    async def advice(request: Request) -> Response:
+        return JSONResponse(await app.later(app.advice, app.item(request.path_params["key"])))
 
     async def marks(request: Request) -> Response:
         item, name = app.item(request.path_params["key"]), request.query_params.get("name", "")
         return JSONResponse(await asyncio.to_thread(progress.features, item, name))
+
+    async def code(request: Request) -> Response:
+        if not app.phone_url:
+            raise LumigraphError("Other machines cannot reach the app; start it with --host 0.0.0.0")
+        key = request.query_params.get("key", "")
+        url = f"{app.phone_url}#{app.item(key).key}" if key else app.phone_url
+        return Response(qr_code(url), media_type="image/svg+xml", headers={"Cache-Control": "no-store"})
 
     async def shared(request: Request) -> Response:
         item, name = app.item(request.path_params["key"]), request.path_params["name"]
@@ -390,6 +416,7 @@ def build(app: App) -> ASGIApp:
         Route("/", page),
         Route("/static/{name}", page),
         Route("/api/home", asked(None, app.home)),
+        Route("/api/phone.svg", code),
         Route("/api/projects", asked(NewBody, app.new), methods=["POST"]),
         Route("/api/trash", asked(None, lambda: projects.empty_trash(app.root)), methods=["DELETE"]),
         Route("/api/trash/{name}", restore, methods=["POST"]),
@@ -400,7 +427,7 @@ def build(app: App) -> ASGIApp:
         Route(f"{item}/photographs", take, methods=["PUT"]),
         Route(f"{item}/photographs", have),
         Route(f"{item}/photographs", leave_out, methods=["DELETE"]),
-        Route(f"{item}/advice", asked(None, app.advice)),
+        Route(f"{item}/advice", advice),
         Route(f"{item}/picture", picture),
         Route(f"{item}/states", asked(None, progress.photographs_state)),
         Route(f"{item}/features", marks),
@@ -440,6 +467,15 @@ def picture_of(item: Item, request: Request) -> Response:
     found = rows.picture(item, query.get("name", ""), query.get("run", ""))
     kept = "max-age=86400" if "v" in query else "no-cache"
     return Response(pictures.thumbnail(found, side), media_type="image/jpeg", headers={"Cache-Control": kept})
+
+
+def qr_code(text: str) -> bytes:
+    """SVG of a QR code."""
+    import segno
+
+    out = io.BytesIO()
+    segno.make(text, error="m", micro=False).save(out, kind="svg", scale=5, border=3, light="#fff")
+    return out.getvalue()
 
 
 async def body_of(request: Request, kind: Any) -> Any:

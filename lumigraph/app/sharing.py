@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LumigraphError
+from .comparison import COMPARE, eval_options
 from .job_record import ShareJob
 from .projects import SHARED, Item, is_splats
 
@@ -98,6 +99,8 @@ def header_count(weights: Path) -> int | None:
 
 def share_job(item: Item, kind: str, run: Path, now: float, size: int | None = None) -> ShareJob:
     """The job of a file to share. size: longer side of a film in pixels"""
+    if kind == COMPARE:
+        return ShareJob(f"{COMPARE}-{run.name}", kind, run.name, eval_options(run), "queued", now)
     if kind not in KINDS:
         raise LumigraphError(f"{kind[:40]!r} cannot be made; choose {', '.join(KINDS)}")
     if kind not in [one["kind"] for one in kinds_for(run)]:
@@ -112,6 +115,8 @@ def share_job(item: Item, kind: str, run: Path, now: float, size: int | None = N
 def command_of(item: Item, job: ShareJob) -> list[str]:
     """Words of the command that makes a file. A file of an earlier version is replaced, as it is one of ours."""
     run, place = item.run(job.run), item.path / SHARED / job.name
+    if job.kind == COMPARE:
+        return ["eval", str(run), *job.options]
     place.parent.mkdir(exist_ok=True)
     output = ["--output", str(place)] if job.kind == "film" else [str(place)]
     return [*KINDS[job.kind].words, str(run), *output, *job.options]

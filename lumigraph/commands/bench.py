@@ -1,22 +1,23 @@
-"""`lumigraph bench`: the speed of kernels, the quality of methods, PSNR against the number of photographs; shapes."""
+"""`lumigraph bench`: speed of kernels and steps, quality of methods, PSNR against the number of photographs; shapes."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from .. import methods
 from ..budget import Budget
 from ..errors import LumigraphError
 from ..files import claim
-from ..files.ranges import Count, Downscale, Scales, Seconds, Seed, Steps
+from ..files.ranges import Count, Downscale, Scales, Seconds, Seed, Share, Steps
 from .capture import posed
-from .common import choose_device, say, scene_name, show
-from .options import DeviceOption, Overwrite, ReaderOption, StepsOption, needed, option
+from .common import choose_device, preset_device, say, scene_name, show, show_table
+from .options import DeviceOption, Overwrite, ReaderOption, SeedOption, StepsOption, needed, option
 from .train import DEFAULT_SECONDS
 
 FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
@@ -40,6 +41,68 @@ class BenchKernels:
         if self.output is not None:
             claim(self.output, "benchmark", self.overwrite)
         bench_kernels(device=choose_device(self.device), output=self.output)
+        return 0
+
+
+@dataclass(frozen=True)
+class BenchStep:
+    """Take one training step apart: each kernel, PyTorch operation and optimizer, in milliseconds and bytes.
+
+    A fresh method is warmed up with the preset of the device; a run is continued in memory, and its folder stays as it
+    is. Bytes are compared with the rate at which the main memory copies.
+    """
+
+    method: Annotated[Positional[str], needed("METHOD_OR_RUN")]
+    """Method, for example gaussian-splatting; or the folder of a run, without SCENE."""
+    scene: Annotated[Positional[str | None], option("SCENE", "the run's own")] = None
+    """Scene to train on, as for `lumigraph train`."""
+    output: Annotated[Path | None, option("FILE.json", "print the table only")] = None
+    """File for the figures, in addition to the table."""
+    flame: Annotated[Path | None, option("FILE.svg", "none")] = None
+    """File for the flame graph: nested bars as wide as their share of the step."""
+    overwrite: Overwrite = False
+    warmup: Annotated[Count, option("N")] = 100
+    """Training steps before the measurement; more let clouds and grids grow."""
+    steps: Annotated[Count, option("N")] = 40
+    """Steps that are measured; more average over more photographs."""
+    progress: Annotated[Share, option("SHARE")] = 0.75
+    """Share of the budget that schedules follow while measuring, such as picture size and bands of harmonics."""
+    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
+    """Reduce photographs by this whole number."""
+    reader: ReaderOption = None
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
+
+    def run(self) -> int:
+        os.environ.setdefault("CUDA_LAUNCH_BLOCKING", "1")  # a GPU's work then counts where it is launched
+        from ..benchmark.step import bench_step
+        from ..capture import open_dataset
+        from ..figures.charts import standalone
+        from ..files import write_bytes, write_json
+        from ..run import Run, build
+
+        if self.output is not None:
+            claim(self.output, "benchmark", self.overwrite)
+        if self.flame is not None:
+            claim(self.flame, "figure", self.overwrite)
+        device = choose_device(self.device)
+        if self.scene is None:
+            run = Run(Path(self.method))
+            data, method, name = run.dataset(), run.new_method(device), run.method_name
+        else:
+            run, name = None, methods.check(self.method)
+            learner = methods.find(name)
+            data = open_dataset(posed(self.scene), learner.learns_from, downscale=self.downscale, reader=self.reader)
+            config = learner.preset(preset_device(self.device, self.preset))
+            method = build(learner, data.frame, config, device, self.seed, learning=True)
+        found = bench_step(method, data, run, self.warmup, self.steps, self.progress, self.seed)
+        show_table(found.table(f"A step of {name} on {scene_name(data.source)}"))
+        if self.output is not None:
+            write_json(self.output, {"method": name, "scene": data.source, **found.to_json()}, "benchmark")
+        if self.flame is not None:
+            write_bytes(self.flame, standalone(found.graph()), "figure")
         return 0
 
 
@@ -347,6 +410,7 @@ def given(value: float | int | None) -> tuple:
 
 What = (
     Annotated[BenchKernels, subcommand("kernels")]
+    | Annotated[BenchStep, subcommand("step")]
     | Annotated[BenchMethods, subcommand("methods")]
     | Annotated[BenchViews, subcommand("views")]
     | Annotated[BenchShapes, subcommand("shapes")]
@@ -355,7 +419,7 @@ What = (
 
 @dataclass(frozen=True)
 class Bench:
-    """Benchmark kernels on this machine, methods on scenes, or methods on shapes."""
+    """Benchmark kernels and training steps on this machine, methods on scenes, or methods on shapes."""
 
     what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 

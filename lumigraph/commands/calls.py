@@ -29,6 +29,7 @@ from ..system.work import at_work
 from .capture import scene_folder
 from .cli import parse
 from .common import kept_rows
+from .notebook_bar import NotebookBar, in_notebook
 
 FRAMES = re.compile("[╭╮╰╯│─]+|-{3,}|For full helptext, run .*")  # around faults of options
 Progress = Callable[[int, float, dict[str, Any]], object]
@@ -70,7 +71,8 @@ def train(
     method:   its name, or a class of your own
     output:   folder of the run; None: runs/SCENE-METHOD-N
     progress: told after each step: its number, the share of the budget that is spent, and the line of metrics.jsonl,
-              which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes
+              which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes.
+              None: a bar in a notebook, lines on stderr elsewhere
     options:  those of `lumigraph train METHOD`
     """
     if not isinstance(scene, str | Path):
@@ -82,8 +84,12 @@ def train(
         methods.register(method)
         method = methods.name_of(method)
     command = understood(["train", method, str(scene), *typed({"output": output, **options})])
-    watch = None if progress is None else Told(progress)
-    return open_any(conducted(command, lambda: command.run(watch))["run"])
+    bar = NotebookBar() if progress is None and in_notebook() else None
+    told = progress or bar
+    rows = conducted(command, lambda: command.run(Told(told) if told else None))
+    if bar:
+        bar.end()
+    return open_any(rows["run"])
 
 
 def open(path: str | Path) -> Opened:

@@ -2,7 +2,9 @@
 
 from ..system import kernel_cache as kernel_cache
 from ._operation import Engine as Engine
+from ._operation import operations as operations
 from ._operation import using as using
+from ._operation import watching as watching
 from .antialias import antialias as antialias
 from .antialias import neighbours as neighbours
 from .band_blocks import band_blocks as band_blocks
@@ -30,6 +32,7 @@ from .octree_march import octree_march as octree_march
 from .patch_cost import patch_cost as patch_cost
 from .patch_flow import patch_flow as patch_flow
 from .perceptron import perceptron as perceptron
+from .photometric import photometric as photometric
 from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
@@ -42,7 +45,6 @@ from .semi_global import semi_global as semi_global
 from .sparse_grid import Nodes as Nodes
 from .sparse_grid import sparse_grid as sparse_grid
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics
-from .ssim import ssim as ssim
 from .tile import Tiles as Tiles
 from .tile import tile as tile
 from .total_variation import total_variation as total_variation

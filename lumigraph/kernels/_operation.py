@@ -17,7 +17,7 @@ import pkgutil
 import typing
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
@@ -159,11 +159,35 @@ def using(engine: Engine) -> Iterator[None]:
         _forced.reset(token)
 
 
+Watch = Callable[[str, Callable[[], Any], tuple], Any]
+_watch: Watch | None = None
+
+
+@contextlib.contextmanager
+def watching(watch: Watch) -> Iterator[None]:
+    """Inside this block, on all threads, take the result of watch(name, call, inputs) for that of each kernel's call().
+
+    name: "project forward", "project backward"; inputs: its own, and on the way back the context with saved tensors
+    """
+    global _watch
+    before, _watch = _watch, watch
+    try:
+        yield
+    finally:
+        _watch = before
+
+
+def watched(name: str, run: Callable, *inputs: Any) -> Any:
+    """Result of run(*inputs), by the watch of the block around if there is one."""
+    return run(*inputs) if _watch is None else _watch(name, partial(run, *inputs), inputs)
+
+
 def implementation(operation: str, tensor: Tensor) -> Callable:
     """The `run` function of an operation, on the engine that fits the tensor's device."""
     engine = _forced.get() or ("gpu" if tensor.is_cuda else "cpu")
     try:
-        return importlib.import_module(f"{__package__}.{operation}.{engine}").run
+        run = importlib.import_module(f"{__package__}.{operation}.{engine}").run
+        return run if _watch is None else partial(watched, f"{operation} forward", run)
     except ModuleNotFoundError as fault:
         if fault.name != "triton":
             raise
@@ -187,12 +211,14 @@ def differentiable(forward: Callable, backward: Callable, contiguous: bool = Tru
     def laid_out(inputs: Iterable[Any]) -> Iterator[Any]:
         return (x.contiguous() if contiguous and isinstance(x, Tensor) else x for x in inputs)
 
+    name = forward.__module__.split(".")[-2]
+
     def back(ctx: Any, *grads: Tensor) -> Any:
-        return backward(ctx, *laid_out(grads))
+        return watched(f"{name} backward", backward, ctx, *laid_out(grads))
 
     once = torch.autograd.function.once_differentiable(back)
     ways = {"forward": staticmethod(forward), "backward": staticmethod(once)}
-    function: Any = type(forward.__module__.split(".")[-2], (torch.autograd.Function,), ways)
+    function: Any = type(name, (torch.autograd.Function,), ways)
 
     def run(*inputs: Any) -> Any:
         return function.apply(*laid_out(inputs))

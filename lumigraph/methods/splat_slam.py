@@ -343,7 +343,7 @@ class SplatSlam(Method):
             seen = self.seen(self.gaussians(), frame, self.pose(frame))
             shown = self.shown(seen)
             away = torch.where(known, (seen.depth - depth).abs(), 0.0).sum() / known.sum().clamp_min(1) / self.unit
-            l1, ssim = (shown - rgb).abs().mean(), kernels.ssim(shown, rgb)
+            ssim, l1 = kernels.photometric(shown, rgb)
             colour = (1 - c.ssim_weight) * l1 + c.ssim_weight * (1 - ssim)
             terms = {"depth": c.depth_weight * away, "colour": c.colour_weight * colour}
             self.figures["mse"] = float((shown - rgb).detach().square().mean())

@@ -155,7 +155,7 @@ def make_way(over: threading.Event, held: Callable[[], float]) -> None:
     looks = 0
     while not over.wait(POLL_SECONDS):
         looks, share = looks + 1, held()
-        if crowding is None and share > MAX_WAITING_SHARE and "torch" in sys.modules:
+        if crowding is None and share > MAX_WAITING_SHARE and openmp_copies():
             leave, looks = threading.Event(), 0
             crowding = threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True), leave
             crowding[0].start()
@@ -173,12 +173,18 @@ def disperse(thread: threading.Thread, leave: threading.Event) -> None:
 
 
 def crowd(leave: threading.Event) -> None:
-    """Hold a second set of threads, which sleep. For OpenMP they are more than there are processors, and then every
-    thread looks for work a hundred times only (GOMP_SPINCOUNT in the manual of GNU's libgomp)."""
-    import torch
-
-    torch.ones(torch.get_num_threads() << 16).exp_()  # large enough for every thread to have a share
+    """Hold a second set of threads in each copy of OpenMP, which sleep. For OpenMP they are more than there are
+    processors, and then every thread looks for work a hundred times only (GOMP_SPINCOUNT in the manual of GNU's
+    libgomp)."""
+    for openmp in openmp_copies():
+        openmp.GOMP_parallel(openmp.omp_get_thread_num, None, processors(), 0)  # each thread asks for its number
     leave.wait()
+
+
+def openmp_copies() -> list[ctypes.CDLL]:
+    """Copies of GNU's OpenMP in this process: one, or two where PyTorch was imported before Lumigraph."""
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    return [ctypes.CDLL(path) for path in sorted({line.split(maxsplit=5)[-1] for line in lines if "/libgomp" in line})]
 
 
 def description() -> str:

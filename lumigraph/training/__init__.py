@@ -2,6 +2,7 @@
 
 from .loop import Clock as Clock
 from .loop import Descent as Descent
+from .loop import advance as advance
 from .loop import finite as finite
 from .loop import fit as fit
 from .loop import rehearse as rehearse

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+from torch.autograd.profiler import record_function as span
 
 from .. import methods
 from ..budget import Budget
@@ -148,11 +149,7 @@ def fit(
                 watched += give_way(watch, method, clock, interrupt)
                 continue
             logged = (step + 1) % log_every == 0
-            set_learning_rate(optimizers, method.learning_rates(step, progress))
-            method.before_step(step, progress)
-            batch = method.batch(data, generator)
-            terms = method.step(batch, step, Descent(method, optimizers, batch, step, logged, refuse))
-            method.after_step(step)
+            batch, terms = advance(method, data, optimizers, generator, step, progress, logged, refuse)
             step += 1
             passes += share_seen(batch)
             losses.append(sum(value.item() for value in terms.values()))
@@ -176,6 +173,32 @@ def fit(
         display.done(step, final.seconds, spent(final.seconds))
     method.eval()
     return Outcome(final, finished, interrupt.signal, clock.pauses - watched)
+
+
+def advance(
+    method: Method,
+    data: Dataset,
+    optimizers: Sequence[torch.optim.Optimizer],
+    generator: torch.Generator,
+    step: int,
+    progress: float,
+    thorough: bool = False,
+    refuse: Callable[[str], None] = lambda fault: None,
+) -> tuple[Lesson, dict[str, Tensor]]:
+    """One training step: its batch, and the terms of its loss. Spans name its parts for `bench step`.
+
+    progress: share of the budget that is spent; thorough, refuse: see `Descent`
+    """
+    set_learning_rate(optimizers, method.learning_rates(step, progress))
+    with span("before step"):
+        method.before_step(step, progress)
+    with span("data"):
+        batch = method.batch(data, generator)
+    with span("forward"):
+        terms = method.step(batch, step, Descent(method, optimizers, batch, step, thorough, refuse))
+    with span("after step"):
+        method.after_step(step)
+    return batch, terms
 
 
 class Descent:
@@ -203,11 +226,14 @@ class Descent:
         chosen = self.optimizers if optimizers is None else optimizers
         for optimizer in chosen:
             optimizer.zero_grad(set_to_none=True)
-        torch.stack(list(terms.values())).sum().backward()
-        if fault := find_fault(self.method, terms, self.batch, self.step, self.thorough):
-            self.refuse(fault)
-        for optimizer in chosen:
-            optimizer.step()
+        with span("backward"):
+            torch.stack(list(terms.values())).sum().backward()
+        with span("check"):
+            if fault := find_fault(self.method, terms, self.batch, self.step, self.thorough):
+                self.refuse(fault)
+        with span("optimizer"):
+            for optimizer in chosen:
+                optimizer.step()
 
 
 def record(
@@ -292,11 +318,7 @@ def rehearse(method: Method, data: Dataset, step: int) -> float:
     optimizers = double.optimizers()
     if step == 0:
         double.compile_begin()
-    set_learning_rate(optimizers, double.learning_rates(step, 0.0))
-    double.before_step(step, 0.0)
-    batch = double.batch(data, torch.Generator().manual_seed(0))
-    double.step(batch, step, Descent(double, optimizers, batch, step, False, lambda fault: None))
-    double.after_step(step)
+    advance(double, data, optimizers, torch.Generator().manual_seed(0), step, 0.0)
     return time.perf_counter() - begin
 
 

@@ -4,6 +4,7 @@ import { html, useEffect, useRef } from "./preact.js";
 import { counted } from "./common.js";
 
 const FRUSTUM = 0.09; // size of a camera, in half-sizes of the scene
+const TURNING_MS = 20000; // after a change; drawing takes processor time from the work that is shown
 const CORNERS = [[-1, -0.7], [1, -0.7], [1, 0.7], [-1, 0.7]];
 
 export function Cameras({ model }) {
@@ -17,11 +18,19 @@ export function Cameras({ model }) {
     const state = view.current;
     let frame = 0;
     let before = 0;
+    let drawn = "";
+    let changed = 0;
     const draw = (now) => {
       frame = requestAnimationFrame(draw);
-      if (now - before < 40) return;
-      if (state.idle && !still) state.turn += Math.min(now - before, 100) * 0.00012;
+      if (now - before < 40 || !canvas.current) return;
+      if (state.idle && !still && now - changed < TURNING_MS) state.turn += Math.min(now - before, 100) * 0.00012;
       before = now;
+      const { clientWidth, clientHeight } = canvas.current;
+      const model = [latest.current.version, latest.current.cameras.length, clientWidth, clientHeight].join();
+      const picture = [model, state.turn, state.tilt, state.zoom].join();
+      if (!drawn.startsWith(model)) changed = now;
+      if (picture === drawn && now - changed > 2000) return; // young cameras change colour
+      drawn = picture;
       paint(canvas.current, latest.current, state, now);
     };
     frame = requestAnimationFrame(draw);
@@ -49,7 +58,7 @@ export function Cameras({ model }) {
   const said = `${counted(model.cameras.length, "camera")} and ${counted(model.points.length, "sparse point")} in 3-D`;
   return html`<canvas ref=${canvas} class="cameras" role="img" aria-label=${said} tabindex="0"
     onPointerDown=${(event) => event.target.setPointerCapture(event.pointerId)} onPointerMove=${drag}
-    onWheel=${wheel} onKeyDown=${key}></canvas>`;
+    onWheel=${wheel} onKeyDown=${key}></canvas><p class="caption">${counted(model.cameras.length, "camera")} · ${counted(model.points.length, "point")} · drag to turn</p>`;
 }
 
 function paint(canvas, model, state, now) {
@@ -63,7 +72,7 @@ function paint(canvas, model, state, now) {
   context.clearRect(0, 0, width, height);
   const [ct, st, cp, sp] = [Math.cos(state.turn), Math.sin(state.turn), Math.cos(state.tilt), Math.sin(state.tilt)];
   const far = 3.6;
-  const focal = 1.9 * Math.min(width, height) * state.zoom;
+  const focal = 1.5 * Math.min(width, height) * state.zoom; // a sphere around the scene fits the view
   const project = (x, y, z) => {
     const across = ct * x + st * y;
     const away = -st * x + ct * y;

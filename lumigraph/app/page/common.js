@@ -1,5 +1,7 @@
 // Requests to the app, and words for sizes, times and states.
 
+import { html } from "./preact.js";
+
 export async function api(method, path, body) {
   const options = { method, headers: {} };
   if (body !== undefined) {
@@ -22,6 +24,12 @@ export async function api(method, path, body) {
   if (!response.ok) throw Object.assign(new Error(said.fault), { status: response.status, have: said.have });
   return said;
 }
+
+// Code and address by which a phone on the same network reaches the app, or one of its scenes.
+export const phone = (url, key = "") => url && html`<details class="phone"><summary class="button">From a phone</summary>
+  <p class="faint">Scan the code with a phone on the same network, photograph there, and see the pictures arrive here.</p>
+  <img alt="QR code of the address below" width="200" height="200" src=${`/api/phone.svg?${new URLSearchParams({ key })}`} />
+  <p><a href=${url}>${url}</a></p></details>`;
 
 export const of = (key) => `items/${encodeURIComponent(key)}`;
 export const pictureUrl = (key, query) => `/api/${of(key)}/picture?${new URLSearchParams(query)}`;

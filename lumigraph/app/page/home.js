@@ -1,7 +1,7 @@
 // Home: cards of all scenes and runs of the folder, and the place to drop photographs.
 
 import { html, useEffect, useRef, useState } from "./preact.js";
-import { ago, api, bytes, counted, of, pictureUrl, repeat } from "./common.js";
+import { ago, api, bytes, of, phone, pictureUrl, repeat } from "./common.js";
 
 export function Home({ say, choose, go }) {
   const [home, setHome] = useState(null);
@@ -84,7 +84,7 @@ function Drop({ home, choose, say, go }) {
     <div><h2>${small ? "New scene" : "Drop photographs, a folder or a video"}</h2>
     <p class="faint">${small
       ? "Drop photographs, a folder or a video anywhere on this page."
-      : "Walk around the thing and take 20 to 60 photographs, or film it for half a minute. They stay on this machine."}</p></div>
+      : `Walk around the thing and take 20 to 60 photographs, or film it for half a minute. They stay on ${home?.local === false ? "the machine of this app" : "this machine"}.`}</p></div>
     <div class="row">
       <label class="button main">Choose photographs or a video
         <input type="file" multiple accept="image/*,video/*,.heic,.heif,.dng,.nef,.cr2,.cr3,.arw" onChange=${(event) => choose(event.target.files)} /></label>
@@ -92,6 +92,7 @@ function Drop({ home, choose, say, go }) {
         <input type="file" webkitdirectory onChange=${(event) => choose(event.target.files)} /></label>
       ${home?.local && path === null && html`<button onClick=${() => setPath("")}>A path on this machine</button>`}
     </div>
+    ${home && phone(home.phone)}
     ${path !== null && html`<form class="row" onSubmit=${open}>
       <label class="wide"><span class="hidden">Folder of photographs, or video</span>
         <input autofocus placeholder="/home/me/photos/garden" value=${path} onInput=${(event) => setPath(event.target.value)} /></label>

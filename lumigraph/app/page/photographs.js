@@ -1,7 +1,7 @@
 // Photographs with their state: sent, details found, compared, placed or left out and why.
 
 import { html, useEffect, useRef, useState } from "./preact.js";
-import { api, bytes, counted, of, pictureUrl } from "./common.js";
+import { api, bytes, counted, of, phone, pictureUrl } from "./common.js";
 import { isUploading, stateOf } from "./uploads.js";
 
 const safe = (name) => name.replace(/[\s#]/g, "_"); // its name in the scene
@@ -19,7 +19,8 @@ export function Photographs({ detail, states, advice, choose, act, marked }) {
   return html`<div class="pad">
     ${own && html`<div class="row">
       <label class="button">Add photographs<input type="file" multiple accept="image/*,video/*,.heic,.heif,.dng,.nef,.cr2,.cr3,.arw" onChange=${(event) => choose(event.target.files, detail.key)} /></label>
-      <span class="faint">${counted(detail.photographs.length, "file")}</span></div>`}
+      <span class="faint">${counted(detail.photographs.length, "file")}</span></div>
+      ${phone(detail.phone, detail.key)}`}
     ${!own && detail.source && html`<p class="faint">${detail.source}</p>`}
     ${sending && html`<div class="upload" role="status">
       <progress max=${up.total || 1} value=${up.sent} aria-label="Upload"></progress>
@@ -51,9 +52,11 @@ function Photograph({ item, one, state, warned, marked, open }) {
   const [kind, text] = words(state);
   const dots = useRef(null);
   const found = marked && state.features ? state.features : 0;
+  const [tries, setTries] = useState(0);
   useEffect(() => {
     if (!found) return;
     api("GET", `${of(item)}/features?${new URLSearchParams({ name: safe(one.name) })}`).then((features) => {
+      if (!features.length && tries < 20) setTimeout(() => setTries(tries + 1), 1500); // they are being written just now
       if (!dots.current) return;
       const [width, height] = [264, 198];
       Object.assign(dots.current, { width, height });
@@ -61,7 +64,7 @@ function Photograph({ item, one, state, warned, marked, open }) {
       context.fillStyle = getComputedStyle(dots.current).getPropertyValue("--mark");
       for (const [x, y] of features) context.fillRect(x * width - 1, y * height - 1, 2, 2);
     }, () => {});
-  }, [found]);
+  }, [found, tries]);
   return html`<li><button class=${`photograph ${kind} ${warned ? "warned" : ""}`} onClick=${open} aria-label=${`${one.name}${text ? `, ${text}` : ""}${warned ? ", see the advice" : ""}`}>
     <img loading="lazy" alt="" src=${pictureUrl(item, { name: one.name, v: one.version })} onError=${(event) => (event.target.style.visibility = "hidden")} />
     ${found > 0 && html`<canvas ref=${dots} aria-hidden="true"></canvas>`}

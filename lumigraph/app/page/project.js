@@ -3,6 +3,7 @@
 import { html, useEffect, useRef, useState } from "./preact.js";
 import { api, counted, of, repeat } from "./common.js";
 import { Cameras } from "./cameras.js";
+import { Compare } from "./compare.js";
 import { Findings, Making } from "./making.js";
 import { Photographs } from "./photographs.js";
 import { Share } from "./share.js";
@@ -37,11 +38,18 @@ export function Project({ item, say, choose, go }) {
       const arrived = found.photographs.length;
       if (latest.current.arrived !== arrived && found.kind !== "run") {
         latest.current.arrived = arrived;
-        setAdvice(await api("GET", `${of(item)}/advice`));
+        latest.current.stale = true;
       }
+      advise();
     } catch (error) {
       setFault(error.message);
     }
+  };
+  const advise = async () => {
+    if (!latest.current.stale || latest.current.asking) return; // one at a time: it takes longer than other requests
+    Object.assign(latest.current, { stale: false, asking: true });
+    await api("GET", `${of(item)}/advice`).then(setAdvice, () => {});
+    latest.current.asking = false;
   };
   useEffect(() => repeat(1, load), [item]);
   useEffect(() => {
@@ -78,6 +86,7 @@ export function Project({ item, say, choose, go }) {
   const shown = tab || (detail.live || (trained.length && !capturing) ? "scene" : model.cameras.length && make?.state !== "failed" ? "cameras" : "photographs");
   const tabs = [
     ["scene", "Scene", detail.live || trained.length > 0],
+    ["compare", "Compare", trained.some((one) => one.photographs) && !detail.live],
     ["cameras", "Cameras", model.cameras.length > 0],
     ["photographs", "Photographs", detail.kind !== "run"],
   ].filter(([, , there]) => there);
@@ -102,13 +111,14 @@ export function Project({ item, say, choose, go }) {
         <div class="tabs" role="tablist" onKeyDown=${keys}>
           ${tabs.map(([name, title]) => html`<button role="tab" id=${`tab-${name}`} aria-selected=${active === name} aria-controls="stage"
             tabindex=${active === name ? 0 : -1} onClick=${() => setTab(name)}>${title}</button>`)}
-          ${active === "scene" && !detail.live && trained.length > 1 && html`<label class="versions"><span class="hidden">Version</span>
+          ${["scene", "compare"].includes(active) && !detail.live && trained.length > 1 && html`<label class="versions"><span class="hidden">Version</span>
             <select value=${viewed} onChange=${(event) => setRun(event.target.value)}>
               ${trained.map((one) => html`<option value=${one.name}>${one.name}${one.psnr ? ` · ${one.psnr.toFixed(1)} dB` : ""}</option>`)}
             </select></label>`}
         </div>
         <div class=${`view on-${active}`} id="stage" role="tabpanel" aria-labelledby=${`tab-${active}`}>
           ${active === "scene" && html`<${SceneView} key=${detail.live ? "live" : viewed} item=${item} run=${detail.live ? "" : viewed} live=${detail.live} />`}
+          ${active === "compare" && html`<${Compare} key=${viewed} detail=${detail} run=${viewed} act=${act} />`}
           ${active === "cameras" && html`<${Cameras} model=${model} />`}
           ${active === "photographs" && html`<${Photographs} detail=${detail} states=${states} advice=${advice} choose=${choose} act=${act} marked=${capturing} />`}
           ${!active && html`<p class="faint pad">Nothing to show yet.</p>`}

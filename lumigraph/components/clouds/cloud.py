@@ -246,12 +246,26 @@ def view_count(bits: Int[Tensor, " gaussian"]) -> Int[Tensor, " gaussian"]:
 
 
 @torch.no_grad()
-def zero_unobserved_sh(harmonics: Float[Tensor, "gaussian coefficient 3"], count: Int[Tensor, " gaussian"]) -> None:
+def zero_unobserved_sh(harmonics: Float[Tensor, "gaussian coefficient 3"], bits: Int[Tensor, " gaussian"]) -> None:
     """Set harmonics to zero, in place, for which a Gaussian's view count is too low: view dependence that few
     directions determine may be anything from elsewhere."""
+    if not harmonics.is_cuda:
+        _zero_unobserved_cpu(harmonics.detach().numpy(), bits.numpy(), np.array([*MIN_VIEWS.items()]))
+        return
     for first, fewest in MIN_VIEWS.items():
-        few = (count < fewest).nonzero()[:, 0]
-        harmonics[few, first:] = 0
+        harmonics[view_count(bits) < fewest, first:] = 0
+
+
+@njit(parallel=True, cache=True)
+def _zero_unobserved_cpu(harmonics, bits, limits):
+    enough = limits[-1, 1]
+    for i in prange(len(bits)):
+        left, count = bits[i], 0
+        while left != 0 and count < enough:
+            left, count = left & (left - 1), count + 1
+        for k in range(len(limits)):
+            if count < limits[k, 1]:
+                harmonics[i, limits[k, 0] :] = 0
 
 
 def picture_share(cloud: Gaussians, camera: Camera, near: float) -> Float[Tensor, " gaussian"]:

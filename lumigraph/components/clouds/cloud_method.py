@@ -180,8 +180,8 @@ class CloudMethod(Method, ABC):
         now.residual = (now.rgb - now.target).detach()
         for part in self.additions:
             part.mask(self, now)
-        now.terms["l1"] = (1 - c.ssim_weight) * (now.rgb - now.target).abs().mean()
-        now.terms["ssim"] = c.ssim_weight * (1 - kernels.ssim(now.rgb, now.target))
+        ssim, l1 = kernels.photometric(now.rgb, now.target)
+        now.terms |= {"l1": (1 - c.ssim_weight) * l1, "ssim": c.ssim_weight * (1 - ssim)}
         if batch.extra:
             now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:

@@ -55,7 +55,7 @@ class Tidying(Addition):
                 distance = distance[~near]
             cloud.log_scales.copy_(clamped_scales(cloud.gaussians(), distance, float(cloud.extent), *limits))
         if method.bands > 1 and rules.observed_harmonics:
-            zero_unobserved_sh(cloud.harmonics, cloud.view_count)
+            zero_unobserved_sh(cloud.harmonics, cloud.view_bits)
 
 
 def camera_distance(

@@ -264,7 +264,10 @@ def sampling_bytes(frame: Frame, config: Any, learning: bool) -> int:
     activations that a step keeps for its gradients. With a mask the number of samples is not known beforehand."""
     if getattr(config, "field", "hash" if hasattr(config, "table") else "network") == "network":
         masked = hasattr(config, "mask") and config.mask.occupancy_resolution > 0
-        kept = config.network.activation_bytes(config.rays.samples_per_step, config.hidden_width)
+        even = hasattr(config, "samples")  # on each ray
+        owner = config.rays if hasattr(config, "rays") else config.occupancy
+        samples = config.samples * config.rays_per_step if even else owner.samples_per_step
+        kept = config.network.activation_bytes(samples, config.hidden_width)
         return 0 if masked else kept * learning
     width = getattr(config, "table_width", config.hidden_width)
     kept = config.table.activation_bytes(config.occupancy.samples_per_step, width)

@@ -1,4 +1,4 @@
-"""Structural similarity of two images, as a loss needs it."""
+"""Photometric difference of two images, as a loss needs it: structural similarity and the mean absolute difference."""
 
 import torch
 from jaxtyping import Float
@@ -6,7 +6,7 @@ from torch import Tensor
 
 from .._operation import Facts, door, implementation, require
 
-FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(0, 1), typical=1, compiled=4, smooth=(1,))
+FACTS = Facts(unit="pixels", unit_axes=2, outputs=2, differentiable=(0, 1), typical=1, compiled=4, smooth=(1,))
 
 WINDOW, DEVIATION = 11, 1.5  # pixels
 C1, C2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 for values up to L = 1
@@ -20,8 +20,10 @@ def weights() -> list[float]:
 
 
 @door
-def ssim(a: Float[Tensor, "height width channel"], b: Float[Tensor, "height width channel"]) -> Float[Tensor, ""]:
-    """Mean structural similarity (Wang 2004, eqs. 13 and 14) of two images with values in [0, 1].
+def photometric(
+    a: Float[Tensor, "height width channel"], b: Float[Tensor, "height width channel"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Mean structural similarity (Wang 2004, eqs. 13 and 14) and mean |a - b| of two images with values in [0, 1].
 
         S = (2 m_a m_b + C1) (2 s_ab + C2) / ((m_a^2 + m_b^2 + C1) (s_aa + s_bb + C2))
         m_a = w * a,   s_ab = w * (a b) - m_a m_b      means and (co)variances around a pixel
@@ -30,10 +32,11 @@ def ssim(a: Float[Tensor, "height width channel"], b: Float[Tensor, "height widt
     both images count as zero beyond their border, as in the original loss of 3D Gaussian Splatting (Kerbl 2023, eq. 7).
     (`metrics.ssim` is the score, whose windows lie inside the image.)
 
-    Returns the mean of S over pixels and channels, which is symmetric, and differentiable in a and b.
+    Returns the means of S and of |a - b| over pixels and channels. Both are symmetric, and differentiable in a and b;
+    where a = b the slope of |a - b| is zero.
     """
     require(a.numel() > 0, "pictures without pixels are not alike")
-    return implementation("ssim", a)(a, b)
+    return implementation("photometric", a)(a, b)
 
 
 def cases(generator: torch.Generator):

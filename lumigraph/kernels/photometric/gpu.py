@@ -61,8 +61,8 @@ def _moments(a, b, window, rows, height, length, C: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["height", "length"])
-def _likeness(rows, window, out, maps, height, length, MAPS: tl.constexpr):
-    """S, and its derivatives in the mean of a, the squares' mean, the products' mean, and the mean of b."""
+def _likeness(first, second, rows, window, out, maps, height, length, MAPS: tl.constexpr):
+    """S, |a - b|, and the derivatives of S in the mean of a, the squares' mean, the products' mean, the mean of b."""
     y, x, here = _place(length)
     size = height.to(tl.int64) * length
     a = _across(rows, window, x, y, size, length, here)
@@ -72,7 +72,10 @@ def _likeness(rows, window, out, maps, height, length, MAPS: tl.constexpr):
     A1, A2 = 2 * a * b + K1, 2 * (products - a * b) + K2
     B1, B2 = a * a + b * b + K1, squares - (a * a + b * b) + K2
     S = A1 * A2 / (B1 * B2)
-    tl.store(out + y * length + x, S, mask=here)
+    at = y * length + x
+    gap = tl.load(first + at, mask=here, other=0.0) - tl.load(second + at, mask=here, other=0.0)
+    tl.store(out + at, S, mask=here)
+    tl.store(out + size + at, tl.abs(gap), mask=here)
     place = maps + y * length + x
     p, q = 2 * (A2 - A1) / (B1 * B2), 2 * S * (B1 - B2) / (B1 * B2)
     if MAPS:
@@ -96,7 +99,7 @@ def _along(maps, window, rows, height, length, C: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["height", "length", "mean"])
-def _gradient(rows, window, own, other, grad, d_own, height, length, mean, share):
+def _gradient(rows, window, own, other, to_ssim, to_gap, d_own, height, length, mean, share):
     """Every derivative spreads to where it was gathered: the window is symmetric, so that is the same blur."""
     y, x, here = _place(length)
     size = height.to(tl.int64) * length
@@ -106,7 +109,8 @@ def _gradient(rows, window, own, other, grad, d_own, height, length, mean, share
     place = y * length + x
     mine, its = tl.load(own + place, mask=here), tl.load(other + place, mask=here)
     to_own = to_mean + 2 * mine * to_squares + its * to_products
-    tl.store(d_own + place, tl.load(grad) * share * to_own, mask=here)
+    sign = tl.where(mine > its, 1.0, 0.0) - tl.where(mine < its, 1.0, 0.0)
+    tl.store(d_own + place, share * (tl.load(to_ssim) * to_own + tl.load(to_gap) * sign), mask=here)
 
 
 @cache
@@ -121,14 +125,14 @@ def forward(ctx, a, b):
     wanted = ctx.needs_input_grad
     first, second = (b, a) if wanted == (False, True) else (a, b)  # S is symmetric
     count = 3 + all(wanted) if any(wanted) else 0
-    rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 1, count))
+    rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 2, count))
     launch(_moments, ctx.grid, first, second, ctx.window, rows, height, length, C=channels)
-    launch(_likeness, ctx.grid, rows, ctx.window, out, maps, height, length, MAPS=count)
+    launch(_likeness, ctx.grid, first, second, rows, ctx.window, out, maps, height, length, MAPS=count)
     ctx.save_for_backward(a, b, maps)
-    return out.mean()
+    return out[0].mean(), out[1].mean()
 
 
-def backward(ctx, grad):
+def backward(ctx, *grads):
     a, b, maps = ctx.saved_tensors
     count, height, length = maps.shape
     rows = empty(*maps.shape, device=a.device)
@@ -138,7 +142,7 @@ def backward(ctx, grad):
         if ctx.needs_input_grad[i]:
             mean = MEAN_B if i and count > MEAN_B else MEAN_A
             found = gradients[i] = empty(*a.shape, device=a.device)
-            given = rows, ctx.window, own, other, grad, found
+            given = rows, ctx.window, own, other, *grads, found
             launch(_gradient, ctx.grid, *given, height, length, mean, 1 / a.numel())
     return (*gradients,)
 

@@ -79,9 +79,18 @@ def _sum(x):
     return total
 
 
+@njit(fastmath=True, error_model="numpy")
+def _gap(a, b):
+    total = np.float32(0)
+    for i in range(len(a)):
+        total += abs(a[i] - b[i])
+    return total
+
+
 @njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
-def _forward(a, b, pixel, bands, sums, maps):
-    """Sums of S by strip and row; and its derivatives, between margins of zeros, where `maps` has room for them."""
+def _forward(a, b, pixel, bands, sums, gaps, maps):
+    """Sums of S and of |a - b| by strip and row; and S's derivatives, between margins of zeros, where `maps` has room
+    for them."""
     height, width = a.shape
     margin = REACH * len(pixel)
     length = STRIP + 2 * margin
@@ -110,6 +119,7 @@ def _forward(a, b, pixel, bands, sums, maps):
                 continue
             _likeness(rows[4 * STRIP :], out)
             sums[strip, middle] = _sum(out[:count])
+            gaps[strip, middle] = _gap(a[middle, left : left + count], b[middle, left : left + count])
             for q in range(maps.shape[1]):
                 if strip == 0:
                     maps[middle, q, :margin] = 0
@@ -134,16 +144,17 @@ def _along_maps(mean, squares, products, rows, pixel):
 
 
 @njit(fastmath=True, error_model="numpy")
-def _gradient(rows, own, other, scale, out):
+def _gradient(rows, own, other, scale, step, out):
     for x in range(len(out)):
         mean = _window(rows, x, 3 * STRIP)
         squares = _window(rows, STRIP + x, 3 * STRIP)
         products = _window(rows, 2 * STRIP + x, 3 * STRIP)
-        out[x] = scale * (mean + TWO * own[x] * squares + other[x] * products)
+        sign = np.float32(own[x] > other[x]) - np.float32(own[x] < other[x])
+        out[x] = scale * (mean + TWO * own[x] * squares + other[x] * products) + step * sign
 
 
 @njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
-def _backward(own, other, maps, mean, scale, pixel, bands, out):
+def _backward(own, other, maps, mean, scale, step, pixel, bands, out):
     """Every derivative spreads to where it was gathered: the window is symmetric, so that is the same blur."""
     height, width = own.shape
     strips = (width + STRIP - 1) // STRIP
@@ -168,6 +179,7 @@ def _backward(own, other, maps, mean, scale, pixel, bands, out):
                     own[middle, left:right],
                     other[middle, left:right],
                     scale,
+                    step,
                     out[middle, left:right],
                 )
 
@@ -182,22 +194,22 @@ def forward(ctx, a, b):
     maps = empty(height, 3 + all(wanted) if any(wanted) else 0, strips * STRIP + 2 * REACH * channels)
     ctx.pixel = (0,) * channels  # its length is known to the compiler, and how far apart pixels are
     ctx.bands = min(get_num_threads(), -(-height // HEIGHT))
-    sums = np.empty((strips, height))
-    _forward(*lines, ctx.pixel, ctx.bands, sums, maps.numpy())
+    sums, gaps = np.empty((2, strips, height))
+    _forward(*lines, ctx.pixel, ctx.bands, sums, gaps, maps.numpy())
     ctx.save_for_backward(a, b, maps)
-    return torch.tensor(sums.sum() / a.numel(), dtype=torch.float32)
+    return tuple(torch.tensor(x.sum() / a.numel(), dtype=torch.float32) for x in (sums, gaps))
 
 
-def backward(ctx, grad):
+def backward(ctx, to_ssim, to_gap):
     a, b, maps = ctx.saved_tensors
-    scale = np.float32(grad.item() / a.numel())
+    scale, step = (np.float32(grad.item() / a.numel()) for grad in (to_ssim, to_gap))
     gradients: list[torch.Tensor | None] = [None, None]
     for i, (own, other) in enumerate([(a, b), (b, a)]):
         if ctx.needs_input_grad[i]:
             found = gradients[i] = empty(*a.shape)
             lines = [x.detach().reshape(len(a), -1).numpy() for x in (own, other, found)]
             mean = MEAN_B if i and maps.shape[1] > MEAN_B else MEAN_A
-            _backward(*lines[:2], maps.numpy(), mean, scale, ctx.pixel, ctx.bands, lines[2])
+            _backward(*lines[:2], maps.numpy(), mean, scale, step, ctx.pixel, ctx.bands, lines[2])
     return (*gradients,)
 
 
