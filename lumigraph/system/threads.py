@@ -184,7 +184,8 @@ def crowd(leave: threading.Event) -> None:
 def openmp_copies() -> list[ctypes.CDLL]:
     """Copies of GNU's OpenMP in this process: one, or two where PyTorch was imported before Lumigraph."""
     lines = Path("/proc/self/maps").read_text().splitlines()
-    return [ctypes.CDLL(path) for path in sorted({line.split(maxsplit=5)[-1] for line in lines if "/libgomp" in line})]
+    paths = {line.split(maxsplit=5)[-1] for line in lines if "/libgomp" in line}
+    return [ctypes.CDLL(path) for path in sorted(paths) if Path(path).exists()]  # an update may have removed one
 
 
 def description() -> str:
