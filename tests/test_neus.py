@@ -167,6 +167,7 @@ def test_sections_gather_where_the_surface_is():
     """A sphere, without any learning: the sections that matter are near it, and hold all of the light."""
     method = NeuS(tiny.scene().frame, replace(NeuS.smallest(), rays=replace(Config().rays, coarse_samples=32)))
     method.network.shape.begin_as(torch.zeros(3), 0.5, False)
+    method.network.max_sharpness = math.inf  # as of a finer table
     with torch.no_grad():
         method.network.deviation.fill_(0.6)  # s = 403
         rays = Rays(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([0.01]))
@@ -175,6 +176,16 @@ def test_sections_gather_where_the_surface_is():
     assert float(weights.sum()) > 0.99
     assert float((weights * seen.samples.t).sum() / weights.sum()) == pytest.approx(2.5, abs=0.01)
     assert len(seen.samples) < 60 and float(seen.samples.length.median()) < 0.03
+
+
+@pytest.mark.parametrize("field", ["hash", "network"])
+def test_a_surface_is_no_thinner_than_its_table_resolves(field):
+    """A table with cells of 2.2 / n has s of 1.3 n / 2.2 at most; a network has cells of no size."""
+    method = NeuS(tiny.scene().frame, replace(NeuS.smallest(), field=field))
+    with torch.no_grad():
+        method.network.deviation.fill_(0.9)  # s = 8103
+    bound = 1.3 * method.network.shape.table.levels.resolutions[-1] / 2.2 if field == "hash" else 8103.08
+    assert float(method.network.sharpness) == pytest.approx(bound, rel=1e-3)
 
 
 def test_slopes_of_sections_are_no_steeper_than_a_distance(field):

@@ -24,6 +24,7 @@ from ...method.field import Codes, Colours, Densities, Directions, Points
 
 INITIAL_DEVIATION = 0.3  # v, the learnt number at first: s = exp(10 v) is 20 per scene unit
 SOFTPLUS_BETA = 100.0  # of the distance network's activations, section E.1
+MAX_SHARPNESS = 1.3  # s times the finest cell of a hash table: a steeper surface falls between its places
 EXTENT = 1.1  # half-size of the cube that the hash table covers: taps beyond the box of interest stay inside
 TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))  # corners, times sqrt(3)
 
@@ -64,6 +65,7 @@ class DistanceField(nn.Module, ABC):
     centre: Tensor
     radius: Tensor
     sign: Tensor
+    finest_cell = 0.0  # scene units, of a table that holds it; 0 for a network
 
     def __init__(self) -> None:
         super().__init__()
@@ -179,6 +181,7 @@ class HashDistance(DistanceField):
         whole = ((-EXTENT,) * 3, (EXTENT,) * 3)
         self.table = HashField(numbers, width, Box(whole, 0.0), EXTENT, code=3, joining=joining)
         self.register_buffer("corners", torch.tensor(TETRAHEDRON) / math.sqrt(3), persistent=False)
+        self.finest_cell = 2 * EXTENT / self.table.levels.resolutions[-1]
 
     @property
     def tap_distance(self) -> float:
@@ -221,6 +224,9 @@ class NeuSField(Field):
     outside:  field of all else; None where nothing is
     margin:   scene units around the surface, in which a mask of empty space sees density
     annealed: share a of the way from the slope's half to the slope itself; see `thickness`
+
+    s is bounded where a table holds the distance. Unbounded it ran away: once a surface is thinner than the sections,
+    a ray has one section, and nothing is learnt beside it.
     """
 
     joint = True
@@ -237,12 +243,13 @@ class NeuSField(Field):
         super().__init__()
         self.shape, self.outside, self.margin, self._annealed = shape, outside, margin, annealed
         self.deviation = nn.Parameter(torch.tensor(INITIAL_DEVIATION))
+        self.max_sharpness = MAX_SHARPNESS / shape.finest_cell if shape.finest_cell else math.inf
         self.register_buffer("box", torch.tensor(bounds), persistent=False)
 
     @property
     def sharpness(self) -> Float[Tensor, ""]:
         """s, the inverse deviation of the logistic density around the surface, per scene unit."""
-        return (10 * self.deviation).exp()
+        return (10 * self.deviation).exp().clamp_max(self.max_sharpness)
 
     def thickness(
         self,
