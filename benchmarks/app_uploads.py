@@ -128,7 +128,7 @@ def make_photographs(folder: Path, count: int) -> list[Path]:
         made.append(folder / f"IMG_{i:04}.jpg")
         wave = 90 + 60 * np.sin(x / (17 + i % 31) + i) * np.cos(y / (11 + i % 23))
         smooth = np.asarray(Image.fromarray(wave.astype(np.uint8)).resize(SIZE, Image.Resampling.BILINEAR))
-        Image.fromarray(smooth[..., None] + np.roll(noise, 97 * i, 1)).save(made[-1], quality=QUALITY, subsampling=0)
+        Image.fromarray(smooth[..., None] + np.roll(noise, 97 * i, 1)).save(made[-1], quality=QUALITY)
     return made
 
 

@@ -115,7 +115,10 @@ class Walk:
         """Save screenshots at both sizes. panel: shown on the phone; scene: title of its viewer, once that is open"""
         give_way()
         self.shot(desk, f"{name}-desk")
-        phone.goto(desk.url)
+        place = desk.url
+        if scene:  # one viewer at a time: both are drawn in software
+            desk.goto("about:blank")
+        phone.goto(place)
         phone.locator("main").wait_for()
         if panel:
             phone.get_by_label(panel, exact=True).scroll_into_view_if_needed()
@@ -125,6 +128,9 @@ class Walk:
         phone.wait_for_timeout(5000)
         self.shot(phone, f"{name}-phone")
         phone.goto("about:blank")
+        if scene:
+            desk.goto(place)
+            desk.frame_locator("iframe").get_by_role("tab", name="Crop").wait_for()
 
 
 def give_way() -> None:
