@@ -90,15 +90,19 @@ def test_a_watch_ends_with_its_block():
     assert watched("other", int, "3") == 3 and len(seen) == 2
 
 
-def test_the_command_leaves_a_run_as_it_is(ball_run, ball_folder, tmp_path, capsys):
+def test_the_command_leaves_a_run_as_it_is(ball_folder, tmp_path, capsys):
+    run = tmp_path / "run"
+    assert main(["train", "voxel-grid", str(ball_folder), "--steps", "4", "--output", str(run)]) == 0
+
     def files():
-        found = sorted(path for path in ball_run.folder.rglob("*") if path.is_file())
+        found = sorted(path for path in run.rglob("*") if path.is_file())
         return {path: sha256(path.read_bytes()).hexdigest() for path in found}
 
+    capsys.readouterr()
     before = files()
     wanted = ["--warmup", "2", "--steps", "2", "--output", str(tmp_path / "step.json")]
     flame = ["--flame", str(tmp_path / "step.svg")]
-    for words in (["voxel-grid", str(ball_folder), *flame], [str(ball_run.folder), "--overwrite"]):
+    for words in (["voxel-grid", str(ball_folder), *flame], [str(run), "--overwrite"]):
         assert main(["bench", "step", *words, *wanted]) == 0
         told, figures = capsys.readouterr().out, json.loads((tmp_path / "step.json").read_text())
         assert figures["method"] == "voxel-grid" and "composite forward" in told
