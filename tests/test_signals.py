@@ -39,7 +39,7 @@ COMMANDS = {
     "explain ray RUN": "lumigraph.explain.ray.along_ray",
     "capture SCENE --output OUT": "lumigraph.capture.motion.reconstruct",
     "bench kernels": "lumigraph.kernels.bench.bench_kernels",
-    "bench step RUN": "lumigraph.benchmark.step.bench_step",
+    "bench step voxel-grid SCENE": "lumigraph.benchmark.step.bench_step",
     "bench methods --methods voxel-grid --scenes SCENE --output OUT": "lumigraph.benchmark.conduct.conduct",
     "view RUN": "lumigraph.viewer.choose_address",
 }

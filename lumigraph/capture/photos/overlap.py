@@ -26,7 +26,7 @@ Descriptors = UInt8[np.ndarray, "_ 128"]  # of the details of a photograph
 
 @cache
 def extractor() -> Any:
-    import pycolmap
+    from ...system.library import pycolmap
 
     pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value  # else it announces itself on stderr
     options = pycolmap.FeatureExtractionOptions()
