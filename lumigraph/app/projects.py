@@ -14,7 +14,6 @@ Runs and scenes that the command line made, also in `runs/` and `scenes/`, are i
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import os
 import re
@@ -26,6 +25,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import LumigraphError
+from ..exchange import size_of
 from ..files import explained, read_json, remove, write_json
 from ..files.names import natural
 
@@ -120,20 +120,6 @@ def is_run(path: Path) -> bool:
 
 def is_splats(path: Path) -> bool:
     return path.suffix.lower() in (".ply", ".spz", ".sog", ".splat") and path.is_file()
-
-
-def disk_bytes(path: Path) -> int:
-    """Bytes of a file, or of all files of a folder, in which files may come and go meanwhile."""
-    places = (
-        [str(path)]
-        if path.is_file()
-        else [os.path.join(top, name) for top, _, names in os.walk(path) for name in names]
-    )
-    total = 0
-    for place in places:
-        with contextlib.suppress(OSError):
-            total += os.stat(place).st_size
-    return total
 
 
 def newest(folder: Path) -> tuple[int, ...]:
@@ -305,7 +291,7 @@ def trash(root: Path) -> list[dict[str, Any]]:
         place = about.with_suffix("")
         if place.is_dir():
             record = read_json(about, TrashRecord)
-            found.append({"name": place.name, "bytes": disk_bytes(place)} | asdict(record))
+            found.append({"name": place.name, "bytes": size_of(place)} | asdict(record))
     return sorted(found, key=lambda one: one["deleted"], reverse=True)
 
 

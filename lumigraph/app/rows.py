@@ -7,11 +7,12 @@ from typing import Any
 
 from ..budget import QUALITIES
 from ..errors import LumigraphError
+from ..exchange import size_of
 from . import pictures, progress
 from .comparison import comparison, rendering
 from .job_record import Making, ShareJob, read_job
 from .jobs import log_lines
-from .projects import SCENE, SHARED, Item, disk_bytes
+from .projects import SCENE, SHARED, Item
 
 MIN_PLACED_SHARE = 0.9  # of the photographs, below which the other mapper is offered
 MAX_MESSAGES = 30  # lines of a log on the page
@@ -24,7 +25,7 @@ def card(item: Item) -> dict[str, Any]:
         runs = [path for path in item.runs if path.is_dir()]
         about = progress.card_of_run(runs[-1]) if runs else {"method": "", "psnr": None}
         job = read_job(item).make
-        size = disk_bytes(item.path)
+        size = size_of(item.path)
     except LumigraphError as fault:
         return {"key": item.key, "kind": item.kind, "title": item.path.name, "fault": str(fault), "age": 0, "bytes": 0}
     picture = next((path for run in reversed(runs) if (path := progress.picture_of_run(run))), None)
@@ -47,7 +48,7 @@ def card(item: Item) -> dict[str, Any]:
 def run_row(path: Path) -> dict[str, Any]:
     about = progress.card_of_run(path) if path.is_dir() else {"method": path.suffix, "psnr": None, "trained": True}
     picture = progress.picture_of_run(path)
-    row = {"name": path.name, "bytes": disk_bytes(path), "age": progress.age(path), **about}
+    row = {"name": path.name, "bytes": size_of(path), "age": progress.age(path), **about}
     row["compared"] = comparison(path)
     return row | {"picture": pictures.version_of(picture) if picture else ""}
 

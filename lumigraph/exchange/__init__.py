@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from ..errors import LumigraphError
@@ -111,9 +113,13 @@ def layout_of(folder: Path) -> str | None:
 
 
 def size_of(path: Path | str) -> int:
-    """Bytes of a file of Gaussians, or of all files of a folder, such as one of SOG."""
-    place = place_of(expanded(path))
-    return sum(file.stat().st_size for file in (place.rglob("*") if place.is_dir() else [place]) if file.is_file())
+    """Bytes of a file of Gaussians, or of all files of a folder, such as one of SOG, even while some come and go."""
+    place, total = place_of(expanded(path)), 0
+    inner = (Path(folder, name) for folder, _, names in os.walk(place) for name in names)
+    for file in [place] if place.is_file() else inner:
+        with suppress(OSError):
+            total += file.stat().st_size
+    return total
 
 
 def check_ending(path: Path) -> str:

@@ -7,6 +7,7 @@ Chance alone gives up to 11 on the bananas of a carpet; neighbours of a walk aro
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -20,6 +21,8 @@ from ..pictures import eight_bits
 SIDE, COUNT = 480, 800  # pixels of the longer side; details of a photograph
 RATIO = 0.8  # of the distances to the nearest and second nearest (Lowe 2004, section 7.1)
 MIN_SHARED = 15  # details, below which two photographs do not count as neighbours
+
+EXTRACTING = threading.Lock()  # COLMAP's extractor keeps its pyramid between calls
 
 Descriptors = UInt8[np.ndarray, "_ 128"]  # of the details of a photograph
 
@@ -40,7 +43,8 @@ def details(image: Image.Image) -> Descriptors:
     image.draft("L", (SIDE, SIDE))
     grey = eight_bits(image).convert("L")
     grey.thumbnail((SIDE, SIDE))
-    _, descriptors = extractor().extract_from_uint8_array(np.ascontiguousarray(grey))
+    with EXTRACTING:
+        _, descriptors = extractor().extract_from_uint8_array(np.ascontiguousarray(grey))
     return np.array(descriptors.data, np.uint8).reshape(-1, 128)
 
 
