@@ -6,6 +6,8 @@ import json
 import math
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import plyfile
@@ -23,7 +25,7 @@ from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
-from lumigraph.datasets.scene import Frame
+from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.depth_maps import Tolerance, agreed, render_depth_maps
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
@@ -208,6 +210,21 @@ def test_an_open_surface_is_cut_where_one_camera_alone_sees_it():
     once = ~agreed(points, maps, Tolerance(5 * CELL))
     inner = ~np.isin(np.arange(len(points)), border(len(points), all_of_them.faces).nonzero()[0])
     assert once[inner].float().mean() < 0.02 and agreed(points, maps[:1], Tolerance(5 * CELL)).float().mean() < 0.9
+
+
+@pytest.mark.parametrize("kind", [Measured, Solid, Seen], ids=["distance", "density", "depth"])
+def test_what_masks_leave_out_is_no_surface(kind):
+    """A ball on a plate, with masks of the ball alone."""
+    cameras = around(24, lowest=10.0)
+    scene = kind(together(ball(), lambda points: (points[:, 2] + 0.7).abs() - 0.06))
+    alone = render_depth_maps(Seen(ball()).render, cameras, scene.frame.background)
+    store = SimpleNamespace(mask=lambda index: alone[index].solid)
+    photographs = Mock(Scene, images=store, splits={"train": torch.arange(len(cameras))})
+    both, masked = (extract_mesh(scene, cameras, cell=CELL, photographs=x) for x in (None, photographs))
+    assert both.vertices[:, 2].min() < -0.7 and both.vertices[:, 0].max() > 0.9
+    assert as_trimesh(masked).is_watertight and as_trimesh(masked).body_count == 1
+    assert as_trimesh(masked).volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.1)
+    assert np.abs(masked.vertices[:, :2]).max() < 0.6 + CELL and masked.vertices[:, 2].max() < 0.6 + CELL
 
 
 def test_the_outline_of_a_mask_becomes_even():

@@ -140,7 +140,7 @@ class ExportMesh:
             size=self.size,
             views=self.views,
             texture=self.texture_size if self.texture else None,
-            photographs=self.photographs(opened) if self.texture else None,
+            photographs=self.photographs(opened),
         )
         return opened, mesh.in_source(opened.frame), why
 
@@ -154,7 +154,8 @@ class ExportMesh:
         except LumigraphError as error:
             if self.scene is not None:
                 raise
-            warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
+            if self.texture:
+                warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
             return None
 
     def rows(self, opened: Any, mesh: Any, written: list[Path], why: str) -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import interpolate, max_pool2d
 
 from ..camera import Camera
 from ..camera.rays import Rendering
@@ -142,6 +142,11 @@ class DepthMap:
                nothing is, NaN where nothing was measured
         """
         return DepthMap(camera, depth, depth.isfinite().float(), rgb)
+
+    def within(self, mask: Bool[Tensor, "rows columns"]) -> DepthMap:
+        """The same with depth only where a mask of the picture, in any size, is true; NaN elsewhere."""
+        sized = interpolate(mask[None, None].float(), tuple(self.depth.shape), mode="nearest-exact")[0, 0] > 0
+        return replace(self, depth=torch.where(sized, self.depth, torch.nan))
 
     @cached_property
     def solid(self) -> Bool[Tensor, "height width"]:
@@ -371,6 +376,17 @@ def hidden(
     needed = 1 + len(depth_maps) // CAMERAS_PER_VIEW
     tracked = track(depth_maps, "Looking for what no camera sees", len(depth_maps))
     return ~_confirmed(points, tracked, needed, lambda seen, some: seen.sees(some, tolerance, tolerance))
+
+
+def unmeasured(points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap]) -> Bool[Tensor, " point"]:
+    """Mask of points in whose direction two cameras (or the only one) measured nothing: the depth there is NaN."""
+    needed = min(MIN_FREE_VIEWS, len(depth_maps))
+
+    def blind(seen: DepthMap, some: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+        pixels, valid, _ = seen.project(some)
+        return seen.inside(pixels, valid) & seen.at_pixels(seen.depth, pixels).isnan()
+
+    return _confirmed(points, depth_maps, needed, blind)
 
 
 def agreed(

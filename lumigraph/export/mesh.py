@@ -18,7 +18,7 @@ from ..camera import Camera
 from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Scene
-from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, render_depth_maps
+from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, render_depth_maps, unmeasured
 from ..errors import LumigraphError
 from ..geometry import evenly
 from ..method import Method
@@ -91,7 +91,8 @@ def extract_mesh(
     size:    longer side of the cameras' pictures at most, pixels
     views:   cameras at most
     texture: texels a side of a texture; None for colours at vertices alone
-    photographs: the scene whose training split `cameras` are, for the texture; None to take the method's renderings
+    photographs: the scene whose training split `cameras` are. Pixels that its masks leave out of learning show no
+             surface, and a texture is made of its colours. None for no masks, and a texture of the method's renderings
     Raises LumigraphError where nothing is solid, where a texture does not fit into memory, and for numbers that make
     no sense.
     """
@@ -108,29 +109,31 @@ def extract_mesh(
         return made
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
     sources: list[Views] = [lambda _: rendered(depth_maps)]
+    learnt = depth_maps
     if photographs is not None:
         chosen = evenly(range(len(cameras)), views)
+        learnt = without_masked(depth_maps, photographs, chosen)
         sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
     if made is not None and texture is not None:
         surface = made.vertices, made.faces
         return textured(surface, sources, HIDDEN_CELLS * grid.cell, texture, surface)
     step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
-    value = from_depth(depth_maps, grid.cell, closed)
+    value = from_depth(learnt, grid.cell, closed)
     if way == "distance" and method.learns_from is not Scene:  # of shapes, known where no camera sees it
         value = from_distance(method, grid.cell)
     elif way != "depth":
         if way == "distance":
             own = from_distance(method, grid.cell)
         else:
-            own = from_density(method, surface_level(method, depth_maps, holds) if level is None else level)
+            own = from_density(method, surface_level(method, learnt, holds) if level is None else level)
         value = near_depth(own, interpolated(value, grid, step))
     vertices, triangles = find_surface(grid, step, holds, value, -1.0 if closed else math.nan)
     if len(triangles):
         points = torch.from_numpy(vertices).float()
         if closed:
-            seen_well = ~hidden(points, depth_maps, Tolerance(2 * grid.cell)).numpy()
+            seen_well = ~hidden(points, learnt, Tolerance(2 * grid.cell)).numpy()
         else:
-            confirmed = agreed(points, depth_maps, Tolerance(TRUNCATION_CELLS * grid.cell)).numpy()
+            confirmed = agreed(points, learnt, Tolerance(TRUNCATION_CELLS * grid.cell)).numpy()
             seen_well = majority(confirmed, triangles, CUT_ROUNDS)
             triangles = triangles[seen_well[triangles].all(-1)]
         corners, triangles = manifold(triangles)
@@ -151,8 +154,14 @@ def extract_mesh(
     if texture is not None:
         return textured((vertices, triangles), sources, HIDDEN_CELLS * grid.cell, texture, detailed)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
-    rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
+    rgb = fused_colours(points, normals, learnt, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
+
+
+def without_masked(depth_maps: Sequence[DepthMap], photographs: Scene, chosen: Sequence[int]) -> list[DepthMap]:
+    """Depth maps of these training cameras, NaN in pixels that the photographs' masks leave out of learning."""
+    masks = [photographs.images.mask(int(photographs.splits["train"][i])) for i in chosen]
+    return [seen if mask is None else seen.within(mask) for seen, mask in zip(depth_maps, masks, strict=True)]
 
 
 def own_mesh(method: Method, holds: Holds, keep: float, smooth: int, faces: int | None) -> Mesh:
@@ -230,13 +239,18 @@ Holds = Callable[[Float[Tensor, "point 3"]], Bool[Tensor, " point"]]
 def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Value:
     """A function of points: 0 at the surface of the fused depth maps, 1 well inside, -1 well outside.
 
-    closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
+    closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN). What
+            lies in the direction of pixels without a measurement is empty then, as it is around a silhouette
     """
     fused = TSDF(depth_maps, Tolerance(TRUNCATION_CELLS * cell))
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         distance, _, pictured = fused(points)
-        return torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), -distance)
+        if not closed:
+            return -distance
+        behind = distance.isnan() & pictured
+        behind[behind.clone()] = ~unmeasured(points[behind], depth_maps)
+        return torch.where(distance.isnan(), torch.where(behind, 1.0, -1.0), -distance)
 
     return value
 
