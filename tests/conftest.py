@@ -32,6 +32,11 @@ FIRST_FILES = ["test_contract", "test_bounds", "test_seeded_faults"]  # the last
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
 
+    with contextlib.suppress(ImportError):  # Triton is for Linux alone
+        import interpreter
+
+        interpreter.hasten()
+
 shape_checks.install()
 
 from lumigraph.system.allocation import settle_memory  # noqa: E402

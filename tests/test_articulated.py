@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import tiny
@@ -11,14 +13,16 @@ import torch
 from bodies import BEND, bent, frame, skeleton
 from budgets import budget
 
-from lumigraph.components.skinning.bone_motion import BoneMotion, BoneNumbers, exponential, rotation_vectors
+from lumigraph.camera import Camera
+from lumigraph.components.skinning.bone_motion import BoneMotion, BoneNumbers, exponential, rotation_vectors, smoothed
 from lumigraph.components.skinning.weight_volume import WeightNumbers, WeightVolume, distance
-from lumigraph.datasets.skeleton import rigid_inverse, rigid_product
+from lumigraph.datasets.scene import Scene
+from lumigraph.datasets.skeleton import BonePose, rigid_inverse, rigid_product
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange.bones import write_bones
 from lumigraph.figures import ramp
 from lumigraph.gaussians.cloud import BAND_0
-from lumigraph.geometry import rotated, to_matrix
+from lumigraph.geometry import multiply, rotated, to_matrix
 from lumigraph.methods.articulated_splatting import ArticulatedSplatting
 from lumigraph.methods.articulated_splatting.contact import bodies_of, contact_map, gaps
 from lumigraph.methods.articulated_splatting.skinned_cloud import skinned
@@ -59,6 +63,37 @@ def test_a_correction_turns_a_joint_in_its_parent():
     torch.testing.assert_close(motion.transforms(*motion.local(torch.tensor([1.0])))[0], found, atol=1e-5, rtol=0)
     network = BoneMotion(frame(), BoneNumbers("network", pose_width=4, pose_depth=1))
     torch.testing.assert_close(network.corrected(), network.quaternions, atol=1e-3, rtol=0)  # hardly any at first
+
+
+def test_poses_lose_their_noise_and_exact_ones_stay():
+    """Two joints that swing, one of them through the quaternion's change of sign, 5 degrees off at every moment."""
+    moments = torch.linspace(0, 1, 60)
+    angle = torch.stack([0.6 * (7 * moments).sin(), 2.5 + 1.5 * moments], 1)
+    exact = exponential(torch.nn.functional.pad(angle[..., None], (0, 2)).flatten(0, 1)).view(60, 2, 4)
+    exact[30:] *= -1
+    axes = torch.nn.functional.normalize(torch.randn(120, 3), dim=-1)
+    noisy = multiply(exact.flatten(0, 1), exponential(math.radians(5) * axes)).view(60, 2, 4)
+    found, same = (smoothed(turns, 0.1 * moments) for turns in (noisy, exact))
+
+    def error(turns: torch.Tensor) -> torch.Tensor:
+        return 2 * torch.rad2deg((turns * exact).sum(-1).abs().clamp_max(1).acos())
+
+    assert error(found).mean() < 2.5 and error(same).max() < 0.1
+
+
+def test_smooth_poses_begin_a_run_and_are_kept():
+    """Of the photographs' moments alone: the others are given as they are."""
+    angles = BEND * torch.tensor([0.0, 0.3, 0.1, 0.5, 0.4, 0.8, 0.6, 1.0])
+    moving = replace(
+        skeleton(), times=tuple(map(float, range(8))), poses=tuple(BonePose.of(bent(float(a))) for a in angles)
+    )
+    motion = BoneMotion(replace(frame(), skeleton=moving), BoneNumbers("table", pose_smoothing=True))
+    before, seen = motion.quaternions.clone(), torch.arange(8) < 6
+    data = Mock(Scene, cameras=Mock(Camera, time=torch.arange(7.0)), splits={"train": torch.arange(6)})
+    motion.begin(None, data, 0.0)
+    assert (motion.quaternions[seen] - before[seen]).abs().max() > 1e-3
+    assert torch.equal(motion.quaternions[~seen], before[~seen])
+    assert "quaternions" in motion.state_dict()
 
 
 def test_weights_begin_at_the_nearest_bone_and_sum_to_one():

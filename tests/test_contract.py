@@ -58,6 +58,7 @@ from lumigraph.paths.opening import opening_of_scene
 from lumigraph.run import Run, build
 from lumigraph.run.checkpoint import Checkpoints
 from lumigraph.training import fit
+from lumigraph.training.loop import rehearse
 
 STEPS, PAUSES, LATER = 24, (5, 18), 48
 SHOWN = 4  # the camera whose picture is looked at, a held-out one
@@ -118,6 +119,8 @@ SITTING = {"steps": STEPS, "show": False, "rehearsal": False, "log_every": 1}
 
 def train(run: Run, data: Any, device: str, **options) -> Method:
     method = run.new_method(device)
+    if not run.has_state:
+        rehearse(method, data, 0)  # which a budget of seconds begins with, and which changes nothing
     fit(method, data, run, **SITTING | options)
     return method
 

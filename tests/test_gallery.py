@@ -33,6 +33,13 @@ def test_a_page_has_picture_idea_and_figures(ball_folder, tmp_path, monkeypatch)
     assert room.gallery(["voxel-grid"], 0.01, tmp_path / "out", launch=again) == 0 and again.seen == []
 
 
+def test_the_model_of_captions_is_made_first(tmp_path, monkeypatch):
+    small = ("--pictures", "4", "--steps", "1", "--batch", "2", "--width", "2", "--embedding", "2")
+    monkeypatch.setattr(room, "CAPTION_NUMBERS", small)
+    assert room.prepare(set(), True, tmp_path, print, Here()) == 0
+    assert any((tmp_path / room.CAPTIONS).iterdir())
+
+
 def test_a_cell_that_fails_says_why(tmp_path, monkeypatch):
     piece = room.Showpiece(str(tmp_path / "nowhere"), "")
     monkeypatch.setattr(room, "SECTIONS", {"Grids": {"voxel-grid": piece}})

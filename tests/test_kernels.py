@@ -145,8 +145,8 @@ def test_reference_gradient_is_the_slope(name, case):
             return getattr(module(name), name)(*(given.get(i, x) for i, x in enumerate(inputs)))
 
     slopes = sum(x.numel() for x in leaves) * sum(x.numel() for x in truth(name, case)[: facts(name).outputs])
-    # Of more than so many slopes, those along one random direction have to do.
-    assert torch.autograd.gradcheck(function, leaves, fast_mode=slopes > 100_000)
+    # Of more than so many slopes, those along one random direction have to do: they take seconds.
+    assert torch.autograd.gradcheck(function, leaves, fast_mode=slopes > 20_000)
 
 
 def test_harmonics_are_orthonormal():

@@ -32,7 +32,7 @@ OBJECT, MOVING = "procedural:still-life,size=160,views=40", "procedural:jelly,si
 TOYS, CHAIRS = "procedural:toys,count=20,size=48,views=12", "procedural:chairs,count=20,size=48,views=12"
 RECORDING = "procedural:room,depth,views=60,size=120"
 EVAL_VIEWS = 3
-MIN_CAPTION_SECONDS = 60.0
+CAPTION_NUMBERS = ("--pictures", "600", "--steps", "300")  # a minute of one processor
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def gallery(
     cells = [cell_of(name, seconds, output) for name in SHOWPIECES if name in names]
     sources = {SHOWPIECES[name].source for name in names}
     guided = any(CAPTIONS in SHOWPIECES[name].options for name in names)
-    if code := prepare(sources, guided, seconds, output, tell, launch):
+    if code := prepare(sources, guided, output, tell, launch):
         return code
     if code := conduct(cells, CellSettings(eval_views=EVAL_VIEWS), output, tell, launch):
         return code
@@ -223,9 +223,7 @@ def cell_of(name: str, seconds: float, output: Path) -> Cell:
     return Cell(name, scene, source, Budget(None, seconds), views=piece.views, further=further)
 
 
-def prepare(
-    sources: set[str], guided: bool, seconds: float, output: Path, tell: Callable[[str], object], launch: Launch
-) -> int:
+def prepare(sources: set[str], guided: bool, output: Path, tell: Callable[[str], object], launch: Launch) -> int:
     """Make the data of methods that learn from files, where they are not there yet. Returns the exit code."""
     if MESH in sources and not (output / MESH).exists():
         import trimesh
@@ -239,8 +237,7 @@ def prepare(
         save_picture(output / PICTURE, scene.photograph(0).before(scene.frame.background), "benchmark")
     if guided and not (output / CAPTIONS).exists():
         tell("A model of captions, for the methods that learn from words")
-        lasting = f"{max(seconds, MIN_CAPTION_SECONDS):g}"
-        code = launch(["train", "captions", "--seconds", lasting, "--output", str(output / CAPTIONS)], output / LOG)
+        code = launch(["train", "captions", *CAPTION_NUMBERS, "--output", str(output / CAPTIONS)], output / LOG)
         if code in STOP_CODES:
             return code
         if code:

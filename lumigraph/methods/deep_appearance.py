@@ -191,6 +191,14 @@ class DeepAppearance(Method):
 
     # Learning
 
+    def compile_begin(self) -> None:
+        """On the copy that rehearses a step: one empty photograph in place of what `begin` unwraps."""
+        super().compile_begin()
+        self.meshes.rows = self.mean_mesh[None]
+        self.textures.rows = self.mean_texture.byte()[None]
+        shown = torch.zeros(1, 1, *self.mean_texture.shape[1:], dtype=torch.bool)
+        self._unwrapped = Unwrapped(self.textures.rows.cpu(), shown, torch.eye(1, 3), torch.zeros(1, dtype=torch.long))
+
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
         super().begin(data, seconds)
         times, number = moments_of(data)

@@ -7,12 +7,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.interpolate import make_smoothing_spline
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from ...datasets.scene import Frame
+from ...datasets.scene import Frame, Scene
 from ...datasets.skeleton import Skeleton, between_moments, local_of, posed, rigid_inverse, rigid_product
 from ...errors import LumigraphError
 from ...exchange.bones import SUFFIXES, read_motion
@@ -28,6 +30,7 @@ FALL = 0.05  # of the rate of corrections that is left at the end of the budget
 MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
 MIN_ANGLE = 1e-8  # radians, squared, against division by zero
 KEPT_CLIPS = 8  # files of poses that are kept in memory
+MIN_MOMENTS = 5  # that a smoothing spline goes through
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,9 @@ class BoneNumbers:
     pose_from: Share = 0.0  # share of the budget before corrections are learnt; later: a better body first
     pose_width: Width = 256  # channels of the network's layers
     pose_depth: Layers = 4  # its hidden layers
+    pose_smoothing: bool = (
+        False  # given poses lie on smooth curves, as smooth as cross-validation finds; exact ones stay
+    )
 
 
 class BoneMotion(Part):
@@ -46,6 +52,7 @@ class BoneMotion(Part):
 
     Every joint turns in its parent by the capture's rotation and a learnt one (Weng 2022, eq. 6); lengths of bones
     stay. Between two moments of the capture joints are interpolated.
+    quaternions: given rotations of joints in their parents; with `pose_smoothing` after it
     turns:    learnt rotation vectors of each moment's joints, radians, one after another, with "table"
     network:  angles of all joints to these, with "network"
     """
@@ -55,7 +62,6 @@ class BoneMotion(Part):
     quaternions: Tensor
     home: Tensor
     back: Tensor
-    given_angles: Tensor
 
     def __init__(self, frame: Frame, numbers: BoneNumbers):
         super().__init__()
@@ -65,12 +71,11 @@ class BoneMotion(Part):
         for name, value in (
             ("times", torch.tensor(skeleton.times)),
             ("positions", local[..., 3].float()),
-            ("quaternions", to_quaternion(local[..., :3]).float()),
             ("home", rigid_inverse(skeleton.rest.matrices).float()),
             ("back", to_quaternion(local_of(skeleton.parents, skeleton.rest.matrices)[..., :3].mT).float()),
         ):
             self.register_buffer(name, value, persistent=False)
-        self.register_buffer("given_angles", self.angles_of(self.quaternions), persistent=False)
+        self.register_buffer("quaternions", to_quaternion(local[..., :3]).float(), persistent=numbers.pose_smoothing)
         bones, n = len(skeleton), numbers
         self.turns = nn.Parameter(torch.zeros(len(skeleton.times) * bones, 3)) if n.pose_correction == "table" else None
         self.network: nn.Sequential | None = None
@@ -83,6 +88,20 @@ class BoneMotion(Part):
             self.network = nn.Sequential(*layers, last)
 
     # Corrections
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        """Smooth the poses of photographs, each joint over time, if the numbers say so."""
+        if not self.numbers.pose_smoothing or data.cameras.time is None:
+            return
+        seen = data.cameras.time[data.splits["train"]].unique().to(self.times)
+        rows = (self.times[:, None] - seen).abs().argmin(0).unique()
+        if len(rows) >= MIN_MOMENTS:
+            self.quaternions[rows] = smoothed(self.quaternions[rows], self.times[rows])
+
+    @property
+    def given_angles(self) -> Float[Tensor, "moment angle"]:
+        """Angles of all given poses: see `angles_of`."""
+        return self.angles_of(self.quaternions)
 
     def angles_of(self, turns: Float[Tensor, "moment bone 4"]) -> Float[Tensor, "moment angle"]:
         """Omega: rotation vectors of joints in their parents from their pose at rest, radians, but for roots."""
@@ -187,6 +206,21 @@ def clip_of(path: str, frame: Frame) -> BoneMotion:
     """Poses in a file for the bones of a scene, at its moments. Raises LumigraphError for a file without any."""
     file = Path(path).expanduser()
     return _clip(file, file.stat().st_mtime_ns if file.is_file() else 0, frame)
+
+
+def smoothed(turns: Float[Tensor, "moment bone 4"], times: Float[Tensor, " moment"]) -> Float[Tensor, "moment bone 4"]:
+    """Unit quaternions on smoothing splines over time, one for each number of each joint.
+
+    The weight of a spline's curvature is that of least generalised cross-validation (Wahba 1990, section 4.3): large
+    for errors that differ from moment to moment, and next to none for exact poses of a smooth motion.
+    """
+    flips = torch.where((turns[1:] * turns[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).cumprod(0)
+    even = torch.cat([turns[:1], turns[1:] * flips]).flatten(1).cpu().double().numpy()
+    place = (
+        (times / times.diff().median()).cpu().double().numpy()
+    )  # the search for the weight needs knots about 1 apart
+    fitted = np.stack([make_smoothing_spline(place, column)(place) for column in even.T], 1)
+    return normalize(torch.from_numpy(fitted).to(turns).view_as(turns), dim=-1)
 
 
 def exponential(omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 4"]:

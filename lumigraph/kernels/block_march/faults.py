@@ -8,7 +8,7 @@ FAULTS = {
     "empty voxels as the first row": ("cpu", "corners", "count += row >= 0", "count += 1"),
     "a step as long as a straight one": ("cpu", "later", "if radius <= ball", "if True"),
     "what is far is left where it is": ("cpu", "placed", "(TWO - share)", "TWO"),
-    "gradient of the place without contraction": ("cpu", "_owed", "t, ball)", "t, ZERO)"),
+    "gradient of a place contracted too far": ("cpu", "_owed", "t, ball)", "t, ball / 2)"),
     "steps that do not shorten sideways": ("gpu", "_later", "4 * aside", "0 * aside"),
     "gradient of the place without contraction there": ("gpu", "_backward", "ball, CURVED)", "ball, False)"),
     "an apron too many": ("gpu", "_cell_of", "+ 1.0", "+ 2.0"),

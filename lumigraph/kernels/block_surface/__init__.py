@@ -99,7 +99,7 @@ def case_table(device: str = "cpu") -> tuple[Tensor, Tensor]:
 
 def cases(generator: torch.Generator):
     """Inputs that every engine must agree on: no block, one, a ball in loose blocks, every case of a cube."""
-    for count, reach, least in [(0, 1, 0.0), (1, 1, 0.0), (3, 1, 0.5), (8, 1, 0.0)]:
+    for count, reach, least in [(0, 1, 0.0), (1, 1, 0.0), (3, 1, 0.5), (4, 1, 0.0)]:
         yield *a_ball(count, reach, generator), least
     voxels, blocks, table = a_ball(3, 1, generator)
     voxels = voxels.clone()

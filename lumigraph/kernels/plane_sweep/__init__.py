@@ -76,7 +76,8 @@ def cases(generator: torch.Generator):
     yield reference, 0 * trust, neighbours, its_trust, warps, hypotheses, window, best
     yield reference, trust, neighbours, 0 * its_trust, warps, hypotheses, window, best
     yield reference, trust, neighbours, its_trust, -warps, hypotheses, window, best  # all of it lies behind
-    far = warps.clone()
+    reference, trust, neighbours, its_trust, warps, hypotheses, *_ = _inputs((4, 6), (5, 4), 2, 2, 3, 1, generator)
+    everywhere, there, far = torch.ones_like(trust), torch.ones_like(its_trust), warps.clone()
     far[0, 2, 3], far[1, :2, 3] = -2.5, 1e9  # some of it lies behind, or nowhere near the picture
     yield reference, everywhere, neighbours, there, far, hypotheses, window, 2
 

@@ -79,7 +79,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         """A smaller cloud without view dependence, a coarser volume, and higher rates for few steps."""
         c = Config(sh_degree=0, initial_gaussians=6000, half_resolution_until=0.3)
         c = replace(c, refine=RefineNumbers(30_000, cap_ramp=True), rates=RateNumbers(most_haste=4.0))
-        return replace(c, weights=replace(c.weights, weight_cells=24))
+        return replace(c, weights=replace(c.weights, weight_cells=24), bones=replace(c.bones, pose_smoothing=True))
 
     @classmethod
     def smallest(cls) -> Any:

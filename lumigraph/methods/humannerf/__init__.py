@@ -78,7 +78,7 @@ class HumanNeRF(Articulated, FieldMethod):
         c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
         c = replace(c, table=replace(c.table, sh_bands=1), decay_start=0.3)
         c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        c = replace(c, bones=BoneNumbers("table", pose_lr=2e-3, pose_from=0.1))
+        c = replace(c, bones=BoneNumbers("table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True))
         c = replace(c, weights=WeightNumbers(24, 0, 1e-2))
         return replace(c, nonrigid=NonRigidNumbers(2, 32, 1, 4, 0.3, 0.7, 1e-3))
 
