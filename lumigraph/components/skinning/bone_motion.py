@@ -31,6 +31,7 @@ MIN_OUTPUT = 1e-5  # weights of the correction network's last layer at first
 MIN_ANGLE = 1e-8  # radians, squared, against division by zero
 KEPT_CLIPS = 8  # files of poses that are kept in memory
 MIN_MOMENTS = 5  # that a smoothing spline goes through
+SMOOTHINGS = 10  # over the budget
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class BoneMotion(Part):
     Every joint turns in its parent by the capture's rotation and a learnt one (Weng 2022, eq. 6); lengths of bones
     stay. Between two moments of the capture joints are interpolated.
     quaternions: given rotations of joints in their parents; with `pose_smoothing` after it
+    seen:     moments with photographs, which are smoothed;  smoothings: number of them that were due so far
     turns:    learnt rotation vectors of each moment's joints, radians, one after another, with "table"
     network:  angles of all joints to these, with "network"
     """
@@ -62,6 +64,8 @@ class BoneMotion(Part):
     quaternions: Tensor
     home: Tensor
     back: Tensor
+    seen: Tensor
+    smoothings: Tensor
 
     def __init__(self, frame: Frame, numbers: BoneNumbers):
         super().__init__()
@@ -75,7 +79,12 @@ class BoneMotion(Part):
             ("back", to_quaternion(local_of(skeleton.parents, skeleton.rest.matrices)[..., :3].mT).float()),
         ):
             self.register_buffer(name, value, persistent=False)
-        self.register_buffer("quaternions", to_quaternion(local[..., :3]).float(), persistent=numbers.pose_smoothing)
+        for name, value in (
+            ("quaternions", to_quaternion(local[..., :3]).float()),
+            ("seen", torch.zeros(len(skeleton.times), dtype=torch.bool)),
+            ("smoothings", torch.zeros((), dtype=torch.long)),
+        ):
+            self.register_buffer(name, value, persistent=numbers.pose_smoothing)
         bones, n = len(skeleton), numbers
         self.turns = nn.Parameter(torch.zeros(len(skeleton.times) * bones, 3)) if n.pose_correction == "table" else None
         self.network: nn.Sequential | None = None
@@ -90,13 +99,25 @@ class BoneMotion(Part):
     # Corrections
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        """Smooth the poses of photographs, each joint over time, if the numbers say so."""
-        if not self.numbers.pose_smoothing or data.cameras.time is None:
-            return
-        seen = data.cameras.time[data.splits["train"]].unique().to(self.times)
-        rows = (self.times[:, None] - seen).abs().argmin(0).unique()
-        if len(rows) >= MIN_MOMENTS:
-            self.quaternions[rows] = smoothed(self.quaternions[rows], self.times[rows])
+        if self.numbers.pose_smoothing and data.cameras.time is not None:
+            times = data.cameras.time[data.splits["train"]].unique().to(self.times)
+            rows = (self.times[:, None] - times).abs().argmin(0).unique()
+            self.seen[rows] = len(rows) >= MIN_MOMENTS
+            self.smooth()
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        if self.numbers.pose_smoothing and progress * SMOOTHINGS >= self.smoothings + 1:
+            self.smoothings += 1
+            self.smooth()
+
+    @torch.no_grad()
+    def smooth(self) -> None:
+        """Smooth the poses of photographs with their corrections so far, each joint over time. A network's corrections
+        follow from the given poses, so those are smoothed once."""
+        if self.seen.any() and (self.network is None or not self.smoothings):
+            self.quaternions[self.seen] = smoothed(self.corrected()[self.seen], self.times[self.seen])
+            if self.turns is not None:
+                self.turns.view(len(self.times), -1)[self.seen] = 0
 
     @property
     def given_angles(self) -> Float[Tensor, "moment angle"]:
