@@ -16,9 +16,9 @@ from .depth_map import back_project as back_project
 from .depth_map import free as free
 from .depth_map import fused_colours as fused_colours
 from .depth_map import hidden as hidden
+from .depth_map import measurements as measurements
 from .depth_map import render_depth_maps as render_depth_maps
 from .depth_map import surface_points as surface_points
-from .depth_map import unmeasured as unmeasured
 from .sensor import sensor_faults as sensor_faults
 from .sensor import trust_of as trust_of
 from .voxel_blocks import VoxelBlocks as VoxelBlocks

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d
@@ -378,15 +378,17 @@ def hidden(
     return ~_confirmed(points, tracked, needed, lambda seen, some: seen.sees(some, tolerance, tolerance))
 
 
-def unmeasured(points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap]) -> Bool[Tensor, " point"]:
-    """Mask of points in whose direction two cameras (or the only one) measured nothing: the depth there is NaN."""
-    needed = min(MIN_FREE_VIEWS, len(depth_maps))
-
-    def blind(seen: DepthMap, some: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-        pixels, valid, _ = seen.project(some)
-        return seen.inside(pixels, valid) & seen.at_pixels(seen.depth, pixels).isnan()
-
-    return _confirmed(points, depth_maps, needed, blind)
+def measurements(
+    points: Float[Tensor, "point 3"], depth_maps: Iterable[DepthMap]
+) -> tuple[Int[Tensor, " point"], Int[Tensor, " point"]]:
+    """Number of cameras that measured in a point's direction, be it hidden or not, and of those with NaN there."""
+    measured, left_out = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
+    for seen in depth_maps:
+        pixels, valid, _ = seen.project(points)
+        inside, known = seen.inside(pixels, valid), ~seen.at_pixels(seen.depth, pixels).isnan()
+        measured += inside & known
+        left_out += inside & ~known
+    return measured, left_out
 
 
 def agreed(

@@ -18,7 +18,7 @@ from ..camera import Camera
 from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Scene
-from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, render_depth_maps, unmeasured
+from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, measurements, render_depth_maps
 from ..errors import LumigraphError
 from ..geometry import evenly
 from ..method import Method
@@ -48,6 +48,8 @@ PROBE_CELLS = 160  # probes along it that locate the surface
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
 TRUNCATION_CELLS = 5  # cells from the surface that depth maps are fused over
 HIDDEN_CELLS = 2  # cells behind the first surface from which on a picture does not show it
+MIN_SHOWN_SHARE = 0.25  # of pictures with masks, that show some of each piece of a closed surface
+MIN_LEFT_OUT = 2  # pictures that leave out what none sees, from which on it is empty
 CUT_ROUNDS = 30  # rounds of diffusion in which the line where an open surface is cut becomes even
 INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
 ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surface
@@ -132,6 +134,8 @@ def extract_mesh(
         points = torch.from_numpy(vertices).float()
         if closed:
             seen_well = ~hidden(points, learnt, Tolerance(2 * grid.cell)).numpy()
+            if masked(learnt):
+                seen_well &= (measurements(points, learnt)[0] >= MIN_SHOWN_SHARE * len(learnt)).numpy()
         else:
             confirmed = agreed(points, learnt, Tolerance(TRUNCATION_CELLS * grid.cell)).numpy()
             seen_well = majority(confirmed, triangles, CUT_ROUNDS)
@@ -162,6 +166,11 @@ def without_masked(depth_maps: Sequence[DepthMap], photographs: Scene, chosen: S
     """Depth maps of these training cameras, NaN in pixels that the photographs' masks leave out of learning."""
     masks = [photographs.images.mask(int(photographs.splits["train"][i])) for i in chosen]
     return [seen if mask is None else seen.within(mask) for seen, mask in zip(depth_maps, masks, strict=True)]
+
+
+def masked(depth_maps: Sequence[DepthMap]) -> bool:
+    """True if some of them have pixels without a measurement."""
+    return any(bool(seen.depth.isnan().any()) for seen in depth_maps)
 
 
 def own_mesh(method: Method, holds: Holds, keep: float, smooth: int, faces: int | None) -> Mesh:
@@ -239,18 +248,21 @@ Holds = Callable[[Float[Tensor, "point 3"]], Bool[Tensor, " point"]]
 def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Value:
     """A function of points: 0 at the surface of the fused depth maps, 1 well inside, -1 well outside.
 
-    closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN). What
-            lies in the direction of pixels without a measurement is empty then, as it is around a silhouette
+    Empty is also what more of the pictures leave out than show, and what two leave out while nobody sees it: the space
+    around a silhouette.
+    closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
     """
     fused = TSDF(depth_maps, Tolerance(TRUNCATION_CELLS * cell))
+    some_masked = masked(depth_maps)
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         distance, _, pictured = fused(points)
-        if not closed:
-            return -distance
-        behind = distance.isnan() & pictured
-        behind[behind.clone()] = ~unmeasured(points[behind], depth_maps)
-        return torch.where(distance.isnan(), torch.where(behind, 1.0, -1.0), -distance)
+        found = torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), -distance)
+        if not some_masked:
+            return found
+        measured, left_out = measurements(points, depth_maps)
+        empty = (left_out > measured) | (distance.isnan() & (left_out >= MIN_LEFT_OUT))
+        return torch.where(empty, -1.0 if closed else math.nan, found)
 
     return value
 
