@@ -272,7 +272,7 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> N
     desk.wait_for_timeout(10_000)
     walk.shot(desk, "7-crop-desk")
     scene.get_by_role("button", name="Save", exact=True).filter(visible=True).first.click()
-    part = until(lambda: next((one for one in walk.detail(key)["runs"] if one["name"].endswith(".ply")), None), 600)
+    part = until(lambda: next((one for one in walk.detail(key)["runs"] if one["name"].endswith("-part")), None), 600)
     walk.mark("the crop is saved")
     desk.get_by_label("Version").filter(has_text=part["name"]).wait_for()
     desk.get_by_role("button", name="Make Web page").click()

@@ -292,10 +292,11 @@ def test_what_a_command_reads_stays_even_where_it_may_overwrite(home, capsys):
 
 
 def test_saving_in_the_viewer_replaces_nothing(home):
-    from lumigraph.commands.view import saver
+    from lumigraph.commands.view import saver, subject_of
     from lumigraph.run import open_any
 
     opened = open_any(home / "gs")
+    assert subject_of(opened).part_ending == ""  # a new run, with cameras and background
     save, nothing = saver(opened), {"crop": torch.zeros(len(opened.method().gaussians()), dtype=torch.bool)}
     (home / "mine.ply").write_text("precious")
     with pytest.raises(LumigraphError, match=r"mine\.ply is there already"):
@@ -305,6 +306,7 @@ def test_saving_in_the_viewer_replaces_nothing(home):
     assert (home / "mine.ply").read_text() == "precious" and save("ours.ply", nothing).endswith("ours.ply")
     with pytest.raises(LumigraphError, match="is there already"):
         save("ours.ply", nothing)
+    assert subject_of(open_any(home / "ours.ply")).part_ending == ".ply"
 
 
 def test_what_lies_among_checkpoints_stays(ball_run, tmp_path):

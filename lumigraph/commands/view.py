@@ -88,8 +88,11 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: An
     finished: False during training, when no part of it can be saved
     page:     function that makes a page on which the browser draws it, if possible
     """
+    from .. import methods
+    from ..run import Run
     from ..viewer import Subject
 
+    learns_on = isinstance(opened, Run) and hasattr(methods.find(opened.method_name), "prune")
     return Subject(
         opened.title,
         opened.frame,
@@ -99,6 +102,7 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: An
         opened.open_scene,
         opened.metrics(),
         saver(opened) if finished else None,
+        "" if learns_on else ".ply",
         page,
         set_scale=opened.set_scale if finished else None,
     )

@@ -71,8 +71,8 @@ class CropPanel:
             self._remove = gui.add_button(REMOVE, visible=False)
             self._remove.on_click(lambda _: self.remove(not self.cleaned))
             if keep is not None:
-                name = f"{shared.subject.title}-part.ply"
-                hint = "Of a splat file, .ply or .spz, or of a folder for a new run"
+                name = f"{shared.subject.title}-part{shared.subject.part_ending}"
+                hint = "Of a new run, or of a splat file: .ply or .spz"
                 self._name = gui.add_text("Name", name, hint=hint)
                 gui.add_button("Save").on_click(lambda _: self._save())
                 self._about = gui.add_markdown("")

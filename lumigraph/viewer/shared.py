@@ -88,6 +88,7 @@ class Subject:
     rows:           of metrics.jsonl, as far as the method has been trained
     keep:           saves the cloud without some Gaussians under a name, and returns its path; None where nothing can be
                     saved
+    part_ending:    of the name that is offered for a part: empty for a new run, which has cameras and background too
     page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
     behind:         colours and floor of a scene under the open sky
     exporter:       exports the scene; None where nothing can be exported
@@ -102,6 +103,7 @@ class Subject:
     open_scene: Callable[[], Scene] | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
     keep: Keep | None = None
+    part_ending: str = ".ply"
     page: Callable[[], bytes] | None = None
     behind: Backdrop | None = None
     exporter: Exporter | None = None

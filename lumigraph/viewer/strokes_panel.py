@@ -63,7 +63,7 @@ class StrokesPanel:
             self._undo = gui.add_button("Undo", visible=False)
             self._about = gui.add_markdown("")
             if keep is not None:
-                self._name = gui.add_text("Name", f"{shared.subject.title}-object.ply")
+                self._name = gui.add_text("Name", f"{shared.subject.title}-object{shared.subject.part_ending}")
                 gui.add_button("Save the part").on_click(lambda _: self._save(part=True))
                 gui.add_button("Save the rest").on_click(lambda _: self._save(part=False))
         self._drawing = False
