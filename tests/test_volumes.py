@@ -162,6 +162,7 @@ def test_the_viewer_leads_to_a_page(tmp_path, page, faults):
         link = page.get_by_role("link", name="Drawn by this browser")
         with page.context.expect_page() as opened:
             link.click()
+        opened.value.wait_for_load_state()
         opened.value.evaluate("lumigraph.ready")
         opened.value.wait_for_selector("body.open canvas")
         assert opened.value.url.startswith(viewer.address.url.partition("?")[0])
