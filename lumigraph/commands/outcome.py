@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 from ..budget import QUALITIES, Budget
@@ -27,8 +28,8 @@ ABOUT_RESIDUALS = "small renderings, each after a gain and an offset per colour"
 NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "export": "make a page to share"}
 
 
-def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
-    """Print the state of a Run after an Outcome, and the next commands."""
+def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = nullcontext) -> None:
+    """Print the state of a Run after an Outcome, and the next commands. turn: see `examine`"""
     from ..evaluation.photographs import RESULT_FILE
     from ..evaluation.tracking import tracks
     from ..metrics.rows import last_psnr
@@ -58,7 +59,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
         rows["cameras moved by"] = str(moved)
     enough = state.step >= method.steps_for("draft", data)
     more = more_time(run.folder, budget) if enough else typed("resume", run.folder, "--quality", "draft")
-    checked, gap = examined(run, method, data), 0.0
+    checked, gap = examined(run, method, data, turn), 0.0
     learnt, held_out = ([one.psnr for one in checked.of(split)] for split in ("train", "test"))
     if learnt and held_out and not method.moves_cameras:  # poses of held-out photographs are not learnt
         psnr, other = (sum(some) / len(some) for some in (learnt, held_out))
@@ -102,13 +103,13 @@ def show_tracking(run: Any, outcome: Any, method: Any, data: Any, processor_seco
     show(rows | (next_commands(run) if outcome.finished else {}))
 
 
-def examined(run: Any, method: Method, data: Any) -> Examined:
+def examined(run: Any, method: Method, data: Any, turn: Any) -> Examined:
     """Findings on the photographs of a run, which are written into it; a fault of their files is a warning."""
     from ..evaluation.photographs import Examined, examine
 
     try:
         compared = isinstance(data, Scene) and not issubclass(method.learns_from, BlockWorld)
-        return examine(run, method, data) if compared else Examined()
+        return examine(run, method, data, turn) if compared else Examined()
     except LumigraphError as fault:
         say(f"warning: the photographs could not be examined: {fault}")
         return Examined()

@@ -143,6 +143,18 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
         yield viewer
 
 
+def shared_turns(viewer: Any, method: Any) -> Any:
+    """End of training for a viewer, whose clients render between our own renderings from now on. Returns the context
+    that each of those needs."""
+    from ..evaluation.tracking import tracks
+
+    if viewer is None or tracks(method):  # which renders all frames of its report at once
+        return contextlib.nullcontext
+    method.eval()
+    viewer.end_training()
+    return viewer.turns.turn
+
+
 def keep_showing(viewer: Any, signal: int | None) -> None:
     """Serve the viewer after training until Ctrl-C, unless Ctrl-C ended the training."""
     if viewer is not None and signal is None:

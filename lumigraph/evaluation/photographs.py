@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -41,6 +42,7 @@ SURE_STRENGTH = 0.2  # of cleaning, at which floaters are probable
 MIN_FLOATERS = 1e-3  # share of the Gaussians, from which on floaters are a finding
 SHOWN = 5  # worst photographs in the report
 RESULT_FILE, SHEET_FILE = "photographs.json", "photographs.png"
+Turn = Callable[[], AbstractContextManager[None]]
 
 
 class Compared(NamedTuple):
@@ -63,13 +65,14 @@ class Examined:
         return sorted((one for one in self.residuals if one.split == split), key=lambda one: one.psnr)
 
 
-def examine(run: Run, method: Method, scene: Scene) -> Examined:
+def examine(run: Run, method: Method, scene: Scene, turn: Turn = nullcontext) -> Examined:
     """Findings on the photographs of a run, worst first, and residuals; written to RUN/photographs.json, the
     five worst photographs with rendering, error and depth to RUN/photographs.png.
 
+    turn: context of each rendering, where others render too: `viewer.turns.Turns.turn`
     Raises LumigraphError where the source's files have become unreadable.
     """
-    compared = compare_all(method, scene)
+    compared = compare_all(method, scene, turn)
     residuals = [one.residual for one in compared]
     if Path(scene.source).expanduser().is_dir():
         capture = read_capture(scene.source, run.settings.scene.options.get("reader"))
@@ -82,9 +85,8 @@ def examine(run: Run, method: Method, scene: Scene) -> Examined:
     result = Examined(found, residuals)
     write_json(run.folder / RESULT_FILE, asdict(result), ours=True)
     if compared:
-        save_picture(
-            run.folder / SHEET_FILE, sheet(method, scene, worst(compared, found), found, len(compared)), ours=True
-        )
+        chosen = worst(compared, found)
+        save_picture(run.folder / SHEET_FILE, sheet(method, scene, chosen, found, len(compared), turn), ours=True)
     return result
 
 
@@ -112,7 +114,7 @@ def examined(run: Run) -> Examined | None:
 
 
 @torch.no_grad()
-def compare_all(method: Method, scene: Scene) -> list[Compared]:
+def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[Compared]:
     """Each photograph beside its rendering through the refined camera, with its own exposure or appearance where the
     method has learnt one; empty for fewer than four photographs."""
     splits = {int(i): name for name, index in scene.splits.items() for i in index}
@@ -120,11 +122,13 @@ def compare_all(method: Method, scene: Scene) -> list[Compared]:
     if len(chosen) < MIN_JUDGED:
         return []
     method.eval()
-    chosen, side = affordable(method, scene.cameras[chosen[0]], chosen)
+    with turn():
+        chosen, side = affordable(method, scene.cameras[chosen[0]], chosen)
     found: list[Compared] = []
     maps: list[DepthMap] = []
     for index in track(chosen, "Examining photographs", len(chosen)):
-        shot, camera, seen = rendered(method, scene, index, side)
+        with turn():
+            shot, camera, seen = rendered(method, scene, index, side)
         truth = shot.before(scene.frame.background)
         mask = torch.ones(truth.shape[:2], dtype=torch.bool) if shot.mask is None else shot.mask
         if not mask.any():
@@ -195,13 +199,14 @@ def worst(compared: Sequence[Compared], found: Sequence[Finding]) -> list[Compar
 
 @torch.no_grad()
 def sheet(
-    method: Method, scene: Scene, compared: Sequence[Compared], found: Sequence[Finding], count: int
+    method: Method, scene: Scene, compared: Sequence[Compared], found: Sequence[Finding], count: int, turn: Turn
 ) -> Image.Image:
     """Contact sheet of photographs, renderings, errors and depths, each with its faults, rendered anew at a larger
     size. count: photographs that were rendered before, in about the same time"""
     rows = []
     for residual, number, side in compared:
-        shot, _, seen = rendered(method, scene, number, min(SHEET_SIDE, side * (count / len(compared)) ** 0.5))
+        with turn():
+            shot, _, seen = rendered(method, scene, number, min(SHEET_SIDE, side * (count / len(compared)) ** 0.5))
         faults = dict.fromkeys(f.fault for f in found if f.photograph == residual.photograph)
         text = f"{residual.photograph} · {residual.psnr:.2f} dB · {', '.join(faults) or 'no fault found'}"
         depth = colour_depth(seen.depth, seen.opacity, depth_range(seen.depth, seen.opacity))
