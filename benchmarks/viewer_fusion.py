@@ -1,8 +1,8 @@
 """The viewer in a headless Chromium while depth maps are fused: growth of the surface, and the longest stall.
 
-    python benchmarks/viewer_fusion.py SCAN [--output fusing] [--chromium /usr/bin/chromium]
+    python benchmarks/viewer_fusion.py SCAN [--output fusing] [--chromium /usr/bin/chromium] [--voxel-size 0.006]
 
-SCAN is what `lumigraph train tsdf-fusion` takes. Written: a strip of screenshots, the share of the window that shows
+SCAN is what `lumigraph train tsdf-fusion` takes, as are further options. Written: a strip of screenshots, the share of the window that shows
 a surface in each, the longest time between two pictures that the browser received while frames were fused, and the
 longest time in which the page itself did not draw.
 """
@@ -24,7 +24,7 @@ from viewer_drag import browser
 
 WINDOW = 640, 480
 MIN_PICTURE = 2000  # bytes of a message that holds a picture
-SHOTS_EVERY = 1.5  # seconds
+SHOTS_EVERY = 4.0  # seconds; a screenshot itself holds the page up
 GAPS = """() => { window.longest = 0; let last = performance.now();
   const tick = now => {
     window.longest = Math.max(window.longest, now - last); last = now; requestAnimationFrame(tick); };
@@ -36,11 +36,11 @@ def main() -> None:
     parser.add_argument("scan")
     parser.add_argument("--output", type=Path, default=Path("fusing"))
     parser.add_argument("--chromium", type=Path, default=Path("/usr/bin/chromium"))
-    given = parser.parse_args()
+    given, options = parser.parse_known_args()
     given.output.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as place, browser(given.chromium) as chromium:
         run = Path(place) / "run"
-        command = [sys.executable, "-u", "-m", "lumigraph", "train", "tsdf-fusion", given.scan]
+        command = [sys.executable, "-u", "-m", "lumigraph", "train", "tsdf-fusion", given.scan, *options]
         process = subprocess.Popen([*command, "--view", "--port", "8190", "--output", str(run)], stdout=subprocess.PIPE)
         assert process.stdout is not None
         address = None
