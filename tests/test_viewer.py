@@ -755,6 +755,8 @@ def test_view_and_train_view(ball_folder, tmp_path, capsys):
             if message["type"] == "BackgroundImageMessage" and message["rgb_data"] and seen:
                 seen.append("picture")
                 break
+        until((folder / "photographs.json").exists)  # meanwhile the photographs are examined
+        time.sleep(1)  # and the report is printed
         client.close()
 
     thread = interrupt_after(watch)
