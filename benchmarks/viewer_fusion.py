@@ -2,9 +2,9 @@
 
     python benchmarks/viewer_fusion.py SCAN [--output fusing] [--chromium /usr/bin/chromium] [--voxel-size 0.006]
 
-SCAN is what `lumigraph train tsdf-fusion` takes, as are further options. Written: a strip of screenshots, the share of the window that shows
-a surface in each, the longest time between two pictures that the browser received while frames were fused, and the
-longest time in which the page itself did not draw.
+SCAN and further options are those of `lumigraph train tsdf-fusion`. Written: a strip of screenshots, the share of the
+window that shows a surface in each, the longest time between two pictures that the browser received while frames were
+fused, and the longest time in which the page itself did not draw.
 """
 
 from __future__ import annotations
