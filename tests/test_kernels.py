@@ -14,7 +14,7 @@ from proofs import kept
 
 from lumigraph import kernels, metrics
 
-pytestmark = budget("kernels", 80)
+pytestmark = budget("kernels", 100)
 
 DIFFERENTIABLE = [name for name in OPERATIONS if facts(name).differentiable]
 
