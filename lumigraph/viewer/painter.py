@@ -108,9 +108,9 @@ class Painter:
             elif not best:
                 best = self._refine(requested)
             elif self._step() != step and self._turns.claim_refresh():
-                step = self._step()
+                step, before = self._step(), self._turns.rendered
                 self._try(self._longest, self._while_current(requested))
-                self._turns.refreshed(time.perf_counter() - now)
+                self._turns.refreshed(self._turns.rendered - before)
             else:
                 if self._requested == requested:
                     self.settled.set()

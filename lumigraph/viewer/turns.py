@@ -23,6 +23,7 @@ class Turns:
 
     training:   whether someone trains; `give_way` must then be called between steps, until `end_training`
     idle_share: of the time that clients at rest may take from training: `Method.idle_render_share`
+    rendered:   seconds of all turns so far, without waiting for them
     """
 
     def __init__(self, training: bool = False, idle_share: float = 1.0):
@@ -31,7 +32,7 @@ class Turns:
         self._waiting: deque[object] = deque()
         self._open = False  # training gives way at the moment
         self._busy = False  # a rendering has its turn
-        self._served = 0
+        self._served, self.rendered = 0, 0.0
         self._own_until = 0.0  # until then training need not give way
         self._idle_until = 0.0  # until then no client at rest may request a newer picture
 
@@ -57,6 +58,7 @@ class Turns:
             end = time.perf_counter()
             with self._condition:
                 self._busy, self._served = False, self._served + 1
+                self.rendered += end - begin
                 self._open = self._open and self.paused  # the next one has to wait until training gives way again
                 self._own_until = end + (end - begin) * (1 / RENDER_SHARE - 1)
                 self._condition.notify_all()
@@ -95,7 +97,7 @@ class Turns:
             return True
 
     def refreshed(self, seconds: float) -> None:
-        """Take note of a refresh that is over, and of how long it took."""
+        """Take note of a refresh that is over, and of how long it rendered."""
         with self._condition:
             self._idle_until = time.perf_counter() + seconds / self._idle_share
 
