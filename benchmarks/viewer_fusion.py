@@ -2,7 +2,7 @@
 
     python benchmarks/viewer_fusion.py SCAN [--output fusing] [--chromium /usr/bin/chromium] [--voxel-size 0.006]
 
-SCAN and further options are those of `lumigraph train tsdf-fusion`. Written: a strip of screenshots, the share of the
+SCAN and --voxel-size are those of `lumigraph train tsdf-fusion`. Written: a strip of screenshots, the share of the
 window that shows a surface in each, the longest time between two pictures that the browser received while frames were
 fused, and the longest time in which the page itself did not draw.
 """
@@ -36,7 +36,9 @@ def main() -> None:
     parser.add_argument("scan")
     parser.add_argument("--output", type=Path, default=Path("fusing"))
     parser.add_argument("--chromium", type=Path, default=Path("/usr/bin/chromium"))
-    given, options = parser.parse_known_args()
+    parser.add_argument("--voxel-size", type=float, help="smaller: slower, so that more is seen of it")
+    given = parser.parse_args()
+    options = ["--voxel-size", str(given.voxel_size)] if given.voxel_size else []
     given.output.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as place, browser(given.chromium) as chromium:
         run = Path(place) / "run"
