@@ -82,7 +82,7 @@ def test_poses_lose_their_noise_and_exact_ones_stay():
 
 
 def test_smooth_poses_begin_a_run_and_are_kept():
-    """Of the photographs' moments alone: the others are given as they are."""
+    """Smoothing changes moments of photographs alone."""
     angles = BEND * torch.tensor([0.0, 0.3, 0.1, 0.5, 0.4, 0.8, 0.6, 1.0])
     moving = replace(
         skeleton(), times=tuple(map(float, range(8))), poses=tuple(BonePose.of(bent(float(a))) for a in angles)

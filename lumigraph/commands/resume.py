@@ -75,7 +75,7 @@ class Resume:
         from ..run.derived import Inferred
         from ..training import fit
         from .outcome import show_outcome
-        from .view import keep_showing, shared_turns, watching
+        from .view import end_training, keep_showing, watching
 
         if run.compressed:
             raise LumigraphError(f"{run.folder} was compressed and cannot be resumed; resume the run it was made of")
@@ -95,7 +95,7 @@ class Resume:
             run.set_budget(**budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as watch:
             outcome = fit(method, data, run, budget=budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
-            show_outcome(run, outcome, method, data, shared_turns(watch, method))
+            show_outcome(run, outcome, method, data, end_training(watch, method))
             keep_showing(watch if self.stay else None, outcome.signal)
         return exit_code(outcome.signal)
 

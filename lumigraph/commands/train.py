@@ -253,7 +253,7 @@ class Train:
         from ..run import Run, build, check_new
         from ..training import fit
         from .outcome import show_outcome
-        from .view import keep_showing, shared_turns, watching
+        from .view import end_training, keep_showing, watching
 
         blocks: BlockOptions | None = getattr(self, "blocks", None)
         if blocks is not None and (code := blocks.run(self)) is not None:
@@ -288,7 +288,7 @@ class Train:
             with run.kept_if_learnt():
                 looking = viewer or watch
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
-            show_outcome(run, outcome, method, data, shared_turns(viewer, method))
+            show_outcome(run, outcome, method, data, end_training(viewer, method))
             keep_showing(viewer if self.stay else None, outcome.signal)
         return exit_code(outcome.signal)
 

@@ -143,12 +143,12 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
         yield viewer
 
 
-def shared_turns(viewer: Any, method: Any) -> Any:
-    """End of training for a viewer, whose clients render between our own renderings from now on. Returns the context
-    that each of those needs."""
+def end_training(viewer: Any, method: Any) -> Any:
+    """Let a viewer's clients render between our own renderings from now on. Returns the context that each of those
+    needs."""
     from ..evaluation.tracking import tracks
 
-    if viewer is None or tracks(method):  # which renders all frames of its report at once
+    if viewer is None or tracks(method):  # a report on tracking renders without turns
         return contextlib.nullcontext
     method.eval()
     viewer.end_training()

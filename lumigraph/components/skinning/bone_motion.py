@@ -43,9 +43,7 @@ class BoneNumbers:
     pose_from: Share = 0.0  # share of the budget before corrections are learnt; later: a better body first
     pose_width: Width = 256  # channels of the network's layers
     pose_depth: Layers = 4  # its hidden layers
-    pose_smoothing: bool = (
-        False  # given poses lie on smooth curves, as smooth as cross-validation finds; exact ones stay
-    )
+    pose_smoothing: bool = False  # smooth given poses over time, as far as cross-validation finds; exact ones stay
 
 
 class BoneMotion(Part):
@@ -237,9 +235,7 @@ def smoothed(turns: Float[Tensor, "moment bone 4"], times: Float[Tensor, " momen
     """
     flips = torch.where((turns[1:] * turns[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).cumprod(0)
     even = torch.cat([turns[:1], turns[1:] * flips]).flatten(1).cpu().double().numpy()
-    place = (
-        (times / times.diff().median()).cpu().double().numpy()
-    )  # the search for the weight needs knots about 1 apart
+    place = (times / times.diff().median()).cpu().double().numpy()  # the weight's search needs knots about 1 apart
     fitted = np.stack([make_smoothing_spline(place, column)(place) for column in even.T], 1)
     return normalize(torch.from_numpy(fitted).to(turns).view_as(turns), dim=-1)
 
