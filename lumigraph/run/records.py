@@ -22,6 +22,7 @@ from ..geometry import RIGID_TOLERANCE
 from ..metrics import Score
 
 MAX_PIXELS = 10**9  # of one picture
+COMPARED = "views", "shapes", "renderings"  # kinds of what an evaluation compares, of which a protocol counts one
 MAX_NAMES = 3  # photographs that a warning names
 
 
@@ -40,12 +41,14 @@ class Line:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Evaluation protocol in eval.json, the fields in use: number of compared views or shapes, total, split."""
+    """Evaluation protocol in eval.json, the fields in use: number of compared views, shapes or renderings, total,
+    split."""
 
     split: str
     of: Tally = 0
     views: Tally | None = None
     shapes: Tally | None = None
+    renderings: Tally | None = None
     members: Tally | None = None
     resolution: str | list[str] = ""
     background: list[float] | None = None
@@ -54,8 +57,13 @@ class Protocol:
     poses: str | None = None
 
     def __post_init__(self) -> None:
-        if self.views is None and self.shapes is None:
-            raise ValueError("should say how many `views` or `shapes` were compared")
+        if all(getattr(self, kind) is None for kind in COMPARED):
+            raise ValueError("should say how many `views`, `shapes` or `renderings` were compared")
+
+
+def compared_kind(protocol: dict[str, Any]) -> str:
+    """The kind of what an evaluation has compared."""
+    return next(kind for kind in COMPARED if kind in protocol)
 
 
 @dataclass(frozen=True, kw_only=True)
