@@ -22,7 +22,7 @@ from ..geometry import RIGID_TOLERANCE
 from ..metrics import Score
 
 MAX_PIXELS = 10**9  # of one picture
-COMPARED = "views", "shapes", "renderings"  # kinds of what an evaluation compares, of which a protocol counts one
+COMPARED = "views", "shapes", "renderings", "frames"  # kinds of what evaluations compare; a protocol counts one
 MAX_NAMES = 3  # photographs that a warning names
 
 
@@ -41,14 +41,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Evaluation protocol in eval.json, the fields in use: number of compared views, shapes or renderings, total,
-    split."""
+    """Evaluation protocol in eval.json, the fields in use: number of compared views, shapes, renderings of words or
+    frames of a walk, total, split."""
 
     split: str
     of: Tally = 0
     views: Tally | None = None
     shapes: Tally | None = None
     renderings: Tally | None = None
+    frames: Tally | None = None
     members: Tally | None = None
     resolution: str | list[str] = ""
     background: list[float] | None = None
@@ -58,7 +59,7 @@ class Protocol:
 
     def __post_init__(self) -> None:
         if all(getattr(self, kind) is None for kind in COMPARED):
-            raise ValueError("should say how many `views`, `shapes` or `renderings` were compared")
+            raise ValueError("should say how many `views`, `shapes`, `renderings` or `frames` were compared")
 
 
 def compared_kind(protocol: dict[str, Any]) -> str:
@@ -134,7 +135,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
 @dataclass(frozen=True)
 class CamerasRecord:
     """Contents of cameras.json: one row per camera, and row numbers by split. lens: see `Lens.to_json`; digests: of the
-    photographs' files, see `Scene`"""
+    photographs' files, see `Scene`; masked: whether some may have masks"""
 
     names: list[str]
     splits: dict[str, list[int]]
@@ -143,6 +144,7 @@ class CamerasRecord:
     size: list[tuple[Side, Side]]
     time: list[Coordinate] | None = None
     digests: list[str] = field(default_factory=list)
+    masked: bool = True
 
 
 def cameras_json(scene: Scene) -> dict[str, Any]:
@@ -155,6 +157,7 @@ def cameras_json(scene: Scene) -> dict[str, Any]:
         "size": camera.size.tolist(),
         "time": None if camera.time is None else camera.time.tolist(),
         **({"digests": scene.digests} if any(scene.digests) else {}),
+        "masked": scene.images.may_have_masks,
     }
 
 
