@@ -443,8 +443,8 @@ def test_its_distance_becomes_a_mesh(lenient):
 
 
 def test_its_evaluation_is_read_again(taught):
-    if taught.kind.learns_from is Shapes:
-        return  # whose evaluation takes seconds; see test_shapes of their commands
+    if taught.kind.learns_from in (Scene, Shapes):
+        return  # tests of commands evaluate these
     evaluate_run(taught.straight, taught.method, taught.data, most=1)
     result = Run(taught.straight.folder).evaluation()
     assert scores_of(result) and compared(result)
