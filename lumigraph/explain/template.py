@@ -26,7 +26,7 @@ STAGES = "trained", "moved", "continued", "from nothing"
 
 
 @dataclass(frozen=True)
-class Stage:
+class TemplateStage:
     """A method at one stage.
 
     stage:   one of STAGES
@@ -46,7 +46,7 @@ class Stage:
 
 def stages_of(
     run: Run, scene: Scene, into: Sequence[str], seconds: float, views: int, runs: Path, alone: bool
-) -> list[Stage]:
+) -> list[TemplateStage]:
     """The run itself; and each method moved from it, trained on for so many seconds, and, with `alone`, trained from
     nothing for as long as both together. Raises LumigraphError for methods that the run cannot become.
 
@@ -59,12 +59,12 @@ def stages_of(
     first = scene.cameras[shown_photograph(scene)]
     aim = ConversionTarget(None, None, seconds, source=scene.source, views=views, seed=run.settings.seed)
 
-    def stage(method: Method, name: str, spent: float) -> Stage:
+    def stage(method: Method, name: str, spent: float) -> TemplateStage:
         seen = shown(method.eval(), scene, first, views)
         assert seen.psnr is not None  # for there are photographs
         with torch.no_grad():
             picture = method.render(first.to(method.device)).rgb.clamp(0, 1).cpu()
-        return Stage(methods.name_of(method), name, spent, seen.psnr, seen.seconds, picture)
+        return TemplateStage(methods.name_of(method), name, spent, seen.psnr, seen.seconds, picture)
 
     trained = run.state.seconds
     found = [stage(teacher, "trained", trained)]
@@ -82,8 +82,8 @@ def stages_of(
 
 def shown_photograph(scene: Scene) -> int:
     """The first held-out photograph, or the first of all."""
-    held_out = scene.splits.get("test", [])
-    return int((held_out if len(held_out) else scene.splits["train"])[0])
+    held_out = scene.splits.get("test")
+    return int((scene.splits["train"] if held_out is None or not len(held_out) else held_out)[0])
 
 
 def from_nothing(scene: Scene, name: str, seconds: float, seed: int) -> Method:
@@ -94,7 +94,7 @@ def from_nothing(scene: Scene, name: str, seconds: float, seed: int) -> Method:
     return method
 
 
-def draw(folder: Path, title: str, truth: Float[Tensor, "height width 3"], found: Sequence[Stage]) -> None:
+def draw(folder: Path, title: str, truth: Float[Tensor, "height width 3"], found: Sequence[TemplateStage]) -> None:
     """Write template.png (a held-out view at each stage), template.svg (PSNR by seconds) and template.json."""
     first, rest = found[0], found[1:]
     rows = [Row("photograph", [truth])]
@@ -114,10 +114,10 @@ def draw(folder: Path, title: str, truth: Float[Tensor, "height width 3"], found
     write_json(folder / "template.json", [figures(x) for x in found], "figure")
 
 
-def label(stage: Stage) -> str:
+def label(stage: TemplateStage) -> str:
     return f"{stage.method}, {stage.stage}: {stage.psnr:.1f} dB, {stage.seconds:.0f} s"
 
 
-def figures(stage: Stage) -> dict[str, Any]:
+def figures(stage: TemplateStage) -> dict[str, Any]:
     """A stage without its picture."""
     return {name: x for name, x in asdict(stage).items() if name != "picture"}

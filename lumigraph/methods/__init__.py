@@ -157,7 +157,7 @@ def summary(name: str) -> str:
 
 
 def first_paragraph(docstring: str | None) -> str:
-    """As one line."""
+    """First paragraph of a docstring, as one line."""
     return " ".join((docstring or "").partition("\n\n")[0].split())
 
 

@@ -152,7 +152,7 @@ class GANcraft(Method):
             painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
             adversary_width=12, kl_weight=0.005, opacity_weight=0.5, momentum=0.5,
             learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
-            painter_learning_rate=2e-3, painter_adversary_learning_rate=1e-3,
+            painter_learning_rate=5e-4, painter_adversary_learning_rate=5e-4,
         )  # fmt: skip
 
     @classmethod
