@@ -11,7 +11,6 @@ import operator
 
 import numpy as np
 from llvmlite import ir
-from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.core import cgutils
 from numba.core.datamodel import models
@@ -20,7 +19,6 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, overload, regi
 
 LANES = 16
 SIXTEEN = (0,) * LANES
-REGISTER = (0,) * (16 if get_host_cpu_features().get("avx512f") else 8)  # as many lanes as one register holds
 I32 = ir.IntType(32)
 ELEMENTS = {"real": ir.FloatType(), "whole": I32, "mask": ir.IntType(1)}  # float32, uint32, bits
 SCALARS = {"real": types.Float, "whole": types.Integer, "mask": ()}  # what stands for lanes that are all the same
@@ -178,9 +176,9 @@ def exp2(x):
     return np.exp2(x, dtype=np.float32)
 
 
-def inverse(x):
-    """1 / x for positive x that are no subnormals. Relative error at most 2e-7; a division takes longer."""
-    return np.float32(1) / x
+def ahead(array, at):
+    """Ask the memory for what is at array[at], to be fetched later."""
+    _places(array, at, 1)
 
 
 def totals(vectors):
@@ -431,22 +429,16 @@ def _exp2(typing, x):
 
 
 @intrinsic
-def _inverse(typing, x):
-    """Bits of a float are its logarithm, nearly: taken from a constant they give 1 / x to within an eighth. Three steps
-    of Newton's y += y (1 - x y) square that three times."""
-
+def _ahead(typing, array, at):
     def generate(context, builder, sig, args):
-        (value,) = args
-        one = ir.Constant(value.type, [1.0] * x.count)
-        magic = ir.Constant(ir.VectorType(I32, x.count), [0x7EF311C7] * x.count)
-        bits = builder.sub(magic, builder.bitcast(value, magic.type))
-        y = builder.bitcast(bits, value.type)
-        for _ in range(3):
-            left = builder.fsub(one, builder.fmul(value, y, flags=FMA), flags=FMA)
-            y = builder.fadd(y, builder.fmul(y, left, flags=FMA), flags=FMA)
-        return y
+        place = builder.gep(_data(context, builder, sig, args), [args[1]])
+        place = builder.bitcast(place, ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [place.type, I32, I32, I32])
+        prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(prefetch, [place, *(ir.Constant(I32, x) for x in (0, 3, 1))])  # to be read, kept near, data
+        return context.get_dummy_value()
 
-    return x(x), generate
+    return types.void(array, types.int64), generate
 
 
 @intrinsic
@@ -456,10 +448,7 @@ def _totals(typing, vectors):
     def generate(context, builder, sig, args):
         lines = list(cgutils.unpack_tuple(builder, args[0]))
         lines += [None] * (LANES - len(lines))
-        if vectors[0].count == 8:  # two of them make sixteen lanes, as if they were folded
-            both, rest = ir.Constant(INTS, [*range(LANES)]), ir.Constant(lines[0].type, ir.Undefined)
-            lines = [a and builder.shuffle_vector(a, rest if b is None else b, both) for a, b in zip(lines[:8], lines[8:])]
-        for size in (8, 4, 2, 1) if vectors[0].count == LANES else (4, 2, 1):
+        for size in (8, 4, 2, 1):
             stay = ir.Constant(INTS, [LANES + lane if lane & size else lane for lane in range(LANES)])
             move = ir.Constant(INTS, [LANES + lane - size if lane & size else lane + size for lane in range(LANES)])
             for i in range(size):
@@ -498,6 +487,6 @@ overload(root)(lambda x: lambda x: _root(x))
 overload(bytes_between)(lambda x: lambda x: _bytes_between(x))
 overload(some)(lambda condition: lambda condition: _some(condition))
 overload(exp2)(lambda x: lambda x: _exp2(x))
-overload(inverse)(lambda x: lambda x: _inverse(x))
+overload(ahead)(lambda array, at: lambda array, at: _ahead(array, at))
 overload(totals)(lambda vectors: lambda vectors: _totals(vectors))
 overload(first_bit)(lambda x: lambda x: _first_bit(x))

@@ -11,16 +11,14 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 
 from .._lanes import (
-    REGISTER,
     SIXTEEN,
+    ahead,
     bytes_between,
     exp2,
     fetch,
-    fetch_like,
     filled,
     first_bit,
     highest,
-    inverse,
     lowest,
     put,
     root,
@@ -37,6 +35,7 @@ LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eigh
 MIN_ALPHA, MAX_ALPHA = np.float32(_MIN_ALPHA), np.float32(_MAX_ALPHA)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 TILE, PAIR = 8, 8  # about what a tile costs in pairs, and a pair in visits to a block, to share work out by
+AHEAD = 6  # pairs from the one at hand to that whose row is asked of the memory
 LOG2_E, LOG2_255, LN_4 = math.log2(math.e), math.log2(255), np.float32(math.log(4))
 LEAST = np.float32(math.log2(_MIN_ALPHA))
 
@@ -100,11 +99,10 @@ def _frame(rows, i, left, top):
 
 
 @njit(inline="always")
-def _bell(rows, i, frame, table, block, half, like):
+def _bell(rows, i, frame, table, block):
     """The roots, and the exponent of 2 in opacity exp(-q / 2), at pixels of a block."""
     along, slant, down, u, v = frame
-    x = fetch_like(table, (block & 7) * LANES + half, like)
-    y = fetch_like(table, (8 + (block >> 3)) * LANES + half, like)
+    x, y = fetch(table, (block & 7) * LANES), fetch(table, (8 + (block >> 3)) * LANES)
     u, v = along * x + (slant * y + u), down * y + v
     return u, v, rows[i + BRIGHT] - v * v - u * u
 
@@ -151,6 +149,7 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
             visited = 0
             for p in range(starts[k], starts[k + 1]):
                 i = np.int64(order[p]) * LANES
+                ahead(rows, np.int64(order[min(p + AHEAD, len(order) - 1)]) * LANES)
                 todo = alive & _blocks(rows, i, np.float32(left), np.float32(top), table) if alive else alive
                 masks[p] = todo
                 if not todo:
@@ -160,7 +159,7 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
                     at = block * (5 * LANES)
-                    _, _, exponent = _bell(rows, i, frame, table, block, 0, SIXTEEN)
+                    _, _, exponent = _bell(rows, i, frame, table, block)
                     light = fetch(state, at)
                     weight = _alpha(exponent, light, stop) * light
                     light = light - weight
@@ -214,31 +213,30 @@ def _backward(
                 if not todo:
                     continue
                 i = np.int64(order[p]) * LANES
+                ahead(rows, np.int64(order[min(p + AHEAD, len(order) - 1)]) * LANES)
                 frame = _frame(rows, i, left, top)
-                s = su = sv = suu = suv = svv = red = green = blue = far = filled(ZERO, REGISTER)
+                s = su = sv = suu = suv = svv = red = green = blue = far = filled(ZERO, SIXTEEN)
                 while todo:
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
-                    for half in range(0, LANES, len(REGISTER)):
-                        at = block * (7 * LANES) + half
-                        u, v, exponent = _bell(rows, i, frame, table, block, half, REGISTER)
-                        light = fetch_like(state, at, REGISTER)
-                        alpha = _alpha(exponent, light, stop)
-                        weight = alpha * light
-                        put(state, at, light - weight)
-                        r, g = fetch_like(state, at + 2 * LANES, REGISTER), fetch_like(state, at + 3 * LANES, REGISTER)
-                        b, d = fetch_like(state, at + 4 * LANES, REGISTER), fetch_like(state, at + 5 * LANES, REGISTER)
-                        worth = fetch_like(state, at + 6 * LANES, REGISTER) + r * rows[i + RED] + g * rows[i + GREEN]
-                        worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
-                        behind = fetch_like(state, at + LANES, REGISTER) - worth
-                        put(state, at + LANES, behind)
-                        slope = worth - alpha * behind * inverse(ONE - alpha)
-                        slope = where(alpha < MAX_ALPHA, slope, ZERO)
-                        gu, gv = slope * u, slope * v
-                        s, su, sv = s + slope, su + gu, sv + gv
-                        suu, suv, svv = suu + gu * u, suv + gu * v, svv + gv * v
-                        red, green = red + weight * r, green + weight * g
-                        blue, far = blue + weight * b, far + weight * d
+                    at = block * (7 * LANES)
+                    u, v, exponent = _bell(rows, i, frame, table, block)
+                    light = fetch(state, at)
+                    alpha = _alpha(exponent, light, stop)
+                    weight = alpha * light
+                    put(state, at, light - weight)
+                    r, g = fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES)
+                    b, d = fetch(state, at + 4 * LANES), fetch(state, at + 5 * LANES)
+                    worth = fetch(state, at + 6 * LANES) + r * rows[i + RED] + g * rows[i + GREEN]
+                    worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
+                    behind = fetch(state, at + LANES) - worth
+                    put(state, at + LANES, behind)
+                    slope = worth - alpha * behind / (ONE - alpha)
+                    slope = where(alpha < MAX_ALPHA, slope, ZERO)
+                    gu, gv = slope * u, slope * v
+                    s, su, sv = s + slope, su + gu, sv + gv
+                    suu, suv, svv = suu + gu * u, suv + gu * v, svv + gv * v
+                    red, green, blue, far = red + weight * r, green + weight * g, blue + weight * b, far + weight * d
                 put(sums, p * LANES, totals((s, su, sv, suu, suv, svv, red, green, blue, far)))
 
 
