@@ -23,18 +23,22 @@ from budgets import PER_METHOD, budget
 
 import lumigraph
 from lumigraph import methods
+from lumigraph.benchmark.cell import CellSettings, evaluated
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
+from lumigraph.commands.eval import compared
 from lumigraph.components.fields import appearance
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Scene
+from lumigraph.datasets.shapes import Shapes
 from lumigraph.depth_maps import depth_map
 from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.model import Model
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, held_out_poses
+from lumigraph.evaluation.run import evaluate_run
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.explain.ray import along_ray
 from lumigraph.export import points as export_points
@@ -52,7 +56,7 @@ from lumigraph.method.capabilities import (
     HasMesh,
     can,
 )
-from lumigraph.metrics import psnr
+from lumigraph.metrics import psnr, scores_of
 from lumigraph.paths import camera_path
 from lumigraph.paths.opening import opening_of_scene
 from lumigraph.run import Run, build
@@ -436,6 +440,15 @@ def test_its_distance_becomes_a_mesh(lenient):
     with torch.no_grad():
         distance = lenient.method.distance(torch.from_numpy(mesh.vertices).float().to(lenient.device))
     assert float(distance.abs().median()) < 1 / 16
+
+
+def test_its_evaluation_is_read_again(taught):
+    if taught.kind.learns_from in (Scene, Shapes):
+        return  # tests of commands evaluate these
+    evaluate_run(taught.straight, taught.method, taught.data, most=1)
+    result = Run(taught.straight.folder).evaluation()
+    assert scores_of(result) and compared(result)
+    assert evaluated(taught.straight.folder, CellSettings(eval_views=1)) or "views" in result["protocol"]
 
 
 def test_it_becomes_a_film(taught, tmp_path):

@@ -14,6 +14,7 @@ import tiny_words
 import torch
 from budgets import budget
 
+from lumigraph.benchmark.cell import CellSettings, evaluated
 from lumigraph.commands.cli import main
 from lumigraph.components.guidance.clip import VisionSizes
 from lumigraph.components.guidance.clip_files import read_clip
@@ -263,6 +264,7 @@ def test_a_scene_is_trained_from_words_and_judged(tmp_path, capsys, monkeypatch)
     assert run.settings.scene.source == "words:a red ball" and run.settings.scene.options["guidance"] == guidance
     assert run.dataset() == Words("a red ball", tiny_words.clip_folder())
     assert main(["eval", "run", "--views", "2"]) == 0
+    assert evaluated(run.folder, CellSettings(eval_views=2))
     (score,) = json.loads((tmp_path / "run/eval.json").read_text())["scores"]
     assert score["name"] == "similarity to the prompt" and -1 <= score["value"] <= 1
     assert main(["train", "dream-fields", "words:a шар", "--steps", "1", "--guidance", guidance, "--output", "b"]) == 2

@@ -18,7 +18,7 @@ from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
 from ..run import Run
 from ..run.derived import Inferred
-from ..run.records import Protocol, ViewScores
+from ..run.records import Protocol, ViewScores, compared_kind
 from ..synthetic import is_category
 
 SHEET = "views.png"
@@ -175,7 +175,7 @@ def evaluated(folder: Path, settings: CellSettings, halves: bool = False) -> boo
     there = protocol.get("of", 0)
     wanted = min((settings.eval_views or there) * protocol.get("members", 1), there)  # of each member so many
     if "views" not in protocol:
-        return protocol.get("shapes") == wanted
+        return protocol[compared_kind(protocol)] == wanted
     kept = (folder / "eval").is_dir() and (result["lpips"] is not None or not settings.lpips)
     return kept and protocol["views"] == wanted and (bool(protocol.get("halves")) or not halves)
 

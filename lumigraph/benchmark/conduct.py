@@ -165,7 +165,8 @@ def compare_alike(
     otherwise 0."""
     halved = by_halves(rows)
     for name, row in rows.items():
-        if row["failed"] or together(row) not in halved or row["protocol"].get("halves") or "shapes" in row["protocol"]:
+        whole = not row["failed"] and "views" in row["protocol"] and not row["protocol"].get("halves")
+        if not whole or together(row) not in halved:
             continue
         tell(f"{name} once more, on right halves, as other methods of {together(row)}")
         log = output / f"{name}.log"

@@ -14,6 +14,7 @@ from ..evaluation.halves import LEFT_HALVES
 from ..evaluation.views import CAPTURED_POSES
 from ..figures.charts import COLOURS, Series
 from ..metrics import named, scores_of
+from ..run.records import compared_kind
 from .cell import FEW_VIEW_FIGURES, MEMBERS, Row, duration
 
 NONE = "–"
@@ -171,7 +172,7 @@ def published(row: Row) -> str:
 def protocol(row: Row) -> str:
     """Protocol of the cell's evaluation, in a few words."""
     how = row["protocol"]
-    count = how["views"] if "views" in how else how["shapes"]
+    count = how[compared_kind(how)]
     some = f"{count} of {how['of']} of {how['split']}, evenly spread"
     parts = [resolution(row), f"{count} of {how['split']}" if count == how["of"] else some]
     if how.get("background") is not None:

@@ -78,8 +78,10 @@ class Eval:
 
 def compared(result: dict[str, Any]) -> dict[str, str]:
     """Compared views with their size and rendering time, shapes, or renderings of words, as text."""
+    from ..run.records import compared_kind
+
     protocol = result["protocol"]
-    what = next(x for x in ("views", "shapes", "renderings") if x in protocol)
+    what = compared_kind(protocol)
     count, there = protocol[what], protocol["of"]
     some = f"{count} of {protocol['split']}" if count == there else f"{count} of {there} of {protocol['split']}"
     members = f", {protocol['members']} members" if "members" in protocol else ""

@@ -145,9 +145,9 @@ class ExportMesh:
         return opened, mesh.in_source(opened.frame), why
 
     def photographs(self, opened: Any) -> Any:
-        """The photographs of a run; None, with a warning, where they are gone. Raises LumigraphError if they are not
-        where --scene says."""
-        if opened.open_scene is None:
+        """The photographs of a run, if their colours or masks are used; None, with a warning, where they are gone.
+        Raises LumigraphError if they are not where --scene says."""
+        if opened.open_scene is None or not (self.texture or opened.masked):
             return None
         try:
             return opened.open_scene(self.scene)

@@ -25,6 +25,7 @@ from ..files import claim, write_bytes
 from ..metrics import scores_of
 from ..metrics.rows import last_psnr, of_final_size
 from ..run import Run
+from ..run.records import compared_kind
 from ..system.progress import clock, short
 from ..training.display import extent, pixel_sizes
 from ..training.verdict import cameras_moved
@@ -83,7 +84,7 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
         figures.append((f"{psnr:.2f}", "dB", "PSNR of training photographs"))
     if evaluation:
         protocol = evaluation["protocol"]
-        what = "views" if "views" in protocol else "shapes"
+        what = compared_kind(protocol)
         count, split = protocol[what], "held-out" if protocol["split"] == "test" else protocol["split"]
         if what == "shapes" and count == 1:
             split, what = "", "shape"

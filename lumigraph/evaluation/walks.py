@@ -5,7 +5,7 @@ No photograph says how the world looks, so nothing is compared with one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -127,13 +127,14 @@ def evaluate_walk(
             shown[name] = shot.rgb, seen
         before = rgb, shot.camera, depth
     separation, colours = colours_by_label(torch.stack(pictures), torch.stack(labels))
-    return WalkEvaluation(frames, separation, colours, protocol(split, chosen), shown)
+    return WalkEvaluation(frames, separation, colours, protocol(split, len(chosen), len(world.splits[split])), shown)
 
 
-def protocol(split: str, chosen: Sequence[int]) -> dict[str, Any]:
+def protocol(split: str, count: int, total: int) -> dict[str, Any]:
     return {
         "split": split,
-        "views": len(chosen),
+        "frames": count,
+        "of": total,
         "warped difference": "mean |difference| of sRGB from the frame before, warped by the exact depth, "
         "where both show the same place; per frame, then averaged",
         "colours by label": "share of the variance of sRGB that lies between labels",

@@ -145,14 +145,20 @@ def colour(name: str) -> int:
 
 
 def summary(name: str) -> str:
-    """The first line of a method's file: what it is and who published it. Reads the file without running it."""
+    """The first paragraph of a method's file, as one line: what it is and who published it. Reads the file without
+    running it."""
     for folder in __path__:
         module = Path(folder) / name.replace("-", "_")
         file = next((x for x in (module.with_suffix(".py"), module / "__init__.py") if x.exists()), None)
         if file:
-            return (ast.get_docstring(ast.parse(file.read_text("utf-8"))) or "").partition("\n")[0]
+            return first_paragraph(ast.get_docstring(ast.parse(file.read_text("utf-8"))))
     kind = find(name)
-    return (inspect.getdoc(sys.modules.get(kind.__module__)) or inspect.getdoc(kind) or "").partition("\n")[0]
+    return first_paragraph(inspect.getdoc(sys.modules.get(kind.__module__)) or inspect.getdoc(kind))
+
+
+def first_paragraph(docstring: str | None) -> str:
+    """As one line."""
+    return " ".join((docstring or "").partition("\n\n")[0].split())
 
 
 def check(name: str) -> str:

@@ -231,6 +231,10 @@ class Run(Trained):
         said = read_cameras(self._cameras)
         return {split: [said.names[i] for i in index] for split, index in said.splits.items()}
 
+    @property
+    def masked(self) -> bool:
+        return self.photographed and read_cameras(self._cameras).masked
+
     def digests(self) -> dict[str, str]:
         """Sizes and hashes of the photographs' files by name, as they were in training; see `Scene.digests`."""
         said = read_cameras(self._cameras)

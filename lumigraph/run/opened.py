@@ -114,6 +114,11 @@ class Opened(ABC):
         return False
 
     @property
+    def masked(self) -> bool:
+        """True if masks may leave pixels of its photographs out of learning."""
+        return self.photographed
+
+    @property
     def open_scene(self) -> Callable[..., Scene] | None:
         """Function that opens the photographs again, told where they are now if they have moved; None where there are
         none."""

@@ -22,6 +22,7 @@ from ..geometry import RIGID_TOLERANCE
 from ..metrics import Score
 
 MAX_PIXELS = 10**9  # of one picture
+COMPARED = "views", "shapes", "renderings", "frames"  # kinds of what evaluations compare; a protocol counts one
 MAX_NAMES = 3  # photographs that a warning names
 
 
@@ -40,12 +41,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Evaluation protocol in eval.json, the fields in use: number of compared views or shapes, total, split."""
+    """Evaluation protocol in eval.json, the fields in use: number of compared views, shapes, renderings of words or
+    frames of a walk, total, split."""
 
     split: str
     of: Tally = 0
     views: Tally | None = None
     shapes: Tally | None = None
+    renderings: Tally | None = None
+    frames: Tally | None = None
     members: Tally | None = None
     resolution: str | list[str] = ""
     background: list[float] | None = None
@@ -54,8 +58,13 @@ class Protocol:
     poses: str | None = None
 
     def __post_init__(self) -> None:
-        if self.views is None and self.shapes is None:
-            raise ValueError("should say how many `views` or `shapes` were compared")
+        if all(getattr(self, kind) is None for kind in COMPARED):
+            raise ValueError("should say how many `views`, `shapes`, `renderings` or `frames` were compared")
+
+
+def compared_kind(protocol: dict[str, Any]) -> str:
+    """The kind of what an evaluation has compared."""
+    return next(kind for kind in COMPARED if kind in protocol)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +135,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
 @dataclass(frozen=True)
 class CamerasRecord:
     """Contents of cameras.json: one row per camera, and row numbers by split. lens: see `Lens.to_json`; digests: of the
-    photographs' files, see `Scene`"""
+    photographs' files, see `Scene`; masked: whether some may have masks"""
 
     names: list[str]
     splits: dict[str, list[int]]
@@ -135,6 +144,7 @@ class CamerasRecord:
     size: list[tuple[Side, Side]]
     time: list[Coordinate] | None = None
     digests: list[str] = field(default_factory=list)
+    masked: bool = True
 
 
 def cameras_json(scene: Scene) -> dict[str, Any]:
@@ -147,6 +157,7 @@ def cameras_json(scene: Scene) -> dict[str, Any]:
         "size": camera.size.tolist(),
         "time": None if camera.time is None else camera.time.tolist(),
         **({"digests": scene.digests} if any(scene.digests) else {}),
+        "masked": scene.images.may_have_masks,
     }
 
 

@@ -222,6 +222,11 @@ class ImageStore:
         return self._trusted.mask(index, width * height).view(height, width)
 
     @property
+    def may_have_masks(self) -> bool:
+        """False if all pixels of all images are to be used."""
+        return self._trusted is not None
+
+    @property
     def trusted_pixels(self) -> Int[Tensor, " image"]:
         """Number of pixels of each image to learn from."""
         return self._count

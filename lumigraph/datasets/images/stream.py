@@ -98,6 +98,11 @@ class ImageStream(ImageStore):
         pixels, _ = whole(self._pictures[index])
         return torch.from_numpy(pixels)[..., : 4 if self.has_alpha else 3]
 
+    @property
+    def may_have_masks(self) -> bool:
+        """True, for masks are read with their images."""
+        return True
+
     def mask(self, index: int) -> Bool[Tensor, "height width"] | None:
         """Mask of an image's pixels to use, read now; None if all."""
         _, trusted = whole(self._pictures[index])

