@@ -93,6 +93,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "explain activation": ("explain activation --steps 2 --output edge.png", ("edge.png",)),
     "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
+    "explain template": (
+        "explain template ball --scene photographs --into voxel-grid --seconds 0.2 --views 1 --output moved",
+        ("moved/", "moved"),
+    ),
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),
     "bench step": (
         "bench step voxel-grid photographs --warmup 1 --steps 1 --output step.json --flame step.svg",

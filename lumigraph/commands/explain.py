@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from ..errors import LumigraphError
-from ..files.ranges import Downscale, Steps, between
+from ..files.ranges import Count, Downscale, Seconds, Steps, between
 from .common import choose_device, say, scene_name, show
 from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, controlled, needed, option
 
@@ -279,6 +279,44 @@ class ExplainScattering:
         return 0
 
 
+@dataclass(frozen=True)
+class ExplainTemplate:
+    """Move a trained run into other structures and continue there: the template of fast radiance fields.
+
+    One picture shows a held-out view as trained, moved, continued, and by each method trained from nothing for as long;
+    a chart shows PSNR by seconds of training, and their numbers are beside them as JSON.
+    """
+
+    run_folder: RunOption
+    output: Annotated[Path | None, option("FOLDER", "RUN/template")] = None
+    """New folder of template.png, template.svg, template.json and the runs."""
+    into: Annotated[tuple[str, ...], option("METHOD ...")] = ("plenoctrees", "gaussian-splatting")
+    """Methods to move into; `lumigraph convert --list` says which can be."""
+    seconds: Annotated[Seconds, option("S")] = 30.0
+    """Training in each of them after the move."""
+    alone: bool = True
+    """Also train each of them from nothing, for as long as the run and the move together."""
+    views: Annotated[Count, option("N")] = 4
+    """Held-out views to compare at most."""
+    scene: PhotographsOption = None
+
+    def run(self) -> int:
+        from .. import methods
+        from ..explain.template import draw, label, shown_photograph, stages_of
+        from ..run import Run, check_new
+
+        run = Run(self.run_folder)
+        folder = self.output or run.folder / "template"
+        check_new(folder)
+        into = tuple(dict.fromkeys(map(methods.check, self.into)))
+        scene = run.scene(self.scene)
+        found = stages_of(run, scene, into, self.seconds, self.views, folder, self.alone)
+        first = scene.photograph(shown_photograph(scene)).before(scene.frame.background)
+        draw(folder, f"{run.title}: train, move, continue", first, found)
+        show({label(x).partition(":")[0]: label(x).partition(": ")[2] for x in found} | {"files": str(folder)})
+        return 0
+
+
 def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:
     """Name and Camera of a photograph, by its name or number in a split of a Run. LumigraphError if there is none."""
     names = run.view_names().get(split, [])
@@ -300,6 +338,7 @@ What = (
     | Annotated[ExplainLightField, subcommand("lightfield")]
     | Annotated[ExplainRay, subcommand("ray")]
     | Annotated[ExplainScattering, subcommand("scattering")]
+    | Annotated[ExplainTemplate, subcommand("template")]
 )
 
 

@@ -18,7 +18,7 @@ from ..capture import meshes
 from ..errors import LumigraphError
 from ..files.names import natural
 from ..files.ranges import Seed, between
-from . import categories
+from . import categories, scenes
 from .cameras import dome, pinhole, spiral
 from .categories import FIELD_OF_VIEW, surrounded
 from .shapes import triangle_of
@@ -63,10 +63,10 @@ def is_category(request: str) -> bool:
 
 
 def path_of(request: str) -> Path | None:
-    """The folder or the mesh that a request names; None where it names something procedural. A category goes first: a
-    folder that is called like one is named ./chairs."""
+    """The folder or the mesh that a request names; None where it names something procedural. Scenes and categories go
+    first: a folder that is called like one is named ./chairs."""
     name = request.partition(",")[0]
-    if name in categories.available():
+    if name in (*categories.available(), *scenes.available()):
         return None
     path = Path(name).expanduser()
     return path if path.is_dir() or meshes.is_mesh(path) else None

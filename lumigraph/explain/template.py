@@ -1,0 +1,123 @@
+"""Train, move, continue: a trained field moved into structures, each beside the same structure trained from nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import methods
+from ..datasets.scene import Scene
+from ..derive.conversion import ConversionTarget, check, convert, new_student, shown, take_over
+from ..figures import Row, contact_sheet, save_picture
+from ..figures.charts import Series, line_chart, standalone
+from ..files import write_bytes, write_json
+from ..method import Method
+from ..run import Run, build
+from ..system.signals import go_on_unless
+from ..training import fit
+
+STAGES = "trained", "moved", "continued", "from nothing"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A method at one stage.
+
+    stage:   one of STAGES
+    seconds: of training since the field began, moving included
+    psnr:    mean over held-out views, dB
+    view_seconds: to render one of them
+    picture: the first of them
+    """
+
+    method: str
+    stage: str
+    seconds: float
+    psnr: float
+    view_seconds: float
+    picture: Float[Tensor, "height width 3"]
+
+
+def stages_of(
+    run: Run, scene: Scene, into: Sequence[str], seconds: float, views: int, runs: Path, alone: bool
+) -> list[Stage]:
+    """The run itself; and each method moved from it, trained on for so many seconds, and, with `alone`, trained from
+    nothing for as long as both together. Raises LumigraphError for methods that the run cannot become.
+
+    scene: the run's photographs; views: held-out ones at most; runs: new folder of the runs
+    """
+    for name in into:
+        check(run, methods.find(name))
+    teacher = run.method()
+    around = teacher.refined(run.cameras()["train"])
+    first = scene.cameras[shown_photograph(scene)]
+    aim = ConversionTarget(None, None, seconds, source=scene.source, views=views, seed=run.settings.seed)
+
+    def stage(method: Method, name: str, spent: float) -> Stage:
+        seen = shown(method.eval(), scene, first, views)
+        assert seen.psnr is not None  # for there are photographs
+        with torch.no_grad():
+            picture = method.render(first.to(method.device)).rgb.clamp(0, 1).cpu()
+        return Stage(methods.name_of(method), name, spent, seen.psnr, seen.seconds, picture)
+
+    trained = run.state.seconds
+    found = [stage(teacher, "trained", trained)]
+    for name in into:
+        student = new_student(methods.find(name), teacher, aim, teacher.device)
+        moved = trained + take_over(teacher, student, scene, around, as_taken=True)
+        found.append(stage(student, "moved", moved))
+        made = convert(run, name, runs / name, aim, teacher.device)
+        whole = moved + made.seconds
+        found.append(stage(Run(runs / name).method(), "continued", whole))
+        if alone:
+            found.append(stage(from_nothing(scene, name, whole, aim.seed), "from nothing", whole))
+    return found
+
+
+def shown_photograph(scene: Scene) -> int:
+    """The first held-out photograph, or the first of all."""
+    held_out = scene.splits.get("test", [])
+    return int((held_out if len(held_out) else scene.splits["train"])[0])
+
+
+def from_nothing(scene: Scene, name: str, seconds: float, seed: int) -> Method:
+    """A method trained on a scene for so many seconds, with its preset."""
+    kind, device = methods.find(name), torch.device("cpu")
+    method = build(kind, scene.frame, kind.preset(device), device, seed, learning=True)
+    go_on_unless(fit(method, scene, seconds=seconds, seed=seed, show=False).signal)
+    return method
+
+
+def draw(folder: Path, title: str, truth: Float[Tensor, "height width 3"], found: Sequence[Stage]) -> None:
+    """Write template.png (a held-out view at each stage), template.svg (PSNR by seconds) and template.json."""
+    first, rest = found[0], found[1:]
+    rows = [Row("photograph", [truth])]
+    series = [Series(f"{first.method}, trained", [first.seconds], [first.psnr])]
+    for name in dict.fromkeys(x.method for x in rest):
+        own = [x for x in rest if x.method == name]
+        labels = [f"{x.psnr:.1f} dB, {x.seconds:.0f} s" for x in (first, *own)]
+        labels[:2] = [f"{x.method}, {x.psnr:.1f} dB" for x in (first, own[0])]
+        rows.append(Row(labels, [x.picture for x in (first, *own)]))
+        path = [first, *(x for x in own if x.stage != "from nothing")]
+        series.append(Series(f"into {name}", [x.seconds for x in path], [x.psnr for x in path]))
+        series += [Series(f"{name}, from nothing", [x.seconds], [x.psnr]) for x in own if x.stage == "from nothing"]
+    columns = STAGES[: max(len(row.pictures) for row in rows)]
+    save_picture(folder / "template.png", contact_sheet(title, columns, rows), "figure")
+    chart = line_chart(series, "seconds of training", "PSNR (dB)", marks=True, smoothed=False)
+    write_bytes(folder / "template.svg", standalone(chart), "figure")
+    write_json(folder / "template.json", [figures(x) for x in found], "figure")
+
+
+def label(stage: Stage) -> str:
+    return f"{stage.method}, {stage.stage}: {stage.psnr:.1f} dB, {stage.seconds:.0f} s"
+
+
+def figures(stage: Stage) -> dict[str, Any]:
+    """A stage without its picture."""
+    return {name: x for name, x in asdict(stage).items() if name != "picture"}
