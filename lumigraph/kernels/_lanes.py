@@ -18,6 +18,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, lower_cast, overload, register_model
 
 LANES = 16
+SIXTEEN = (0,) * LANES
 I32 = ir.IntType(32)
 ELEMENTS = {"real": ir.FloatType(), "whole": I32, "mask": ir.IntType(1)}  # float32, uint32, bits
 SCALARS = {"real": types.Float, "whole": types.Integer, "mask": ()}  # what stands for lanes that are all the same
@@ -171,13 +172,13 @@ def some(condition):
 
 
 def exp2(x):
-    """2^x for x up to 127, 2^-126 below -126. Relative error at most 1e-7: a polynomial of degree 6 on [-1/2, 1/2]."""
-    return np.exp2(np.maximum(x, -126), dtype=np.float32)
+    """2^x for x from -126 to 127, anything for others. Relative error at most 3e-7: a quintic on [-1/2, 1/2]."""
+    return np.exp2(x, dtype=np.float32)
 
 
-def inverse(x):
-    """1 / x for positive x that are no subnormals. Relative error at most 2e-7; a division takes longer."""
-    return np.float32(1) / x
+def ahead(array, at):
+    """Ask the memory for what is at array[at], to be fetched later."""
+    _places(array, at, 1)
 
 
 def totals(vectors):
@@ -390,53 +391,54 @@ def _bytes_between(typing, x):
 @intrinsic
 def _some(typing, condition):
     def generate(context, builder, sig, args):
-        bits = builder.bitcast(args[0], ir.IntType(LANES))
-        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
+        bits = builder.sext(args[0], INTS)
+        name = f"llvm.vector.reduce.or.v{LANES}i32"
+        any_ = cgutils.get_or_insert_function(builder.module, ir.FunctionType(I32, [INTS]), name)
+        return builder.icmp_signed("<", builder.call(any_, [bits]), ir.Constant(I32, 0))
 
     return types.boolean(mask), generate
 
 
 # 2^f = sum_i c_i f^i on [-1/2, 1/2]: Chebyshev's nodes, found once in double precision.
-_NODES = 0.5 * np.cos((np.arange(7) + 0.5) * np.pi / 7)
+_NODES = 0.5 * np.cos((np.arange(6) + 0.5) * np.pi / 6)
 _COEFFICIENTS = np.linalg.solve(np.vander(_NODES, increasing=True), np.exp2(_NODES))
 _ROUNDER = 1.5 * 2.0**23  # adding it leaves the nearest whole number in the lowest bits
 
 
 @intrinsic
 def _exp2(typing, x):
+    """Pairs of terms are independent (Estrin), which is quicker than a chain of them."""
+
     def generate(context, builder, sig, args):
-        def constant(value):
-            return ir.Constant(FLOATS, [float(np.float32(value))] * LANES)
+        def constant(value, kind=ir.FloatType()):
+            return ir.Constant(ir.VectorType(kind, x.count), [value] * x.count)
 
-        high = builder.fcmp_ordered(">=", args[0], constant(-126))
-        x = builder.select(high, args[0], constant(-126))
-        rounded = builder.fadd(x, constant(_ROUNDER))
-        f = builder.fsub(x, builder.fsub(rounded, constant(_ROUNDER)))
-        total = constant(_COEFFICIENTS[-1])
-        for c in _COEFFICIENTS[-2::-1]:
-            total = builder.fadd(builder.fmul(total, f, flags=FMA), constant(c), flags=FMA)
-        exponent = builder.shl(builder.bitcast(rounded, INTS), ir.Constant(INTS, [23] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(total, INTS), exponent), FLOATS)
+        def plus(a, b, c):
+            return builder.fadd(builder.fmul(a, b, flags=FMA), c, flags=FMA)
 
-    return lanes(lanes), generate
+        whole = builder.fadd(args[0], constant(_ROUNDER))
+        f = builder.fsub(args[0], builder.fsub(whole, constant(_ROUNDER)))
+        c0, c1, c2, c3, c4, c5 = (constant(float(np.float32(c))) for c in _COEFFICIENTS)
+        square = builder.fmul(f, f)
+        total = plus(square, plus(square, plus(c5, f, c4), plus(c3, f, c2)), plus(c1, f, c0))
+        whole, total = (builder.bitcast(v, ir.VectorType(I32, x.count)) for v in (whole, total))
+        exponent = builder.shl(whole, constant(23, I32))
+        return builder.bitcast(builder.add(total, exponent), args[0].type)
+
+    return x(x), generate
 
 
 @intrinsic
-def _inverse(typing, x):
-    """Bits of a float are its logarithm, nearly: taken from a constant they give 1 / x to within an eighth. Three steps
-    of Newton's y += y (1 - x y) square that three times."""
-
+def _ahead(typing, array, at):
     def generate(context, builder, sig, args):
-        (x,) = args
-        one = ir.Constant(FLOATS, [1.0] * LANES)
-        bits = builder.sub(ir.Constant(INTS, [0x7EF311C7] * LANES), builder.bitcast(x, INTS))
-        y = builder.bitcast(bits, FLOATS)
-        for _ in range(3):
-            left = builder.fsub(one, builder.fmul(x, y, flags=FMA), flags=FMA)
-            y = builder.fadd(y, builder.fmul(y, left, flags=FMA), flags=FMA)
-        return y
+        place = builder.gep(_data(context, builder, sig, args), [args[1]])
+        place = builder.bitcast(place, ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [place.type, I32, I32, I32])
+        prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(prefetch, [place, *(ir.Constant(I32, x) for x in (0, 3, 1))])  # to be read, kept near, data
+        return context.get_dummy_value()
 
-    return lanes(lanes), generate
+    return types.void(array, types.int64), generate
 
 
 @intrinsic
@@ -468,7 +470,6 @@ def _first_bit(typing, x):
     return types.int64(types.uint64), generate
 
 
-SIXTEEN = (0,) * LANES
 overload(fetch)(lambda array, at: lambda array, at: _fetch(array, at, SIXTEEN))
 overload(fetch_like)(lambda array, at, like: lambda array, at, like: _fetch(array, at, like))
 overload(gather)(lambda array, at, stride, like: lambda array, at, stride, like: _gather(array, at, stride, like))
@@ -486,6 +487,6 @@ overload(root)(lambda x: lambda x: _root(x))
 overload(bytes_between)(lambda x: lambda x: _bytes_between(x))
 overload(some)(lambda condition: lambda condition: _some(condition))
 overload(exp2)(lambda x: lambda x: _exp2(x))
-overload(inverse)(lambda x: lambda x: _inverse(x))
+overload(ahead)(lambda array, at: lambda array, at: _ahead(array, at))
 overload(totals)(lambda vectors: lambda vectors: _totals(vectors))
 overload(first_bit)(lambda x: lambda x: _first_bit(x))

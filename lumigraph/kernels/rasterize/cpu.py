@@ -10,7 +10,22 @@ import math
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from .._lanes import bytes_between, exp2, fetch, first_bit, highest, inverse, lowest, put, root, some, totals, where
+from .._lanes import (
+    SIXTEEN,
+    ahead,
+    bytes_between,
+    exp2,
+    fetch,
+    filled,
+    first_bit,
+    highest,
+    lowest,
+    put,
+    root,
+    some,
+    totals,
+    where,
+)
 from .._operation import differentiable, empty
 from ..project import MAX_ALPHA as _MAX_ALPHA
 from ..project import MIN_ALPHA as _MIN_ALPHA
@@ -20,12 +35,17 @@ LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eigh
 MIN_ALPHA, MAX_ALPHA = np.float32(_MIN_ALPHA), np.float32(_MAX_ALPHA)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 TILE, PAIR = 8, 8  # about what a tile costs in pairs, and a pair in visits to a block, to share work out by
-LOG2_E, LOG2_255 = math.log2(math.e), math.log2(255)
+AHEAD = 6  # pairs from the one at hand to that whose row is asked of the memory
+LOG2_E, LOG2_255, LN_4 = math.log2(math.e), math.log2(255), np.float32(math.log(4))
+LEAST = np.float32(math.log2(_MIN_ALPHA))
 
-# Rows of a table of constants: a block's columns and rows; a tile's rows of blocks, and right (+) and left (-) edges.
-TABLE = np.zeros(4 * LANES, np.float32)
-TABLE[:16], TABLE[16:32] = np.tile(np.arange(4), 4), np.repeat(np.arange(4), 4)
-TABLE[32:48], TABLE[48:64] = np.tile(4 * np.arange(8), 2), np.repeat([1, -1], 8)
+# Rows of a table of constants: where a tile's pixels are, x by columns of blocks and y by rows of them; then a tile's
+# rows of blocks, and right (+) and left (-) edges.
+TABLE = np.zeros((18, LANES), np.float32)
+TABLE[:8] = 4 * np.arange(8)[:, None] + np.tile(np.arange(4), 4) + 0.5
+TABLE[8:16] = 4 * np.arange(8)[:, None] + np.repeat(np.arange(4), 4) + 0.5
+TABLE[16], TABLE[17] = np.tile(4 * np.arange(8), 2), np.repeat([1, -1], 8)
+TABLE = TABLE.ravel()
 
 # Columns of a Gaussian's row: exponent of 2 at (dx, dy) is BRIGHT - (ALONG (dx + SKEW dy))^2 - (DOWN dy)^2.
 X, Y, ALONG, SKEW, DOWN, BRIGHT, RED, GREEN, BLUE, DEPTH, MAX_REACH, LIMIT = range(12)
@@ -38,14 +58,14 @@ def _pack(centres, conics, opacities, colours, depths, rows):
         row = rows[i * LANES : (i + 1) * LANES]
         a, b, c = np.float64(conics[i, 0]), np.float64(conics[i, 1]), np.float64(conics[i, 2])
         if opacities[i] > 0 and a > 0:
-            upright = c - b * b / a  # in double precision, for needles leave little of it
+            upright = max(c - b * b / a, 1e-30)  # in double precision, for needles leave little of it
             row[X], row[Y] = centres[i, 0], centres[i, 1]
             row[ALONG], row[SKEW] = math.sqrt(0.5 * LOG2_E * a), b / a
-            row[DOWN] = math.sqrt(0.5 * LOG2_E * max(upright, 0.0))
+            row[DOWN] = math.sqrt(0.5 * LOG2_E * upright)
             row[BRIGHT] = math.log2(opacities[i])
             row[LIMIT] = row[BRIGHT] + LOG2_255
             # How far below the centre the ellipse reaches furthest to the right.
-            row[MAX_REACH] = -b / c * math.sqrt(max(row[LIMIT], ZERO) / (0.5 * LOG2_E * max(upright, 1e-30)) * c / a)
+            row[MAX_REACH] = -b / c * math.sqrt(max(row[LIMIT], ZERO) / (0.5 * LOG2_E * upright) * c / a)
             for k in range(3):
                 row[RED + k] = colours[i, k]
             row[DEPTH] = depths[i]
@@ -57,8 +77,8 @@ def _pack(centres, conics, opacities, colours, depths, rows):
 def _blocks(rows, i, left, top, table):
     """Which blocks of a tile hold a pixel that the ellipse may touch: bit 8 r + c for column c of row r."""
     above = top + HALF - rows[i + Y]
-    sign = fetch(table, 48)
-    upper = fetch(table, 32) + above
+    sign = fetch(table, 17 * LANES)
+    upper = fetch(table, 16 * LANES) + above
     y = lowest(highest(sign * rows[i + MAX_REACH], upper), upper + np.float32(3))
     v = y * rows[i + DOWN]
     room = rows[i + LIMIT] - v * v
@@ -69,27 +89,27 @@ def _blocks(rows, i, left, top, table):
 
 
 @njit(inline="always")
-def _frame(rows, i, left, top, columns, lines):
-    """What is the same for all of a tile's blocks: slopes of the exponent's two roots, these roots at a block's pixels
-    relative to its corner, and where the tile's corner is seen from the centre."""
+def _frame(rows, i, left, top):
+    """The exponent's two roots as functions of a pixel in the tile: slopes of the first, slope of the second, and what
+    both are at the tile's corner."""
     along, down = rows[i + ALONG], rows[i + DOWN]
     slant = along * rows[i + SKEW]
-    x, y = np.float32(left) + HALF - rows[i + X], np.float32(top) + HALF - rows[i + Y]
-    return along, slant, down, columns * along + lines * slant, lines * down, x, y
+    x, y = np.float32(left) - rows[i + X], np.float32(top) - rows[i + Y]
+    return along, slant, down, along * x + slant * y, down * y
 
 
 @njit(inline="always")
-def _bell(rows, i, frame, block):
-    """A block's corner seen from the centre, and opacity exp(-q / 2) at its pixels."""
-    along, slant, down, u, v, x, y = frame
-    x, y = x + np.float32(4 * (block & 7)), y + np.float32(4 * (block >> 3))
-    u, v = u + (along * x + slant * y), v + down * y
-    return x, y, exp2(rows[i + BRIGHT] - u * u - v * v)
+def _bell(rows, i, frame, table, block):
+    """The roots, and the exponent of 2 in opacity exp(-q / 2), at pixels of a block."""
+    along, slant, down, u, v = frame
+    x, y = fetch(table, (block & 7) * LANES), fetch(table, (8 + (block >> 3)) * LANES)
+    u, v = along * x + (slant * y + u), down * y + v
+    return u, v, rows[i + BRIGHT] - v * v - u * u
 
 
 @njit(inline="always")
-def _alpha(raw, light, stop):
-    return where((raw >= MIN_ALPHA) & (light >= stop), lowest(raw, MAX_ALPHA), ZERO)
+def _alpha(exponent, light, stop):
+    return where((exponent >= LEAST) & (light >= stop), lowest(exp2(exponent), MAX_ALPHA), ZERO)
 
 
 @njit(inline="always")
@@ -118,7 +138,6 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
     across = (width + side - 1) // side
     for share in prange(len(shares) - 1):
         state = np.empty(BLOCKS * 5 * LANES, np.float32)
-        columns, lines = fetch(table, 0), fetch(table, 16)
         for k in range(shares[share], shares[share + 1]):
             left, top = k % across * side, k // across * side
             wide, high = _span(width, side, left), _span(height, side, top)
@@ -130,18 +149,19 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
             visited = 0
             for p in range(starts[k], starts[k + 1]):
                 i = np.int64(order[p]) * LANES
+                ahead(rows, np.int64(order[min(p + AHEAD, len(order) - 1)]) * LANES)
                 todo = alive & _blocks(rows, i, np.float32(left), np.float32(top), table) if alive else alive
                 masks[p] = todo
                 if not todo:
                     continue
-                frame = _frame(rows, i, left, top, columns, lines)
+                frame = _frame(rows, i, left, top)
                 while todo:
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
                     at = block * (5 * LANES)
-                    _, _, raw = _bell(rows, i, frame, block)
+                    _, _, exponent = _bell(rows, i, frame, table, block)
                     light = fetch(state, at)
-                    weight = _alpha(raw, light, stop) * light
+                    weight = _alpha(exponent, light, stop) * light
                     light = light - weight
                     put(state, at, light)
                     for c in range(4):
@@ -175,7 +195,6 @@ def _backward(
     across = (width + side - 1) // side
     for share in prange(len(shares) - 1):
         state = np.empty(BLOCKS * 7 * LANES, np.float32)
-        columns, lines = fetch(table, 0), fetch(table, 16)
         for k in range(shares[share], shares[share + 1]):
             left, top = k % across * side, k // across * side
             state[:] = 0
@@ -194,15 +213,16 @@ def _backward(
                 if not todo:
                     continue
                 i = np.int64(order[p]) * LANES
-                frame = _frame(rows, i, left, top, columns, lines)
-                s = sx = sy = sxx = sxy = syy = red = green = blue = far = columns * ZERO
+                ahead(rows, np.int64(order[min(p + AHEAD, len(order) - 1)]) * LANES)
+                frame = _frame(rows, i, left, top)
+                s = su = sv = suu = suv = svv = red = green = blue = far = filled(ZERO, SIXTEEN)
                 while todo:
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
                     at = block * (7 * LANES)
-                    x, y, raw = _bell(rows, i, frame, block)
+                    u, v, exponent = _bell(rows, i, frame, table, block)
                     light = fetch(state, at)
-                    alpha = _alpha(raw, light, stop)
+                    alpha = _alpha(exponent, light, stop)
                     weight = alpha * light
                     put(state, at, light - weight)
                     r, g = fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES)
@@ -211,18 +231,17 @@ def _backward(
                     worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
                     behind = fetch(state, at + LANES) - worth
                     put(state, at + LANES, behind)
-                    slope = worth - alpha * behind * inverse(ONE - alpha)
-                    slope = where(raw < MAX_ALPHA, slope, ZERO)
-                    dx, dy = columns + x, lines + y
-                    gx, gy = slope * dx, slope * dy
-                    s, sx, sy = s + slope, sx + gx, sy + gy
-                    sxx, sxy, syy = sxx + gx * dx, sxy + gx * dy, syy + gy * dy
+                    slope = worth - alpha * behind / (ONE - alpha)
+                    slope = where(alpha < MAX_ALPHA, slope, ZERO)
+                    gu, gv = slope * u, slope * v
+                    s, su, sv = s + slope, su + gu, sv + gv
+                    suu, suv, svv = suu + gu * u, suv + gu * v, svv + gv * v
                     red, green, blue, far = red + weight * r, green + weight * g, blue + weight * b, far + weight * d
-                put(sums, p * LANES, totals((s, sx, sy, sxx, sxy, syy, red, green, blue, far)))
+                put(sums, p * LANES, totals((s, su, sv, suu, suv, svv, red, green, blue, far)))
 
 
 @njit(parallel=True, **FAST)
-def _gather(sums, masks, order, conics, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
+def _gather(sums, masks, order, rows, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
     """Each thread adds up its own Gaussians' sums, in the order of tiles, and makes gradients of them."""
     n = len(to_depths)
     for part in prange(parts):
@@ -235,9 +254,16 @@ def _gather(sums, masks, order, conics, opacities, parts, to_centres, to_conics,
                 put(total, at, fetch(total, at) + fetch(sums, p * LANES))
         for i in range(begin, end):
             s = total[(i - begin) * LANES : (i - begin + 1) * LANES]
-            a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
-            to_centres[i, 0], to_centres[i, 1] = a * s[1] + b * s[2], b * s[1] + c * s[2]
-            to_conics[i, 0], to_conics[i, 1], to_conics[i, 2] = -HALF * s[3], -s[4], -HALF * s[5]
+            along, skew, down = rows[i * LANES + ALONG], rows[i * LANES + SKEW], rows[i * LANES + DOWN]
+            to_centres[i, 0] = LN_4 * along * s[1]
+            to_centres[i, 1] = LN_4 * (along * skew * s[1] + down * s[2])
+            if along > 0:
+                dudy, dydy = s[4] / (along * down), s[5] / (down * down)
+                dxdy = dudy - skew * dydy
+                to_conics[i, 0] = -HALF * (s[3] / (along * along) - skew * (dudy + dxdy))
+                to_conics[i, 1], to_conics[i, 2] = -dxdy, -HALF * dydy
+            else:
+                to_conics[i] = 0
             to_opacities[i] = s[0] / opacities[i] if opacities[i] > 0 else ZERO
             for k in range(3):
                 to_colours[i, k] = s[6 + k]
@@ -263,7 +289,7 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
     pictures = (x.numpy() for x in (rgb, depth, opacity))
     _forward(rows, order, starts, _shares(work), *ctx.numbers, *pictures, masks, visits)
     ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * work)
-    ctx.save_for_backward(rgb, depth, opacity, conics, opacities)
+    ctx.save_for_backward(rgb, depth, opacity, opacities)
     return rgb, depth, opacity
 
 
@@ -272,7 +298,7 @@ def backward(ctx, *grads):
     n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
     _backward(*(x.numpy() for x in grads), *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
     results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
-    _gather(sums, masks, order, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
+    _gather(sums, masks, order, rows, saved[3], get_num_threads(), *(x.numpy() for x in results))
     return *results, None, None
 
 

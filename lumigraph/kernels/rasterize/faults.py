@@ -8,9 +8,9 @@ FAULTS = {
     "the other axis": ("gpu", "_backward", "conic[2] * sum_y", "conic[0] * sum_y"),
     "a block too few": ("cpu", "_blocks", "np.float32(1.5)", "np.float32(0.5)"),
     "spent blocks visited": ("cpu", "_alpha", "& (light >= stop)", "& (light >= ZERO)"),
-    "light not lost on the cpu": ("cpu", "_backward", "behind * inverse(ONE - alpha)", "behind"),
-    "0.99, yet with gradient on the cpu": ("cpu", "_backward", "raw < MAX_ALPHA", "raw >= ZERO"),
-    "half a square": ("cpu", "_gather", "-HALF * s[5]", "-s[5]"),
+    "light not lost on the cpu": ("cpu", "_backward", "behind / (ONE - alpha)", "behind"),
+    "0.99, yet with gradient on the cpu": ("cpu", "_backward", "alpha < MAX_ALPHA", "alpha >= ZERO"),
+    "half a square": ("cpu", "_gather", "-HALF * dydy", "-dydy"),
     "only one block's sums": ("cpu", "_gather", "and masks[p]", "and masks[p] == 1"),
 }
 
