@@ -45,7 +45,6 @@ TABLE = np.zeros((18, LANES), np.float32)
 TABLE[:8] = 4 * np.arange(8)[:, None] + np.tile(np.arange(4), 4) + 0.5
 TABLE[8:16] = 4 * np.arange(8)[:, None] + np.repeat(np.arange(4), 4) + 0.5
 TABLE[16], TABLE[17] = np.tile(4 * np.arange(8), 2), np.repeat([1, -1], 8)
-TABLE = TABLE.ravel()
 
 # Columns of a Gaussian's row: exponent of 2 at (dx, dy) is BRIGHT - (ALONG (dx + SKEW dy))^2 - (DOWN dy)^2.
 X, Y, ALONG, SKEW, DOWN, BRIGHT, RED, GREEN, BLUE, DEPTH, MAX_REACH, LIMIT = range(12)
@@ -285,7 +284,7 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
     rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
     work = np.diff(starts) + TILE
     masks, visits = np.empty(len(order), np.uint64), np.empty(len(work), np.int64)
-    ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE
+    ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE.ravel()
     pictures = (x.numpy() for x in (rgb, depth, opacity))
     _forward(rows, order, starts, _shares(work), *ctx.numbers, *pictures, masks, visits)
     ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * work)
