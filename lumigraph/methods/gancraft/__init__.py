@@ -150,7 +150,7 @@ class GANcraft(Method):
             samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5,
             encoder_size=32, encoder_width=12,
             painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
-            adversary_width=12, kl_weight=0.005, opacity_weight=0.5, momentum=0.5,
+            adversary_width=12, kl_weight=3e-4, opacity_weight=0.5, momentum=0.5,
             learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
             painter_learning_rate=5e-4, painter_adversary_learning_rate=5e-4,
         )  # fmt: skip
