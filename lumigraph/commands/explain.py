@@ -302,7 +302,7 @@ class ExplainTemplate:
 
     def run(self) -> int:
         from .. import methods
-        from ..explain.template import draw, label, shown_photograph, stages_of
+        from ..explain.template import draw, shown_photograph, stages_of
         from ..run import Run, check_new
 
         run = Run(self.run_folder)
@@ -313,7 +313,7 @@ class ExplainTemplate:
         found = stages_of(run, scene, into, self.seconds, self.views, folder, self.alone)
         first = scene.photograph(shown_photograph(scene)).before(scene.frame.background)
         draw(folder, f"{run.title}: train, move, continue", first, found)
-        show({label(x).partition(":")[0]: label(x).partition(": ")[2] for x in found} | {"files": str(folder)})
+        show({f"{x.method}, {x.stage}": str(x) for x in found} | {"files": str(folder)})
         return 0
 
 

@@ -43,6 +43,9 @@ class TemplateStage:
     view_seconds: float
     picture: Float[Tensor, "height width 3"]
 
+    def __str__(self) -> str:
+        return f"{self.psnr:.1f} dB, {self.seconds:.0f} s"
+
 
 def stages_of(
     run: Run, scene: Scene, into: Sequence[str], seconds: float, views: int, runs: Path, alone: bool
@@ -76,7 +79,7 @@ def stages_of(
         whole = moved + made.seconds
         found.append(stage(Run(runs / name).method(), "continued", whole))
         if alone:
-            found.append(stage(from_nothing(scene, name, whole, aim.seed), "from nothing", whole))
+            found.append(stage(from_nothing(scene, name, whole, aim.seed, teacher.device), "from nothing", whole))
     return found
 
 
@@ -86,9 +89,9 @@ def shown_photograph(scene: Scene) -> int:
     return int((scene.splits["train"] if held_out is None or not len(held_out) else held_out)[0])
 
 
-def from_nothing(scene: Scene, name: str, seconds: float, seed: int) -> Method:
+def from_nothing(scene: Scene, name: str, seconds: float, seed: int, device: torch.device) -> Method:
     """A method trained on a scene for so many seconds, with its preset."""
-    kind, device = methods.find(name), torch.device("cpu")
+    kind = methods.find(name)
     method = build(kind, scene.frame, kind.preset(device), device, seed, learning=True)
     go_on_unless(fit(method, scene, seconds=seconds, seed=seed, show=False).signal)
     return method
@@ -101,7 +104,7 @@ def draw(folder: Path, title: str, truth: Float[Tensor, "height width 3"], found
     series = [Series(f"{first.method}, trained", [first.seconds], [first.psnr])]
     for name in dict.fromkeys(x.method for x in rest):
         own = [x for x in rest if x.method == name]
-        labels = [f"{x.psnr:.1f} dB, {x.seconds:.0f} s" for x in (first, *own)]
+        labels = [str(x) for x in (first, *own)]
         labels[:2] = [f"{x.method}, {x.psnr:.1f} dB" for x in (first, own[0])]
         rows.append(Row(labels, [x.picture for x in (first, *own)]))
         path = [first, *(x for x in own if x.stage != "from nothing")]
@@ -112,10 +115,6 @@ def draw(folder: Path, title: str, truth: Float[Tensor, "height width 3"], found
     chart = line_chart(series, "seconds of training", "PSNR (dB)", marks=True, smoothed=False)
     write_bytes(folder / "template.svg", standalone(chart), "figure")
     write_json(folder / "template.json", [figures(x) for x in found], "figure")
-
-
-def label(stage: TemplateStage) -> str:
-    return f"{stage.method}, {stage.stage}: {stage.psnr:.1f} dB, {stage.seconds:.0f} s"
 
 
 def figures(stage: TemplateStage) -> dict[str, Any]:

@@ -37,7 +37,7 @@ ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 TILE, PAIR = 8, 8  # about what a tile costs in pairs, and a pair in visits to a block, to share work out by
 AHEAD = 6  # pairs from the one at hand to that whose row is asked of the memory
 LOG2_E, LOG2_255, LN_4 = math.log2(math.e), math.log2(255), np.float32(math.log(4))
-LEAST = np.float32(math.log2(_MIN_ALPHA))
+MIN_EXPONENT = np.float32(math.log2(_MIN_ALPHA))
 
 # Rows of a table of constants: where a tile's pixels are, x by columns of blocks and y by rows of them; then a tile's
 # rows of blocks, and right (+) and left (-) edges.
@@ -108,7 +108,7 @@ def _bell(rows, i, frame, table, block):
 
 @njit(inline="always")
 def _alpha(exponent, light, stop):
-    return where((exponent >= LEAST) & (light >= stop), lowest(exp2(exponent), MAX_ALPHA), ZERO)
+    return where((exponent >= MIN_EXPONENT) & (light >= stop), lowest(exp2(exponent), MAX_ALPHA), ZERO)
 
 
 @njit(inline="always")
