@@ -657,26 +657,33 @@ def test_one_photograph_is_an_intake_too():
 
 
 @pytest.mark.parametrize(("asked", "other"), [("incremental", "global"), ("global", "incremental")])
-def test_where_one_mapper_finds_nothing_the_other_is_tried(tmp_path, monkeypatch, asked, other):
-    """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once."""
-    tried: list[str] = []
+@pytest.mark.parametrize("first", [0.0, 0.5])
+def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeypatch, asked, other, first):
+    """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once; and a
+    wrong model has a small error too."""
+    tried: list[tuple[str, int]] = []
+    shares = {(asked, 0): first, (other, 0): 0.4, ("incremental", 1): 0.9}
 
-    def mapped(database: Path, models: Path, mapper: str) -> None:
-        tried.append(mapper)
-        assert not any(models.iterdir())
-        (models / "0").mkdir()  # the first leaves a pair behind
-        (models / "0" / mapper).touch()
+    def mapped(database: Path, models: Path, mapper: str, seed: int) -> None:
+        tried.append((mapper, seed))
+        (models / "0").mkdir(parents=True)
+        (models / "0" / f"{mapper}{seed}").touch()
 
-    def placed(models: Path) -> int:
-        return 2 if (models / "0" / asked).exists() else 8 * (models / "0" / other).exists()
+    def confirmed(models: Path) -> float:
+        return shares[tried[-1]] if models.name == "attempt" else 1.0
 
-    monkeypatch.setattr(reconstruction, "largest", placed)
+    monkeypatch.setattr(reconstruction, "largest", lambda models: 8)
     work = object.__new__(Reconstruction)
     work.stages, work.models, work.unfolded = Stages(tmp_path), tmp_path / "models", tmp_path / "unfolded"
-    work.database, work.options, work.map = tmp_path / "database.db", MotionOptions(mapper=asked), mapped
+    work.database, work.options = tmp_path / "database.db", MotionOptions(mapper=asked)
+    work.map, work.confirmed = mapped, confirmed
     for _ in range(2):  # once it is there it stays
         work.place("key")
-        assert tried == [asked, other] and (work.models / reconstruction.FALLBACK_MARK).exists()
+        assert tried == [(asked, 0), (other, 0), ("incremental", 1)]
+        assert {place.name for place in work.models.iterdir()} == {"0", reconstruction.NOTE_FILE}
+        assert (work.models / "0" / "incremental1").exists()
+        note = (work.models / reconstruction.NOTE_FILE).read_text()
+        assert ("contradicted 50%" in note) == bool(first) and "contradicts 10%" in note
 
 
 def synthetic_model(place, frames, model="SIMPLE_RADIAL", params=(1280.0, 512.0, 384.0, 0.05)):
