@@ -9,9 +9,10 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Integer
 
 from ...geometry import evenly
 from ...system.library import pycolmap
@@ -23,8 +24,8 @@ MAX_EPIPOLAR_ERROR = 0.003  # distance from the epipolar line, of a photograph's
 
 @dataclass(frozen=True)
 class Agreement:
-    """Numbers of matches: all of the pairs that were looked at, and those whose epipolar line the model confirms.
-    Matches of photographs without a place are not confirmed."""
+    """Numbers of matches: all among the photographs that matches connect with a model's, and those whose epipolar line
+    the model confirms. Matches of photographs without a place are not confirmed."""
 
     matches: int
     confirmed: int
@@ -47,7 +48,8 @@ def agreement(model: pycolmap.Reconstruction, database: Path) -> Agreement:
             for number, found in zip(*opened.read_two_view_geometries(), strict=True)
             if len(found.inlier_matches) >= MIN_MATCHES
         ]
-    for (a, b), matched in evenly(pairs, MAX_PAIRS):
+    near = connected(pairs, {number for number, name in names.items() if name in placed})
+    for (a, b), matched in evenly(near, MAX_PAIRS):
         matches += len(matched)
         first, second = placed.get(names[a]), placed.get(names[b])
         if first is not None and second is not None:
@@ -55,13 +57,20 @@ def agreement(model: pycolmap.Reconstruction, database: Path) -> Agreement:
     return Agreement(matches, confirmed)
 
 
+def connected(pairs: list[tuple[tuple[int, int], Any]], numbers: set[int]) -> list[tuple[tuple[int, int], Any]]:
+    """Pairs of photographs that other pairs connect with some of these."""
+    while new := {x for pair, _ in pairs for x in pair if numbers.intersection(pair)} - numbers:
+        numbers = numbers | new
+    return [(pair, found) for pair, found in pairs if numbers.intersection(pair)]
+
+
 def on_epipolar_lines(
     model: pycolmap.Reconstruction,
     first: pycolmap.Image,
     second: pycolmap.Image,
-    first_features: Float[np.ndarray, "feature 2"],
-    second_features: Float[np.ndarray, "feature 2"],
-    matched: Int[np.ndarray, "match 2"],
+    first_features: Float[np.ndarray, "first 2"],
+    second_features: Float[np.ndarray, "second 2"],
+    matched: Integer[np.ndarray, "match 2"],
 ) -> Bool[np.ndarray, " match"]:
     """True for the matches of two photographs whose Sampson distance is small under the model's poses."""
     cameras = model.cameras[first.camera_id], model.cameras[second.camera_id]

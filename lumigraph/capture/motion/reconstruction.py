@@ -29,7 +29,7 @@ from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from ..transforms import read as read_transforms
-from .agreement import agreement
+from .agreement import Agreement, agreement
 from .demand import demand_of, fitted, reduced_pixels
 from .diagnosis import (
     ALL_TURNED_SHARE,
@@ -347,32 +347,31 @@ class Reconstruction:
         asked = self.options.mapper
         ways = [(asked, 0), (OTHER_MAPPER[asked], 0), *(("incremental", seed) for seed in OTHER_SEEDS)]
         with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as chosen:
-            shares: list[float] = []
+            found: list[Agreement] = []
             for mapper, seed in ways:
                 attempt = chosen / "attempt"
                 attempt.mkdir()
                 self.map(self.database, attempt, mapper, seed=seed)
-                share, best = self.confirmed(attempt), max(shares, default=0.0)
-                shares.append(share)
-                if share > best:
+                now = self.agreement(attempt)
+                if all(now.confirmed > other.confirmed for other in found):
                     for place in set(chosen.iterdir()) - {attempt}:
                         remove(place)
                     for place in attempt.iterdir():
                         place.rename(chosen / place.name)
-                    if len(shares) > 1:
-                        write_bytes(
-                            chosen / NOTE_FILE, made_otherwise(shares[0], mapper, seed, share).encode(), ours=True
-                        )
+                    if found:
+                        note = made_otherwise(found[0].share, mapper, seed, now.share)
+                        write_bytes(chosen / NOTE_FILE, note.encode(), ours=True)
                 remove(attempt)
-                if max(shares) >= MIN_AGREEMENT:
+                found.append(now)
+                if now.share >= MIN_AGREEMENT:
                     break
 
-    def confirmed(self, models: Path) -> float:
-        """Share of the matches that the largest of some models confirms; 0 without a model."""
+    def agreement(self, models: Path) -> Agreement:
+        """Agreement of the largest of some models with the matches. Panoramas are taken as they are."""
         found = read_models(models)
         if not found or found[0].num_reg_images() < MIN_VIEWS:
-            return 0.0
-        return 1.0 if self.spherical else agreement(found[0], self.database).share
+            return Agreement(matches=1, confirmed=0)
+        return Agreement(0, 0) if self.spherical else agreement(found[0], self.database)
 
     def unfold(self, key: str) -> None:
         """If the model leaps between neighbours, make another from what near neighbours share alone. Far ones that
