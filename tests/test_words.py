@@ -34,7 +34,7 @@ from lumigraph.datasets.words import Words
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
 from lumigraph.synthetic import captions
-from lumigraph.training.captions import CaptionNumbers, learn_captions, perturbed
+from lumigraph.training.captions import CaptionNumbers, contrast, different, learn_captions, perturbed, thing_loss
 
 pytestmark = budget("methods", 20)
 CPU = torch.device("cpu")
@@ -310,8 +310,32 @@ def test_a_perturbation_stays_small_and_misleads():
     n = CaptionNumbers(pictures=40, steps=1, batch=8, width=4, embedding=8)
     learned = learn_captions(n)
     pictures, said = torch.rand(4, 3, 32, 32, generator=chance()), torch.eye(4, 8)
-    from lumigraph.training.captions import contrast
-
     changed = perturbed(learned.network, pictures, said, 0.05, chance())
     assert (changed - pictures).abs().max() <= 0.05 + 1e-6
-    assert contrast(learned.network, changed, said) > contrast(learned.network, pictures, said)
+    before, after = (contrast(learned.network, learned.network.of_pictures(x), said) for x in (pictures, changed))
+    assert after > before
+
+
+def test_batches_follow_the_pictures_and_repeat_no_group():
+    """Half of the pictures are of two groups, and half of fifty: a batch holds both of the two."""
+    same = torch.cat([torch.arange(2).repeat(25), torch.arange(2, 52)])
+    for seed in range(5):
+        groups = same[different(same, 8, chance(seed))].tolist()
+        assert len(set(groups)) == len(groups) == 8
+    many = [same[different(same, 8, chance(seed))] for seed in range(200)]
+    assert torch.stack([(x < 2).sum() for x in many]).float().mean() > 0.9  # 0.3 if each group were as likely
+
+
+def test_no_thing_is_learnt_to_be_wrong_beside_its_held_out_neighbour():
+    things, never = captions.THINGS, [set(pair) for pair in captions.held_out()]
+    first, second = next(
+        (i, j) for i in range(15) for j in range(i) if things[i].colour == things[j].colour
+    )  # no held-out pair has one colour twice
+    there = torch.zeros(1, 15, dtype=torch.bool)
+    there[0, [first, second]] = True
+    logits = torch.zeros(1, 15, requires_grad=True)
+    (gradient,) = torch.autograd.grad(thing_loss(logits, there), logits)
+    assert gradient[0, first] < 0 and gradient[0, second] < 0
+    for other in set(range(15)) - {first, second}:
+        allowed = [{things[other], things[beside]} not in never for beside in (first, second)]
+        assert bool(gradient[0, other] > 0) == any(allowed)

@@ -2,7 +2,7 @@
 
 CLIP's architecture and contrastive loss (Radford 2021, section 2.3) at small size. Pictures stand before random
 backgrounds, and are perturbed against the model while it learns (Madry 2018), so that its gradients look like things
-(Santurkar 2019)."""
+(Santurkar 2019). A head that names the things of a picture helps while it learns, and is dropped."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import affine_grid, cross_entropy, grid_sample
 
-from ..color.blending import before
 from ..components.guidance.clip import EXPANSION, Clip, ClipSizes, ResnetSizes, TransformerSizes
 from ..components.guidance.clip_files import HEAD_WIDTH
 from ..components.guidance.tokenizer import Tokenizer
@@ -36,13 +35,14 @@ PIXELS = 32  # a side of the model's pictures
 class CaptionNumbers:
     """Numbers of the model and of its training."""
 
-    pictures: Count = 3000  # pictures that are traced to learn from; more generalise better, and take longer
-    steps: Steps = 2000  # steps of learning; more recognise more
-    batch: BatchSize = 64  # pictures in a step, each the wrong one for all other captions
+    pictures: Count = 6000  # pictures that are traced to learn from; more generalise better, and take longer
+    steps: Steps = 4500  # steps of learning; more recognise more
+    batch: BatchSize = 32  # pictures of a step, compared with their captions and as many others
     width: Width = 16  # channels of the residual network's stem; wider recognises more, and costs time
     embedding: Width = 64  # of the shared space
-    learning_rate: LearningRate = 1e-3  # AdamW's learning rate at its highest
+    learning_rate: LearningRate = 2e-3  # AdamW's learning rate at its highest
     weight_decay: NonNegative = 0.05  # of AdamW
+    things_weight: NonNegative = 2.0  # weight of the loss that names each thing of a picture; 0: off
     perturbation: Share = 8 / 255  # largest change of a colour against the model; 0 is faster, its gradients are noise
     perturbed_from: Share = 0.8  # share of the steps after which pictures are perturbed
     seed: Seed = 0
@@ -71,28 +71,45 @@ def new_model(n: CaptionNumbers) -> tuple[Clip, Tokenizer]:
 
 
 def learn_captions(n: CaptionNumbers) -> Learned:
-    """A model of the captions of procedural scenes."""
+    """A model of the captions of procedural scenes.
+
+    Three things make it learn shapes beside colours. Each picture is compared with captions of no picture in the batch
+    too; a linear head, dropped afterwards, names its things; backgrounds become textured by and by.
+    """
     random, generator = np.random.default_rng(n.seed), torch.Generator().manual_seed(n.seed)
     groups = list(captions.training_groups(random, n.pictures))
     traced = torch.from_numpy(captions.pictures(groups, TRACED_PIXELS, n.seed))
     network, tokenizer = new_model(n)
     network.visual.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    tokens = torch.stack([tokenizer([captions.caption(order) for order in (x, x[::-1])]) for x in groups])
-    numbers = {things: i for i, things in enumerate(dict.fromkeys(frozenset(x) for x in groups))}
-    same = torch.tensor([numbers[frozenset(x)] for x in groups])
-    optimizer = torch.optim.AdamW(network.parameters(), n.learning_rate, weight_decay=n.weight_decay)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(n.seed)
+        head = nn.Linear(n.embedding, len(captions.THINGS))
+    distinct = {frozenset(group): group for group in groups}
+    numbers = {things: i for i, things in enumerate(distinct)}
+    same = torch.tensor([numbers[frozenset(group)] for group in groups])
+    tokens = torch.stack([tokenizer([captions.caption(x) for x in (y, y[::-1])]) for y in distinct.values()])
+    short = torch.tensor([len(x) < 3 for x in distinct])
+    there = torch.tensor([[thing in x for thing in captions.THINGS] for x in distinct])
+    optimizer = torch.optim.AdamW(
+        [*network.parameters(), *head.parameters()], n.learning_rate, weight_decay=n.weight_decay
+    )
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, n.learning_rate, n.steps, pct_start=WARMUP)
     for step in track(range(n.steps), "Learning captions", n.steps):
         chosen = different(same, n.batch, generator)
-        order = torch.randint(2, (len(chosen),), generator=generator)
-        pictures = augmented(traced[chosen], PIXELS, generator)
-        said = network.of_captions(tokens[chosen, order])
+        own = same[chosen]
+        others = short.clone()
+        others[own] = False
+        others = others.nonzero()[:, 0]
+        shown = torch.cat([own, others[torch.randperm(len(others), generator=generator)[: n.batch]]])
+        order = torch.randint(2, (len(shown),), generator=generator)
+        pictures = augmented(traced[chosen], PIXELS, generator, step / n.steps)
+        said = network.of_captions(tokens[shown, order])
         if n.perturbation and step >= n.perturbed_from * n.steps:
             pictures = perturbed(network, pictures, said.detach(), n.perturbation, generator)
         optimizer.zero_grad()
-        loss = contrast(network, pictures, said)
+        seen = network.of_pictures(pictures)
+        loss = contrast(network, seen, said) + n.things_weight * thing_loss(network.scale * head(seen), there[own])
         loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
         schedule.step()
     network.eval().requires_grad_(False)
@@ -100,65 +117,90 @@ def learn_captions(n: CaptionNumbers) -> Learned:
 
 
 def different(same: Int[Tensor, " picture"], count: int, generator: torch.Generator) -> Int[Tensor, " chosen"]:
-    """Random pictures, at most one of each group of things. same: number of each picture's group"""
-    order = torch.randperm(len(same), generator=generator)
-    first = torch.full((int(same.max()) + 1,), -1)
-    first[same[order]] = order  # the last one of each group
-    there = first[first >= 0]
+    """Random pictures, at most one of each group of things. same: number of each picture's group
+
+    Groups are drawn by their number of pictures: if each were as likely, groups of three things, of which there are
+    most, would fill the batch, and their shapes are the smallest.
+    """
+    order = torch.randperm(len(same), generator=generator)[: 2 * count]
+    last = torch.full((int(same.max()) + 1,), -1)
+    last[same[order]] = order
+    there = last[last >= 0]
     return there[torch.randperm(len(there), generator=generator)[:count]]
 
 
 def contrast(
-    network: Clip, pictures: Float[Tensor, "pair 3 size size"], said: Float[Tensor, "pair embedding"]
+    network: Clip, seen: Float[Tensor, "picture embedding"], said: Float[Tensor, "caption embedding"]
 ) -> Tensor:
-    """The symmetric contrastive loss (Radford 2021, figure 3). said: embedding of each picture's caption"""
-    logits = network.scale * network.of_pictures(pictures) @ said.T
-    own = torch.arange(len(pictures), device=logits.device)
-    return 0.5 * (cross_entropy(logits, own) + cross_entropy(logits.T, own))
+    """The symmetric contrastive loss (Radford 2021, figure 3) of embeddings. said: of each picture's caption in turn,
+    then of captions of no picture here"""
+    logits = network.scale * seen @ said.T
+    own = torch.arange(len(seen), device=logits.device)
+    return 0.5 * (cross_entropy(logits, own) + cross_entropy(logits[:, : len(seen)].T, own))
+
+
+def thing_loss(logits: Float[Tensor, "picture thing"], there: Bool[Tensor, "picture thing"]) -> Tensor:
+    """Cross entropy of each thing in a picture against those that may be there instead.
+
+    Things that would make a held-out pair are left out, so that none is learnt to be wrong because of its neighbours.
+    """
+    never = torch.zeros(2 * [len(captions.THINGS)])
+    for pair in captions.held_out():
+        a, b = map(captions.THINGS.index, pair)
+        never[a, b] = never[b, a] = 1
+    picture, thing = there.nonzero(as_tuple=True)
+    beside = there[picture].float()
+    beside[torch.arange(len(picture)), thing] = 0
+    return cross_entropy(logits[picture].masked_fill(beside + beside @ never > 0, -torch.inf), thing)
 
 
 def perturbed(
     network: Clip,
-    pictures: Float[Tensor, "pair 3 size size"],
-    said: Float[Tensor, "pair embedding"],
+    pictures: Float[Tensor, "picture 3 size size"],
+    said: Float[Tensor, "caption embedding"],
     most: float,
     generator: torch.Generator,
-) -> Float[Tensor, "pair 3 size size"]:
+) -> Float[Tensor, "picture 3 size size"]:
     """Pictures changed against the model by one step from a random start (Wong 2020). most: change of a colour"""
     start = most * (2 * torch.rand(pictures.shape, generator=generator) - 1)
     changed = (pictures + start).requires_grad_()
-    (gradient,) = torch.autograd.grad(contrast(network, changed, said), changed)
+    (gradient,) = torch.autograd.grad(contrast(network, network.of_pictures(changed), said), changed)
     away = (changed.detach() + 1.25 * most * gradient.sign() - pictures).clamp(-most, most)
     return (pictures + away).clamp(0, 1)
 
 
 def augmented(
-    rgba: UInt8[Tensor, "picture side side 4"], size: int, generator: torch.Generator
+    rgba: UInt8[Tensor, "picture side side 4"], size: int, generator: torch.Generator, textured: float = 0.5
 ) -> Float[Tensor, "picture 3 size size"]:
-    """Pictures before random backgrounds, mirrored, cropped, brighter or darker, with noise."""
+    """Pictures mirrored, cropped, before random backgrounds, with noise. textured: share of the backgrounds"""
     count = len(rgba)
-    rgb = before_random(rgba, generator)
     turn = torch.zeros(count, 2, 3)
     zoom = 1 + MAX_ZOOM * (2 * torch.rand(count, generator=generator) - 1)
     mirror = 2.0 * torch.randint(2, (count,), generator=generator) - 1
     turn[:, 0, 0], turn[:, 1, 1] = zoom * mirror, zoom
     turn[:, :, 2] = MAX_SHIFT * (2 * torch.rand(count, 2, generator=generator) - 1)
-    grid = affine_grid(turn, [count, 3, size, size], align_corners=False)
-    x = grid_sample(rgb, grid, padding_mode="reflection", align_corners=False)
+    grid = affine_grid(turn, [count, 4, size, size], align_corners=False)
+    x = grid_sample(premultiplied(rgba), grid, align_corners=False)
+    x = before_random(x, generator, textured)
     noise = torch.randn(x.shape, generator=generator) * torch.rand(count, 1, 1, 1, generator=generator)
     return (x + MAX_NOISE * noise).clamp(0, 1)
 
 
+def premultiplied(rgba: UInt8[Tensor, "picture side side 4"]) -> Float[Tensor, "picture 4 side side"]:
+    """Pictures in [0, 1] with colours multiplied by alpha."""
+    x = rgba.movedim(-1, 1).float() / 255
+    return torch.cat([x[:, :3] * x[:, 3:], x[:, 3:]], 1)
+
+
 def before_random(
-    rgba: UInt8[Tensor, "picture side side 4"], generator: torch.Generator
+    rgba: Float[Tensor, "picture 4 side side"], generator: torch.Generator, textured: float = 0.5
 ) -> Float[Tensor, "picture 3 side side"]:
-    """Pictures before random backgrounds: plain, or those of Dream Fields."""
-    x = rgba.float() / 255
-    plain = torch.rand(len(x), 3, 1, 1, generator=generator)
-    behind = torch.where(
-        torch.rand(len(x), 1, 1, 1, generator=generator) < 0.5, plain, backgrounds(len(x), x.shape[1], generator)
-    )
-    return before(x[..., :3], x[..., 3], behind.movedim(1, -1)).movedim(-1, 1)
+    """Premultiplied pictures before random backgrounds: plain, or a share of those of Dream Fields."""
+    behind = torch.rand(len(rgba), 3, 1, 1, generator=generator).expand(len(rgba), 3, *rgba.shape[2:]).clone()
+    chosen = torch.randperm(len(rgba), generator=generator)[: round(textured * len(rgba))]
+    if len(chosen):
+        behind[chosen] = backgrounds(len(chosen), rgba.shape[-1], generator)
+    return rgba[:, :3] + (1 - rgba[:, 3:]) * behind
 
 
 @torch.no_grad()
@@ -167,7 +209,7 @@ def recognised(network: Clip, tokenizer: Tokenizer, seed: int) -> float:
     pairs = captions.pairs()
     shown = [pair for pair in captions.held_out() for _ in range(HELD_OUT_PICTURES)]
     traced = torch.from_numpy(captions.pictures(shown, network.sizes.picture, seed))
-    pictures = before_random(traced, torch.Generator().manual_seed(seed))
+    pictures = before_random(premultiplied(traced), torch.Generator().manual_seed(seed))
     said = network.of_captions(tokenizer([captions.caption(pair) for pair in pairs]))
     best = (network.of_pictures(pictures) @ said.T).argmax(-1)
     return float((best == torch.arange(len(captions.held_out())).repeat_interleave(HELD_OUT_PICTURES)).float().mean())
