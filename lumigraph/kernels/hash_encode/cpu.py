@@ -15,6 +15,7 @@ from . import PRIMES
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0), np.float32(1)
 BLOCK = 64  # points whose corners are worked out together; entries and weights are laid out corner by corner
+PASS = 64  # entries of a level, for each point looked up, up to which it is read in order first
 CHUNK = 1 << 16  # points a thread takes at most at a time: many, so that a level's table is fetched once
 
 
@@ -115,7 +116,7 @@ def _look_up(points, n, table, resolutions, offsets, masks, features, out, share
         last = min(n, (chunk + 1) * share)
         for level in range(len(resolutions)):
             base, plane = offsets[level], level * width * n
-            if 8 * (last - chunk * share) >= offsets[level + 1] - base:
+            if PASS * (last - chunk * share) >= offsets[level + 1] - base:
                 put(weights, 0, _pass_over(table, base * width, offsets[level + 1] * width))
             for first in range(chunk * share, last, BLOCK):
                 count = min(BLOCK, last - first)
