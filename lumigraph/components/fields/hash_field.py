@@ -117,17 +117,19 @@ class HashField(Field):
 
     def encode(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
         """Features of all levels, the coarsest first."""
-        return self._look_up(self.space.warp(points))
-
-    def _look_up(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
-        encoded = kernels.hash_encode(coordinates * (0.5 / self.extent) + 0.5, self.table, self.levels)
+        encoded = kernels.hash_encode(self.space.warp(points) * (0.5 / self.extent) + 0.5, self.table, self.levels)
         weights = self.joining(self.levels.levels) if self.joining else None
         return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:
-        coordinates, stretch = self.space.mapped(points)
-        geometry = self.density_network(self._look_up(coordinates))
-        return truncated_exp(geometry[:, 0]) * stretch, geometry
+        return self.decode(points, self.encode(points))
+
+    def decode(
+        self, points: Float[Tensor, "point 3"], encoded: Float[Tensor, "point width"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point geometry"]]:
+        """Density per scene unit and geometry features of points that were encoded."""
+        geometry = self.density_network(encoded)
+        return truncated_exp(geometry[:, 0]) * self.space.stretch(points), geometry
 
     def colour(
         self, features: Float[Tensor, "point geometry"], directions: Directions, code: Codes | None = None

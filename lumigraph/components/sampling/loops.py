@@ -37,7 +37,7 @@ def sum_excess(found, bins, edges, w, little, excess, slope):
         below = np.zeros(count + 1)
         for b in range(count):
             below[b + 1] = below[b] + found[ray, b]
-        steps = np.zeros(count + 1, np.float32)
+        steps = np.zeros(count + 1)
         total, first, last = ZERO, 0, 0
         for i in range(w.shape[1]):
             start, end = edges[ray, i], edges[ray, i + 1]
@@ -52,7 +52,7 @@ def sum_excess(found, bins, edges, w, little, excess, slope):
                 steps[first] -= np.float32(2) * share
                 steps[last] += np.float32(2) * share
         excess[ray] = total
-        running = ZERO
+        running = 0.0
         for b in range(count):
             running += steps[b]
             slope[ray, b] = running

@@ -159,7 +159,9 @@ class _Excess(torch.autograd.Function):
     @staticmethod
     def forward(ctx, found, bins, edges, w):
         excess, slope = w.new_empty(len(w)), torch.empty_like(found)
-        sum_excess(*(x.detach().contiguous().numpy() for x in (found, bins, edges, w)), LITTLE, excess.numpy(), slope.numpy())
+        sum_excess(
+            *(x.detach().contiguous().numpy() for x in (found, bins, edges, w)), LITTLE, excess.numpy(), slope.numpy()
+        )
         ctx.save_for_backward(slope)
         return excess
 

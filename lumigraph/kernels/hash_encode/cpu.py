@@ -7,7 +7,21 @@ from functools import cache
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from .._lanes import LANES, SIXTEEN, ahead, fetch, fetch_like, filled, gather, highest, lowest, put, real, scatter, whole
+from .._lanes import (
+    LANES,
+    SIXTEEN,
+    ahead,
+    fetch,
+    fetch_like,
+    filled,
+    gather,
+    highest,
+    lowest,
+    put,
+    real,
+    scatter,
+    whole,
+)
 from .._operation import differentiable, empty
 from ..sparse_grid.cpu import cell_of
 from . import PRIMES

@@ -12,7 +12,7 @@ from .._operation import differentiable, empty
 
 FAST = {"cache": True, "fastmath": True, "error_model": "numpy"}
 BLOCK = 32  # samples, whose values of one feature are lanes; a buffer has feature f of sample s at [f BLOCK + s]
-TILE = 4  # outputs that are summed up together: each weight that is read serves BLOCK products
+TILE = 4  # outputs that are summed up together: with LANES samples each, sums fill half of sixteen registers
 ROW = (0,) * BLOCK
 ZERO = np.float32(0)
 
