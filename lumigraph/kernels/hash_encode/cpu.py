@@ -1,6 +1,8 @@
 """Numba. Work goes level by level, so that one level's table stays in cache, and features are kept in planes (feature,
 sample), as a matrix product likes them. Looking up, threads share out the points; spreading gradients, the levels, so
-that no two threads add to one place and the sum is the same every time."""
+that no two threads add to one place and the sum is the same every time.
+
+Before many points are looked up, a level is read once in order: random reads from the main memory are slower."""
 
 from functools import cache
 
@@ -135,8 +137,9 @@ def _look_up(points, n, table, resolutions, offsets, masks, features, out, share
             for first in range(chunk * share, last, BLOCK):
                 count = min(BLOCK, last - first)
                 _place(points, n, first, count, resolutions[level], masks[level], base, features, entries, weights)
-                for k in range(8 * BLOCK):
-                    ahead(table, entries[k])
+                for corner in range(8):
+                    for i in range(count):
+                        ahead(table, entries[corner * BLOCK + i])
                 for i in range(count):
                     blend(table, entries, weights, i, features, out, plane + first + i, n)
 
