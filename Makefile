@@ -48,6 +48,7 @@ package: .venv/.made
 	$(BIN)/python -m build --outdir dist .
 
 site: .venv/.tools
+	$(BIN)/python docs/site_pages.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
 clean:

@@ -19,7 +19,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -30,6 +30,7 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from browser import ARGUMENTS, find_chromium
+from waiting import until
 
 DESK, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 PICTURE_BYTES = 150_000  # of a screenshot
@@ -142,16 +143,6 @@ def give_way() -> None:
             for thread in process.threads():
                 os.setpriority(os.PRIO_PROCESS, thread.id, NICENESS)
             Path(f"/proc/{process.pid}/autogroup").write_text(str(NICENESS))
-
-
-def until(told: Callable[[], Any], seconds: float, pause: float = 0.5) -> Any:
-    """Result of a function, as soon as it has one."""
-    end = time.monotonic() + seconds
-    while not (found := told()):
-        if time.monotonic() > end:
-            raise SystemExit(f"It did not come within {seconds:.0f} s")
-        time.sleep(pause)
-    return found
 
 
 def drop(page: Any, files: list[Path]) -> None:

@@ -1,4 +1,5 @@
-"""Lumigraph's captures beside COLMAP's own defaults: photographs placed, reprojection error, points, seconds.
+"""Lumigraph's captures beside COLMAP's own defaults: photographs placed, share of the matches that the model confirms,
+reprojection error, points, seconds.
 
 Seconds are given twice: elapsed, and those of all processors, which other programs on the machine hardly change.
 
@@ -27,6 +28,7 @@ from PIL import Image, ImageOps
 from rich.table import Table
 
 from lumigraph import files
+from lumigraph.capture.motion.agreement import agreement
 from lumigraph.capture.pictures import list_images
 from lumigraph.geometry import evenly
 from lumigraph.system.console import console
@@ -52,9 +54,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Placed:
-    """Result of one reconstruction. photographs: in the largest model; error: mean reprojection error in pixels."""
+    """Result of one reconstruction. photographs: in the largest model; confirmed: share of all matches, see
+    `Agreement`; error: mean reprojection error in pixels."""
 
     photographs: int
+    confirmed: float
     apart: list[int]
     error: float
     points: int
@@ -97,14 +101,15 @@ def timed(command: list[str]) -> tuple[subprocess.CompletedProcess[str], tuple[f
     return log, (time.perf_counter() - started, processor)
 
 
-def measured(models: Path, seconds: tuple[float, float]) -> Placed:
+def measured(models: Path, database: Path, seconds: tuple[float, float]) -> Placed:
     found = [pycolmap.Reconstruction(place) for place in models.iterdir() if (place / "images.bin").is_file()]
     found.sort(key=lambda model: -model.num_reg_images())
     if not found:
-        return Placed(0, [], 0.0, 0, *seconds)
+        return Placed(0, 0.0, [], 0.0, 0, *seconds)
     best = found[0]
     apart = [model.num_reg_images() for model in found[1:]]
-    return Placed(best.num_reg_images(), apart, best.compute_mean_reprojection_error(), best.num_points3D(), *seconds)
+    share, error = agreement(best, database).share, best.compute_mean_reprojection_error()
+    return Placed(best.num_reg_images(), share, apart, error, best.num_points3D(), *seconds)
 
 
 def compare(photographs: Path, work: Path) -> tuple[Placed, Placed]:
@@ -114,14 +119,14 @@ def compare(photographs: Path, work: Path) -> tuple[Placed, Placed]:
     if log.returncode:
         console().print(log.stdout[-300:] + log.stderr[-300:])
     (ours / "sparse").mkdir(parents=True, exist_ok=True)
-    first = measured(ours / "sparse", seconds)
+    first = measured(ours / "sparse", ours / "work" / "database.db", seconds)
     models.mkdir()
     _, seconds = timed([sys.executable, "-c", DEFAULTS, str(work / "database.db"), str(photographs), str(models)])
-    return first, measured(models, seconds)
+    return first, measured(models, work / "database.db", seconds)
 
 
 def main(options: Options) -> None:
-    names = "placed", "apart", "error, px", "points", "seconds", "processor seconds"
+    names = "placed", "confirmed", "apart", "error, px", "points", "seconds", "processor seconds"
     table = Table("capture", "photographs", *names, caption="Lumigraph / COLMAP's defaults")
     rows = []
     for source in options.folders:
@@ -144,6 +149,7 @@ def main(options: Options) -> None:
             cells = [
                 (
                     r.photographs,
+                    f"{r.confirmed:.0%}",
                     " ".join(map(str, r.apart)) or "-",
                     f"{r.error:.2f}",
                     r.points,

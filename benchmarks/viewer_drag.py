@@ -12,8 +12,9 @@ within a third of the typical distance). Writes a picture before and after.
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,6 +32,9 @@ from lumigraph.method import Method
 from lumigraph.method.capabilities import HasGaussians, can, needs
 from lumigraph.run import open_any
 from lumigraph.viewer import Subject, Viewer, choose_address
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from waiting import until
 
 SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 DRAG = 60  # pixels
@@ -70,12 +74,12 @@ def dragged(viewer: Viewer, chromium: Any, size: tuple[int, int], output: Path) 
     page = context.new_page()
     known = set(map(id, viewer._everyone()))
     page.goto(viewer.address.url)
-    visitor = wait(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
+    visitor = until(lambda: next((v for v in viewer._everyone() if id(v) not in known), None), PATIENCE)
     things = around_focus(viewer.method, viewer.subject)
     result: dict[str, Any] = {"distance": round(viewer.subject.opening.distance, 3)}
 
     def note(moment: str) -> None:
-        wait(visitor.painter.settled.is_set)
+        until(visitor.painter.settled.is_set, PATIENCE)
         time.sleep(REST)
         page.screenshot(path=f"{output}-{moment}.png")
         camera = visitor.request().camera(size)
@@ -91,7 +95,7 @@ def dragged(viewer: Viewer, chromium: Any, size: tuple[int, int], output: Path) 
     page.mouse.down()
     page.mouse.move(size[0] // 3 + DRAG, size[1] // 2, steps=6)
     page.mouse.up()
-    wait(lambda: visitor.request().pose != start)
+    until(lambda: visitor.request().pose != start, PATIENCE)
     note("after")
     context.close()
     return result
@@ -118,16 +122,6 @@ def around_focus(method: Method, subject: Subject) -> Float[Tensor, "point 3"]:
     away = (points - focus).norm(dim=-1)
     near = points[away < NEAR_FOCUS * typical]
     return near if len(near) else focus[None]
-
-
-def wait(told: Callable[[], Any], seconds: float = PATIENCE) -> Any:
-    """What a function gives as soon as it gives anything."""
-    end = time.monotonic() + seconds
-    while not (found := told()):
-        if time.monotonic() > end:
-            raise TimeoutError("the browser did not answer")
-        time.sleep(0.05)
-    return found
 
 
 @contextlib.contextmanager

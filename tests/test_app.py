@@ -10,7 +10,6 @@ import signal
 import sqlite3
 import sys
 import threading
-import time
 from collections import namedtuple
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from budgets import budget
 from PIL import Image
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from waiting import until
 from websockets.sync.server import serve as serve_websockets
 
 from lumigraph.app import jobs, progress, projects, uploads
@@ -102,14 +102,6 @@ def project(app) -> str:
 def put(client, key: str, name: str, data: bytes, offset: int = 0, size: int | None = None):
     about = {"name": name, "offset": offset, "size": len(data) if size is None else size}
     return client.put(f"/api/items/{key}/photographs", params=about, content=data)
-
-
-def wait(told, seconds: float = 20.0):
-    end = time.monotonic() + seconds
-    while not (found := told()):
-        assert time.monotonic() < end, "it never came"
-        time.sleep(0.02)
-    return found
 
 
 def names(app, key: str) -> list[str]:
@@ -383,7 +375,7 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     assert running.post(f"/api/items/{project}/make", json={"method": "no-such"}).status_code == 400
     assert running.post(f"/api/items/{project}/make", json={"quality": "superb"}).status_code == 400
     running.post(f"/api/items/{project}/make", json={"quality": "good", "mapper": "global"})
-    wait(lambda: state(running, project) == "done")
+    until(lambda: state(running, project) == "done")
     capture, train = calls(app, project)
     here = app.root / project
     assert capture == ["capture", str(here / "photos"), "--output", str(here / "scene"), "--mapper", "global"]
@@ -399,7 +391,7 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     asked = {"kind": "film", "run": "gaussian-splatting-1"}
     assert running.post(f"/api/items/{project}/shares", json=asked | {"run": "../x"}).status_code == 400
     running.post(f"/api/items/{project}/shares", json=asked)
-    row = wait(
+    row = until(
         lambda: next((one for one in running.get(f"/api/items/{project}").json()["shares"] if one["bytes"]), None)
     )
     assert calls(app, project)[2][:2] == ["render", str(here / "runs/gaussian-splatting-1")]
@@ -421,7 +413,7 @@ def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run)
     assert running.get(f"/api/items/{project}").json()["runs"][0]["compared"] is None
     let(app)
     running.post(f"/api/items/{project}/shares", json={"kind": "compare", "run": "a"})
-    wait(lambda: running.get(f"/api/items/{project}").json()["shares"][0]["state"] == "done")
+    until(lambda: running.get(f"/api/items/{project}").json()["shares"][0]["state"] == "done")
     (words,) = calls(app, project)
     assert words == ["eval", str(place), "--split", "test", "--views", "12", "--save-images", "--overwrite"]
     run = Run(place)
@@ -440,27 +432,27 @@ def test_a_failure_is_the_sentence_of_the_command(app, running, project):
     let(app)
     (app.root / "fault").write_text("at most 2 of 3 show the same things; take 20 or more")
     running.post(f"/api/items/{project}/make", json={})
-    wait(lambda: state(running, project) == "failed")
+    until(lambda: state(running, project) == "failed")
     making = running.get(f"/api/items/{project}").json()["make"]
     assert making["fault"] == "at most 2 of 3 show the same things; take 20 or more" and making["stage"] == "capture"
     (app.root / "fault").unlink()
     running.post(f"/api/items/{project}/more", json={})
-    wait(lambda: state(running, project) == "done")
+    until(lambda: state(running, project) == "done")
 
 
 def test_a_job_is_paused_and_goes_on_by_resume(app, running, project):
     put(running, project, "a.jpg", jpeg())
     running.post(f"/api/items/{project}/make", json={})
-    wait(lambda: calls(app, project))
+    until(lambda: calls(app, project))
     assert running.post(f"/api/items/{project}/make", json={}).status_code == 400  # one at a time
     running.post(f"/api/items/{project}/pause")
-    wait(lambda: app.runner.current is None)
+    until(lambda: app.runner.current is None)
     assert state(running, project) == "paused" and "saved" in jobs.log_lines(find_item(app.root, project))
     let(app)
     running.post(f"/api/items/{project}/more", json={})
-    wait(lambda: state(running, project) == "done")
+    until(lambda: state(running, project) == "done")
     running.post(f"/api/items/{project}/more", json={"minutes": 2})
-    wait(lambda: len(calls(app, project)) == 4 and state(running, project) == "done")
+    until(lambda: len(calls(app, project)) == 4 and state(running, project) == "done")
     assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train", "resume"]
     assert calls(app, project)[3][2:4] == ["--seconds", "120.0"]
 
@@ -469,15 +461,15 @@ def test_a_training_gets_more_time_while_it_runs(app, running, project):
     put(running, project, "a.jpg", jpeg())
     let(app)
     running.post(f"/api/items/{project}/make", json={})
-    wait(lambda: state(running, project) == "done")
+    until(lambda: state(running, project) == "done")
     (app.root / "go").unlink()
     running.post(f"/api/items/{project}/more", json={"minutes": 1})
-    wait(lambda: len(calls(app, project)) == 3)
+    until(lambda: len(calls(app, project)) == 3)
     running.post(f"/api/items/{project}/more", json={"quality": "good"})
-    wait(lambda: len(calls(app, project)) == 4)
+    until(lambda: len(calls(app, project)) == 4)
     assert state(running, project) == "running"
     let(app)
-    wait(lambda: state(running, project) == "done")
+    until(lambda: state(running, project) == "done")
     assert calls(app, project)[3][0] == "resume" and calls(app, project)[3][2:4] == ["--quality", "good"]
 
 
@@ -488,7 +480,7 @@ def test_a_scene_with_poses_is_trained_without_a_capture(app, running, ball_fold
     (card,) = running.get("/api/home").json()["cards"]
     assert (card["kind"], card["key"]) == ("scene", "scenes:ball")
     made = running.post("/api/items/scenes:ball/make", json={"minutes": 1}).json()
-    wait(lambda: state(running, made["key"]) == "done")
+    until(lambda: state(running, made["key"]) == "done")
     (train,) = calls(app, made["key"])
     assert train[:3] == ["train", "gaussian-splatting", str(scene)] and train[5:7] == ["--seconds", "60.0"]
 
@@ -498,12 +490,12 @@ def test_jobs_wait_for_each_other_and_go_with_their_project(app, running):
     for key in keys:
         put(running, key, "a.jpg", jpeg())
         running.post(f"/api/items/{key}/make", json={})
-    wait(lambda: calls(app, "one"))
+    until(lambda: calls(app, "one"))
     assert state(running, "two") == "queued" and running.get("/api/home").json()["queue"][1]["key"] == "two"
     trash = running.delete("/api/items/one").json()["trash"]
-    wait(lambda: calls(app, "two"))
+    until(lambda: calls(app, "two"))
     let(app)
-    wait(lambda: state(running, "two") == "done")
+    until(lambda: state(running, "two") == "done")
     running.post(f"/api/trash/{trash}")
     assert state(running, "one") == "stopped"
 
@@ -514,7 +506,7 @@ def test_a_killed_app_goes_on_where_it_was(app, project):
     (item.path / "photos" / "a.jpg").write_bytes(jpeg())
     jobs.make(item)
     app.runner.begin()
-    wait(lambda: calls(app, project))
+    until(lambda: calls(app, project))
     child = app.runner.current.child
     app.runner._ended = True  # as after a kill, nobody changes the record any more
     child.send_signal(signal.SIGKILL)
@@ -523,7 +515,7 @@ def test_a_killed_app_goes_on_where_it_was(app, project):
     let(app)
     again = App(app.root, app.address, app.runner.program)
     again.runner.begin()
-    wait(lambda: read_job(item).make.state == "done")
+    until(lambda: read_job(item).make.state == "done")
     again.runner.end()
     assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train"]
 
@@ -536,7 +528,7 @@ def test_a_damaged_record_is_told_and_stops_nobody_else(app, running, project):
     other = new_project(app.root, "other").key
     put(running, other, "a.jpg", jpeg())
     running.post(f"/api/items/{other}/make", json={})
-    wait(lambda: state(running, other) == "done")
+    until(lambda: state(running, other) == "done")
 
 
 # Progress
@@ -605,7 +597,7 @@ def test_the_viewer_is_reached_through_the_app_alone(app, project):
             socket.send_bytes(b"hello")
             assert socket.receive_bytes() == b"seen hello" and view.connections == 1
             assert socket.accepted_subprotocol == "viser-v1"
-        wait(lambda: view.connections == 0)
+        until(lambda: view.connections == 0)
         with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"/scene/{project}/b", headers=HOST):
             pass
         server.shutdown()

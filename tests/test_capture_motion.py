@@ -26,6 +26,7 @@ from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
 from lumigraph.capture.coverage import use_of
 from lumigraph.capture.motion import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
+from lumigraph.capture.motion.agreement import Agreement, agreement
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior, write_database
@@ -657,26 +658,30 @@ def test_one_photograph_is_an_intake_too():
 
 
 @pytest.mark.parametrize(("asked", "other"), [("incremental", "global"), ("global", "incremental")])
-def test_where_one_mapper_finds_nothing_the_other_is_tried(tmp_path, monkeypatch, asked, other):
-    """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once."""
-    tried: list[str] = []
+@pytest.mark.parametrize("first", [0, 50])
+def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeypatch, asked, other, first):
+    """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once; and a
+    wrong model has a small error too."""
+    tried: list[tuple[str, int]] = []
+    shares = {(asked, 0): first, (other, 0): 40, ("incremental", 1): 90}
 
-    def mapped(database: Path, models: Path, mapper: str) -> None:
-        tried.append(mapper)
-        assert not any(models.iterdir())
-        (models / "0").mkdir()  # the first leaves a pair behind
-        (models / "0" / mapper).touch()
+    def mapped(database: Path, models: Path, mapper: str, seed: int) -> None:
+        tried.append((mapper, seed))
+        (models / "0").mkdir(parents=True)
+        (models / "0" / f"{mapper}{seed}").touch()
 
-    def placed(models: Path) -> int:
-        return 2 if (models / "0" / asked).exists() else 8 * (models / "0" / other).exists()
-
-    monkeypatch.setattr(reconstruction, "largest", placed)
+    monkeypatch.setattr(reconstruction, "largest", lambda models: 8)
     work = object.__new__(Reconstruction)
     work.stages, work.models, work.unfolded = Stages(tmp_path), tmp_path / "models", tmp_path / "unfolded"
-    work.database, work.options, work.map = tmp_path / "database.db", MotionOptions(mapper=asked), mapped
+    work.database, work.options = tmp_path / "database.db", MotionOptions(mapper=asked)
+    work.map, work.agreement = mapped, lambda models: Agreement(100, shares[tried[-1]])
     for _ in range(2):  # once it is there it stays
         work.place("key")
-        assert tried == [asked, other] and (work.models / reconstruction.FALLBACK_MARK).exists()
+        assert tried == [(asked, 0), (other, 0), ("incremental", 1)]
+        assert {place.name for place in work.models.iterdir()} == {"0", reconstruction.NOTE_FILE}
+        assert (work.models / "0" / "incremental1").exists()
+        note = (work.models / reconstruction.NOTE_FILE).read_text()
+        assert ("contradicted 50%" in note) == bool(first) and "contradicts 10%" in note
 
 
 def synthetic_model(place, frames, model="SIMPLE_RADIAL", params=(1280.0, 512.0, 384.0, 0.05)):
@@ -687,6 +692,20 @@ def synthetic_model(place, frames, model="SIMPLE_RADIAL", params=(1280.0, 512.0,
     options.camera_model_id, options.camera_params = getattr(pycolmap.CameraModelId, model), list(params)
     with closing(pycolmap.Database.open(place / "database.db")) as database:
         return pycolmap.synthesize_dataset(options, database)
+
+
+def test_matches_contradict_wrong_cameras(tmp_path):
+    model = synthetic_model(tmp_path, 8)
+    whole = agreement(model, tmp_path / "database.db")
+    assert whole.share > 0.99 and whole.matches > 1000
+    frames = sorted(model.reg_frame_ids())
+    part = pycolmap.Reconstruction(model)
+    part.deregister_frame(frames[0])  # a match of a photograph without a place is not confirmed
+    assert agreement(part, tmp_path / "database.db").share == pytest.approx(6 / 8, abs=0.05)
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, np.sin(0.1), 0, np.cos(0.1)])), np.zeros(3))
+    frame = model.frame(frames[0])
+    frame.rig_from_world = turn * frame.rig_from_world
+    assert agreement(model, tmp_path / "database.db").share == pytest.approx(6 / 8, abs=0.1)
 
 
 @pytest.mark.parametrize("shared", [0, 3])

@@ -22,6 +22,7 @@ from balls import RED, Splatted
 from budgets import budget
 from torch import nn
 from viewer_client import Client
+from waiting import until
 
 import lumigraph.methods
 import lumigraph.viewer.viewer as viewer_module
@@ -58,13 +59,6 @@ def learnt(ball_run):
 def subject(scene, folder, **changes) -> Subject:
     cameras = {name: scene.cameras[index] for name, index in scene.splits.items()}
     return replace(Subject("ball", scene.frame, cameras, folder / "paths", "lumigraph render RUN"), **changes)
-
-
-def until(happens, seconds: float = 20.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not happens():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def request_of(camera, canvas) -> ViewRequest:

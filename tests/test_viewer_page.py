@@ -15,6 +15,7 @@ from budgets import budget
 from PIL import Image
 from test_nerf_w import made, two_lights
 from test_viewer import some_cloud, subject
+from waiting import until
 
 import lumigraph.methods
 from lumigraph.datasets.scene import Frame
@@ -48,19 +49,10 @@ def visit(viewer, page, size=SIZE):
     page.set_viewport_size({"width": size[0], "height": size[1]})
     known = set(map(id, viewer._everyone()))
     page.goto(viewer.address.url)
-    visitor = wait(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
+    visitor = until(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
     visitor.controls._sharpest.value = SHARPEST
     settle(visitor)
     return visitor
-
-
-def wait(told, seconds: float = 30.0):
-    """What a function gives as soon as it gives anything."""
-    end = time.monotonic() + seconds
-    while not (found := told()):
-        assert time.monotonic() < end, "it never came"
-        time.sleep(0.02)
-    return found
 
 
 def settle(visitor) -> None:
@@ -107,8 +99,8 @@ def test_the_scene_appears_turns_and_changes_modes(viewer, page, faults):
     page.mouse.down()
     page.mouse.move(250, 320, steps=4)
     page.mouse.up()
-    wait(lambda: visitor.request().pose != place)
-    wait(visitor.painter.settled.is_set)
+    until(lambda: visitor.request().pose != place)
+    until(visitor.painter.settled.is_set)
     after = expected(viewer, visitor)
     assert psnr(after, before) < 25
     shows(page, after, 28)
@@ -116,8 +108,8 @@ def test_the_scene_appears_turns_and_changes_modes(viewer, page, faults):
     seen = shot(page)
     for mode in ("Depth", "Opacity", "Normals"):
         choose(page, "Show", mode)
-        wait(lambda mode=mode: visitor.request().mode == mode.lower() and visitor.painter.settled.is_set())
-        wait(lambda seen=seen: psnr(shot(page), seen) < 20)
+        until(lambda mode=mode: visitor.request().mode == mode.lower() and visitor.painter.settled.is_set())
+        until(lambda seen=seen: psnr(shot(page), seen) < 20)
         seen = shot(page)
     assert faults == []
 
@@ -136,20 +128,20 @@ def drag(page, visitor, pixels: int) -> None:
     page.mouse.down()
     page.mouse.move(width / 3 + pixels, height / 2, steps=4)
     page.mouse.up()
-    wait(lambda: visitor.request().pose != before)
-    wait(visitor.painter.settled.is_set)
+    until(lambda: visitor.request().pose != before)
+    until(visitor.painter.settled.is_set)
 
 
 @pytest.mark.parametrize("size", [SIZE, (320, 480)], ids=["desktop", "phone"])
 def test_a_drag_keeps_the_ball_where_it_is(viewer, page, size):
     """On a phone the panel begins folded, opens at a touch, and stays open."""
     visitor = visit(viewer, page, size)
-    wait(lambda: page.title() == "ball")
+    until(lambda: page.title() == "ball")
     before = middle(visitor)
     eye = np.array(visitor.request().pose)[:, 3]
     assert np.abs(before).max() < 0.2
     if size != SIZE:  # until it is folded, the panel is where the drag begins
-        wait(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] < 100)
+        until(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] < 100)
         assert page.locator(".mantine-Paper-root").first.bounding_box()["width"] == size[0]
     drag(page, visitor, 60)
     moved = np.array(visitor.request().pose)[:, 3]
@@ -162,7 +154,7 @@ def test_a_drag_keeps_the_ball_where_it_is(viewer, page, size):
         cameras.wait_for(state="visible")
         return
     page.get_by_text("ball", exact=True).click()
-    wait(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] > 200)
+    until(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] > 200)
     time.sleep(0.5)
     assert cameras.is_visible()
 
@@ -181,9 +173,9 @@ def test_a_click_on_a_camera_flies_there(viewer, page):
         time.sleep(1)
         page.mouse.click(SIZE[0] / 2, SIZE[1] / 2)
         try:
-            wait(arrived, 4)
+            until(arrived, 4)
             return
-        except AssertionError:
+        except TimeoutError:
             continue
     pytest.fail("the camera was not reached in 8 clicks")
 
@@ -193,15 +185,15 @@ def test_a_path_is_set_saved_and_opened(viewer, page):
     page.get_by_role("tab", name="Path").click()
     add = page.get_by_role("button", name="Add keyframe here")
     add.click()
-    wait(lambda: len(visitor.path._stops) == 1)
+    until(lambda: len(visitor.path._stops) == 1)
     first = np.array(visitor.request().pose)
     visitor.flight.place(viewer.subject.cameras["train"].pose[4].double().numpy(), 3.0, 0.9)
-    wait(lambda: np.abs(np.array(visitor.request().pose) - first).max() > 0.1)
+    until(lambda: np.abs(np.array(visitor.request().pose) - first).max() > 0.1)
     add.click()
-    wait(lambda: len(visitor.path._stops) == 2)
+    until(lambda: len(visitor.path._stops) == 2)
     page.get_by_role("button", name="Save").click()
     file = viewer.subject.paths / "path-1.json"
-    wait(file.exists)
+    until(file.exists)
     path = CameraPath.load(file)
     assert [key.seconds for key in path.keyframes] == [0.0, 2.0]
     assert np.allclose(path.keyframes[0].pose, first, atol=1e-5)
@@ -219,12 +211,12 @@ def test_a_path_is_set_saved_and_opened(viewer, page):
 
     visitor.path._saved.value = "path-1"
     page.get_by_role("button", name="✕").click()
-    wait(lambda: len(visitor.path._stops) == 1)
+    until(lambda: len(visitor.path._stops) == 1)
     page.get_by_role("button", name="Open").click()
-    wait(lambda: len(visitor.path._stops) == 2)
+    until(lambda: len(visitor.path._stops) == 2)
     page.get_by_role("button", name="Play").click()
     last = np.array(path.keyframes[1].pose)
-    wait(lambda: np.abs(np.array(visitor.request().pose) - last).max() < 1e-3)
+    until(lambda: np.abs(np.array(visitor.request().pose) - last).max() < 1e-3)
 
 
 def test_appearances_are_a_list_whose_choice_is_seen(page, faults, tmp_path):
@@ -238,7 +230,7 @@ def test_appearances_are_a_list_whose_choice_is_seen(page, faults, tmp_path):
         pictures = {}
         for photograph in ("1", "2"):
             choose(page, "Appearance", photograph)
-            wait(lambda n=photograph: visitor.request().settings == (("appearance", n),))
+            until(lambda n=photograph: visitor.request().settings == (("appearance", n),))
             settle(visitor)
             told = method.given(appearance=photograph).render(visitor.request().camera(SIZE)).rgb
             pictures[photograph] = told.clamp(0, 1).numpy()[ROWS, COLUMNS]
@@ -259,7 +251,7 @@ def test_a_slider_changes_the_picture(page, tmp_path):
         slider = page.locator("[role=slider][aria-valuemax='2']").first
         slider.focus()
         slider.press("End")
-        wait(lambda: dict(visitor.request().settings).get("brightness") == 2.0)
+        until(lambda: dict(visitor.request().settings).get("brightness") == 2.0)
         settle(visitor)
         bright = method.given(brightness=2.0).render(visitor.request().camera(SIZE)).rgb.clamp(0, 1)
         assert psnr(bright.numpy()[ROWS, COLUMNS], expected(viewer, visitor)) < 24
@@ -278,6 +270,6 @@ def test_gaussians_are_drawn_by_the_browser(page, faults, tmp_path):
         shows(page, expected(viewer, visitor), 26)  # the browser's sums are half as exact
         assert visitor.controls.status.content == "300 Gaussians, drawn by the browser"
         page.get_by_role("checkbox", name="Draw exactly").click()
-        wait(lambda: visitor.request().exact and visitor.painter.settled.is_set())
+        until(lambda: visitor.request().exact and visitor.painter.settled.is_set())
         shows(page, expected(viewer, visitor), 33)
     assert [fault for fault in faults if HARMLESS not in fault and "WebSocket" not in fault] == []

@@ -29,6 +29,7 @@ from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from ..transforms import read as read_transforms
+from .agreement import Agreement, agreement
 from .demand import demand_of, fitted, reduced_pixels
 from .diagnosis import (
     ALL_TURNED_SHARE,
@@ -72,8 +73,11 @@ PIXELS_PER_FEATURE = 150  # of a photograph that may have its features without t
 MAX_SECOND_SIDE = 3200  # pixels of the longer side, for photographs that found no place
 SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
 MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
-FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
+MIN_AGREEMENT = 0.8  # share of the matches, below which photographs are placed in other ways too
+NOTE_FILE = "note.txt"  # beside models that were made in another way than was asked for: why, in a sentence
+OTHER_SEEDS = 1, 2
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
+WAYS = {"incremental": "one by one", "global": "all at once"}
 SNAPSHOTS, MAX_SNAPSHOTS = "snapshots", 40  # folder among the work of models while cameras are placed, and their number
 MOVING_FILE = "moving.json"  # among the work: features that move
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
@@ -332,17 +336,42 @@ class Reconstruction:
         self.colmap(description, len(named), database, stage="matching", pairs=str(listed), since=since)
 
     def place(self, key: str) -> None:
-        """By the mapper that was asked for; by the other where it finds no model. One by one needs a pair that tells
-        depth to begin with, which a walk straight ahead may lack; all at once needs focal lengths and many pairs."""
+        """Place photographs by the mapper that was asked for. Where many matches contradict its model, or it finds
+        none, try the other one and other first pairs, until a model agrees. The one that most matches confirm is kept.
+
+        One by one needs a first pair that tells depth, which a walk straight ahead may lack, and a poor one leads to a
+        wrong model; all at once needs focal lengths and many pairs.
+        """
         if self.stages.is_done("mapping", key) and self.models.is_dir() and largest(self.models) >= MIN_VIEWS:
             return
-        with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as partial:
-            self.map(self.database, partial, self.options.mapper)
-            if largest(partial) < MIN_VIEWS:
-                for place in partial.iterdir():  # a pair at most
-                    remove(place)
-                self.map(self.database, partial, OTHER_MAPPER[self.options.mapper])
-                (partial / FALLBACK_MARK).touch()
+        asked = self.options.mapper
+        ways = [(asked, 0), (OTHER_MAPPER[asked], 0), *(("incremental", seed) for seed in OTHER_SEEDS)]
+        with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as chosen:
+            found: list[Agreement] = []
+            for mapper, seed in ways:
+                attempt = chosen / "attempt"
+                attempt.mkdir()
+                self.map(self.database, attempt, mapper, seed=seed)
+                now = self.agreement(attempt)
+                if all(now.confirmed > other.confirmed for other in found):
+                    for place in set(chosen.iterdir()) - {attempt}:
+                        remove(place)
+                    for place in attempt.iterdir():
+                        place.rename(chosen / place.name)
+                    if found:
+                        note = made_otherwise(found[0].share, mapper, seed, now.share)
+                        write_bytes(chosen / NOTE_FILE, note.encode(), ours=True)
+                remove(attempt)
+                found.append(now)
+                if now.share >= MIN_AGREEMENT:
+                    break
+
+    def agreement(self, models: Path) -> Agreement:
+        """Agreement of the largest of some models with the matches. Panoramas are taken as they are."""
+        found = read_models(models)
+        if not found or found[0].num_reg_images() < MIN_VIEWS:
+            return Agreement(matches=1, confirmed=0)
+        return Agreement(0, 0) if self.spherical else agreement(found[0], self.database)
 
     def unfold(self, key: str) -> None:
         """If the model leaps between neighbours, make another from what near neighbours share alone. Far ones that
@@ -429,7 +458,7 @@ class Reconstruction:
         names = [name for name in self.names if name in poses]
         return len(folds(names, np.stack([poses[name] for name in names]), matches, self.intake.in_order))
 
-    def map(self, database: Path, models: Path, mapper: str, model: Path | None = None) -> None:
+    def map(self, database: Path, models: Path, mapper: str, model: Path | None = None, seed: int = 0) -> None:
         snapshots = self.work / SNAPSHOTS
         remove(snapshots)
         snapshots.mkdir()
@@ -443,6 +472,7 @@ class Reconstruction:
             images=str(self.images),
             models=str(models),
             model=model and str(model),
+            seed=seed,
             snapshots=str(snapshots),
             snapshot_every=max(1, len(self.names) // MAX_SNAPSHOTS),
             calibrate=not (self.spherical or all(prior(group)[1] for group in self.groups)),
@@ -451,9 +481,8 @@ class Reconstruction:
     def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str], Path]:
         """The models, largest first, notes on how they were made, and the database of their matches."""
         found, notes, database = read_models(self.models), [], self.database
-        if (self.models / FALLBACK_MARK).exists():
-            how = "all at once" if self.options.mapper == "incremental" else "one by one"
-            notes.append(f"--mapper {self.options.mapper} found no model, so photographs were placed {how}")
+        if (self.models / NOTE_FILE).exists():
+            notes.append((self.models / NOTE_FILE).read_text())
         if self.unfolded.is_dir() and (unfolded := read_models(self.unfolded)):
             enough = unfolded[0].num_reg_images() >= MIN_KEPT_SHARE * found[0].num_reg_images()
             if enough and self.leaps(unfolded[0], matches) < self.leaps(found[0], matches):
@@ -491,6 +520,11 @@ class Reconstruction:
         known = place is not None and place.new_from_old is not None
         if self.options.moving:
             told.append(self.found_to_move().say())
+        if not self.spherical and (share := agreement(model, database).share) < MIN_AGREEMENT:
+            told.append(
+                f"{1 - share:.0%} of the matches contradict the cameras' places, so some may be wrong; look at "
+                f"capture.png, and take photographs between those that stand far apart"
+            )
         if place is not None and not known:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
@@ -551,6 +585,14 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
     """COLMAP's models in a folder, the largest first."""
     found = [pycolmap.Reconstruction(place) for place in sorted(folder.iterdir()) if place.is_dir()]
     return sorted(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+
+def made_otherwise(first: float, mapper: str, seed: int, share: float) -> str:
+    """Sentence on a model that was made in another way than was asked for. first, share: share of the matches that the
+    first model and this one confirm"""
+    why = f"the first model contradicted {1 - first:.0%} of the matches" if first else "there was no model at first"
+    how = f"{WAYS[mapper]}, from another pair" if seed else WAYS[mapper]
+    return f"{why}, so photographs were placed {how}; this one contradicts {1 - share:.0%}"
 
 
 def registered(model: pycolmap.Reconstruction) -> set[str]:

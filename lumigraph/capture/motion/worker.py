@@ -345,7 +345,7 @@ def main() -> None:
 
 def do(job: dict[str, Any]) -> None:
     job.setdefault("threads", min(os.cpu_count() or 1, MAX_THREADS))
-    job["seed"] = 0
+    job.setdefault("seed", 0)
     run, table = STAGES[job["stage"]]
     if table is None:
         run(job)

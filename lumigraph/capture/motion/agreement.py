@@ -1,0 +1,87 @@
+"""Agreement of a model with the matches of its photographs.
+
+Mapping takes what fits and discards the rest, so a wrong model has a small error too. But it contradicts matches of two
+photographs, each of which one motion explains.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Integer
+
+from ...geometry import evenly
+from ...system.library import pycolmap
+from .diagnosis import MIN_MATCHES
+
+MAX_PAIRS = 4000  # pairs of photographs that are looked at
+MAX_EPIPOLAR_ERROR = 0.003  # distance from the epipolar line, of a photograph's longer side
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Numbers of matches: all among the photographs that matches connect with a model's, and those whose epipolar line
+    the model confirms. Matches of photographs without a place are not confirmed."""
+
+    matches: int
+    confirmed: int
+
+    @property
+    def share(self) -> float:
+        """Confirmed share of the matches; 1 where there are none."""
+        return self.confirmed / self.matches if self.matches else 1.0
+
+
+def agreement(model: pycolmap.Reconstruction, database: Path) -> Agreement:
+    """Agreement of a model of flat photographs with the matches in COLMAP's database."""
+    placed = {image.name: image for image in model.images.values() if image.has_pose}
+    matches = confirmed = 0
+    with closing(pycolmap.Database.open(database)) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {number: opened.read_keypoints(number)[:, :2] for number in names}
+        pairs = [
+            (pycolmap.pair_id_to_image_pair(number), found.inlier_matches)
+            for number, found in zip(*opened.read_two_view_geometries(), strict=True)
+            if len(found.inlier_matches) >= MIN_MATCHES
+        ]
+    near = connected(pairs, {number for number, name in names.items() if name in placed})
+    for (a, b), matched in evenly(near, MAX_PAIRS):
+        matches += len(matched)
+        first, second = placed.get(names[a]), placed.get(names[b])
+        if first is not None and second is not None:
+            confirmed += int(on_epipolar_lines(model, first, second, features[a], features[b], matched).sum())
+    return Agreement(matches, confirmed)
+
+
+def connected(pairs: list[tuple[tuple[int, int], Any]], numbers: set[int]) -> list[tuple[tuple[int, int], Any]]:
+    """Pairs of photographs that other pairs connect with some of these."""
+    while new := {x for pair, _ in pairs for x in pair if numbers.intersection(pair)} - numbers:
+        numbers = numbers | new
+    return [(pair, found) for pair, found in pairs if numbers.intersection(pair)]
+
+
+def on_epipolar_lines(
+    model: pycolmap.Reconstruction,
+    first: pycolmap.Image,
+    second: pycolmap.Image,
+    first_features: Float[np.ndarray, "first 2"],
+    second_features: Float[np.ndarray, "second 2"],
+    matched: Integer[np.ndarray, "match 2"],
+) -> Bool[np.ndarray, " match"]:
+    """True for the matches of two photographs whose Sampson distance is small under the model's poses."""
+    cameras = model.cameras[first.camera_id], model.cameras[second.camera_id]
+    x, y = (
+        np.c_[camera.cam_from_img(found[index]), np.ones(len(index))]
+        for camera, found, index in zip(cameras, (first_features, second_features), matched.T, strict=True)
+    )
+    motion = second.cam_from_world() * first.cam_from_world().inverse()
+    essential = np.cross(np.eye(3), motion.translation) @ motion.rotation.matrix()
+    lines, back = x @ essential.T, y @ essential
+    gradient = (lines[:, :2] ** 2).sum(-1) + (back[:, :2] ** 2).sum(-1)
+    distance = np.abs((y * lines).sum(-1)) / np.sqrt(gradient.clip(1e-24))
+    limit = MAX_EPIPOLAR_ERROR * max(max(c.width, c.height) / c.mean_focal_length() for c in cameras)
+    return distance < limit
