@@ -10,7 +10,7 @@ import torch
 
 from lumigraph.components.sampling.cone_sampler import blurred, frustum_moments
 from lumigraph.components.sampling.occupancy import OccupancyMask
-from lumigraph.components.sampling.sampling import inverse_transform, stratified
+from lumigraph.components.sampling.sampling import inverse_of, inverse_transform, stratified
 
 
 def test_one_in_each_bin(generator):
@@ -34,6 +34,16 @@ def test_where_nothing_was_found_samples_are_even():
     edges = torch.linspace(2, 6, 9)[None]
     found = inverse_transform(edges, torch.zeros(1, 8), stratified(1, 16))
     torch.testing.assert_close(found, 2 + 4 * stratified(1, 16))
+
+
+def test_the_loop_inverts_as_the_definition_does(generator):
+    """Bins of equal and of no weight, shares on their borders, and shares that fall."""
+    edges = torch.rand(5, 9, generator=generator).cumsum(-1)
+    weights = torch.rand(5, 8, generator=generator)
+    weights[1, 2:5], weights[2], weights[3, :7] = 0, 0, 0
+    shares = torch.cat([stratified(5, 30, generator), torch.tensor([0.0, 1.0, 0.5, 0.25]).expand(5, 4)], -1)
+    expected = inverse_of(*(x.double() for x in (edges, weights, shares)))
+    torch.testing.assert_close(inverse_transform(edges, weights, shares).double(), expected, atol=1e-3, rtol=0)
 
 
 def test_no_sample_leaves_its_bins():

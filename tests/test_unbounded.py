@@ -8,7 +8,7 @@ import torch
 from numba import njit
 
 from lumigraph.camera.rays import Look, Rays, Samples
-from lumigraph.components.sampling.proposal import Proposal, edges_of, proposal_loss
+from lumigraph.components.sampling.proposal import Proposal, Proposed, edges_of, excess_of, proposal_loss
 from lumigraph.components.sampling.samplers import MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.training.regularizers import depth_loss, distortion_loss, scale_gradients
@@ -86,6 +86,21 @@ def test_nothing_is_overlooked_within_a_bound():
     whole = found.weights.sum(-1, keepdim=True).expand(5, 8).flatten()
     assert float(proposal_loss(found, 0 * whole)) == 0
     assert float(proposal_loss(found, 2 * whole)) > 0
+
+
+def test_the_loop_sums_excess_as_the_definition_does(generator):
+    """Loss and gradient, with edges that coincide with those of bins and others."""
+    bins, edges = (edges_of(n, torch.rand(6, generator=generator)) for n in (16, 7))
+    edges[0] = bins[0, ::2][:8]
+    edges[0, -1] = 1
+    found = (0.2 * torch.rand(6, 16, generator=generator)).requires_grad_()
+    weights = torch.rand(6, 7, generator=generator)
+    samples = Samples.rows(edges[:, :-1], edges[:, -1])
+    loss = proposal_loss(Proposed(samples, edges, bins, found), weights.flatten())
+    expected = excess_of(*(x.double() for x in (found, bins, edges, weights))).mean()
+    torch.testing.assert_close(loss.double(), expected)
+    gradients = (torch.autograd.grad(x, found)[0] for x in (loss, expected))
+    torch.testing.assert_close(*gradients, atol=1e-6, rtol=1e-5)
 
 
 def test_weight_in_one_place_is_not_spread():

@@ -82,6 +82,7 @@ _binary(operator.truediv, real=lambda b, x, y: b.fdiv(x, y, flags=("arcp", *FMA)
 _binary(operator.ge, compares=True, real=lambda b, x, y: b.fcmp_ordered(">=", x, y))
 _binary(operator.gt, compares=True, real=lambda b, x, y: b.fcmp_ordered(">", x, y))
 _binary(operator.lt, compares=True, real=lambda b, x, y: b.fcmp_ordered("<", x, y))
+_binary(operator.ne, compares=True, real=lambda b, x, y: b.fcmp_unordered("!=", x, y))
 _binary(operator.and_, mask=lambda b, x, y: b.and_(x, y), whole=lambda b, x, y: b.and_(x, y))
 _binary(operator.xor, whole=lambda b, x, y: b.xor(x, y))
 

@@ -13,7 +13,8 @@ from ...camera.rays import Rays, Samples
 from ...volume import weights_of
 from ..fields.layers import LIMIT, truncated_exp
 from ..fields.voxels import VoxelGrid
-from .sampling import FAINT, inverse_transform
+from .loops import sum_excess
+from .sampling import FAINT, inverse_transform, loops_fit
 from .spaces import NDC, Contraction, Space, fits_kernels
 
 FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
@@ -106,7 +107,8 @@ class Proposal(nn.Module):
         grid.values.copy_(torch.where(found.view(-1, 1) > 0, DENSE, THIN))
 
     def _density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
-        return truncated_exp(self.grid(self.space.warp(points))[:, 0]) * self.space.stretch(points)
+        coordinates, stretch = self.space.mapped(points)
+        return truncated_exp(self.grid(coordinates)[:, 0]) * stretch
 
     def _samples(self, shares: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Samples:
         t = self._distance(shares, rays, near, far)
@@ -131,9 +133,39 @@ def proposal_loss(proposed: Proposed, weights: Float[Tensor, " sample"]) -> Floa
     """By how much a field's weights exceed what the grid finds in all its intervals that they overlap, mean of all rays
     (Barron 2022, eqs. 12 and 13). Gradients reach the grid alone.
     """
-    w, edges = weights.detach().view(len(proposed.edges), -1), proposed.edges
-    below = nn.functional.pad(proposed.weights.cumsum(-1), (1, 0))
-    first = torch.searchsorted(proposed.bins, edges[:, :-1].contiguous(), right=True) - 1
-    last = torch.searchsorted(proposed.bins, edges[:, 1:].contiguous()).clamp(max=proposed.bins.shape[1] - 1)
-    bound = below.gather(-1, last) - below.gather(-1, first.clamp(0, proposed.bins.shape[1] - 1))
-    return ((w - bound).clamp_min(0).square() / (w + LITTLE)).sum(-1).mean()
+    w = weights.detach().view(len(proposed.edges), -1)
+    excess = _Excess.apply if loops_fit(w) else excess_of
+    return excess(proposed.weights, proposed.bins, proposed.edges, w).mean()
+
+
+def excess_of(
+    found: Float[Tensor, "ray bin"],
+    bins: Float[Tensor, "ray bin_edge"],
+    edges: Float[Tensor, "ray edge"],
+    w: Float[Tensor, "ray interval"],
+) -> Float[Tensor, " ray"]:
+    """sum_i max(0, w_i - bound_i)^2 / w_i of each ray, where bound_i sums the weights found in bins that interval i
+    overlaps (Barron 2022, eq. 13)."""
+    below = nn.functional.pad(found.cumsum(-1), (1, 0))
+    first = torch.searchsorted(bins, edges[:, :-1].contiguous(), right=True) - 1
+    last = torch.searchsorted(bins, edges[:, 1:].contiguous()).clamp(max=bins.shape[1] - 1)
+    bound = below.gather(-1, last) - below.gather(-1, first.clamp(0, bins.shape[1] - 1))
+    return ((w - bound).clamp_min(0).square() / (w + LITTLE)).sum(-1)
+
+
+class _Excess(torch.autograd.Function):
+    """`excess_of` with its gradient, in one loop over rays."""
+
+    @staticmethod
+    def forward(ctx, found, bins, edges, w):
+        excess, slope = w.new_empty(len(w)), torch.empty_like(found)
+        sum_excess(
+            *(x.detach().contiguous().numpy() for x in (found, bins, edges, w)), LITTLE, excess.numpy(), slope.numpy()
+        )
+        ctx.save_for_backward(slope)
+        return excess
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        return grad[:, None] * ctx.saved_tensors[0], None, None, None

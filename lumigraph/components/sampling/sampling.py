@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .loops import invert
+
 FAINT = 1e-5  # weight that every bin has at least, so that no part of a ray is beyond reach
 
 
@@ -32,12 +34,29 @@ def inverse_transform(
     weights: of each bin, not negative
     shares:  in [0, 1], growing, how much of the distribution lies below each result; see `stratified`
     """
+    if loops_fit(edges, weights, shares):
+        found = torch.empty_like(shares, memory_format=torch.contiguous_format)
+        invert(*(x.contiguous().numpy() for x in (edges, weights, shares)), FAINT, found.numpy())
+        return found
+    return inverse_of(edges, weights, shares)
+
+
+def inverse_of(
+    edges: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], shares: Float[Tensor, "ray count"]
+) -> Float[Tensor, "ray count"]:
+    """The definition of `inverse_transform`, on any device and with gradients."""
     density = weights + FAINT
     below = torch.nn.functional.pad((density / density.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
     i = torch.searchsorted(below, shares.contiguous(), right=True).clamp(1, weights.shape[-1])
     low, high = below.gather(-1, i - 1), below.gather(-1, i)
     share = ((shares - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)
     return torch.lerp(edges.gather(-1, i - 1), edges.gather(-1, i), share)
+
+
+def loops_fit(*tensors: Tensor) -> bool:
+    """True for tensors that loops on the CPU take: float32, and no gradient is asked for."""
+    wanted = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    return not wanted and all(x.dtype == torch.float32 and not x.is_cuda for x in tensors)
 
 
 def midpoints(x: Float[Tensor, "ray n"]) -> Float[Tensor, "ray n_less_one"]:

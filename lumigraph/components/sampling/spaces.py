@@ -73,6 +73,10 @@ class Space(ABC):
     def stretch(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """|det J|^(1/3): the length in coordinates of a unit of the scene, whatever its direction."""
 
+    def mapped(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+        """Coordinates of points, and `stretch` there."""
+        return self.warp(points), self.stretch(points)
+
     def along(self, rays: Rays, samples: Samples) -> Float[Tensor, " sample"]:
         """Coordinates that a ray passes in a unit of the scene, averaged over each sample."""
         ray = samples.ray_index
@@ -234,6 +238,13 @@ class Contraction(Space):
             return kernels.contract(points.reshape(-1, 3))[0].view(points.shape)
         return points * self._across(points)[..., None]
 
+    def mapped(self, points):
+        if not fits_kernels(points):
+            return super().mapped(points)
+        coordinates, stretch = kernels.contract(points, True)
+        assert stretch is not None
+        return coordinates, stretch
+
     def unwarp(self, coordinates):
         doubled = 2 * coordinates
         radius = doubled.norm(dim=-1, keepdim=True).clamp_min(1)  # 2 - 1 / |x| outside
@@ -247,9 +258,7 @@ class Contraction(Space):
 
     def stretch(self, points):
         if fits_kernels(points):
-            stretch = kernels.contract(points, True)[1]
-            assert stretch is not None
-            return stretch
+            return self.mapped(points)[1]
         return (self._radial(points) * self._across(points).square()) ** (1 / 3)
 
     def _radius(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:

@@ -11,6 +11,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor, nn
 
+from ...kernels._lanes import LANES, fetch, put, root, some, where
+
 
 class RowOptimizer(torch.optim.Optimizer):
     """Optimizer whose parameters are tables (row, ...), and which leaves alone what has no gradient, moments and all.
@@ -72,7 +74,7 @@ def exchange(
             group["params"] = [new if p is old else p for p in group["params"]]
 
 
-BLOCK = 64  # elements that are passed over together where no gradient has a bit set
+CHUNK = 1 << 12  # elements that a thread takes at a time
 
 
 class LazyAdam(RowOptimizer):
@@ -131,17 +133,23 @@ def _move(p, grad, mean, square, i, rate, b1, b2, eps, keep):
         p[i] = keep * p[i] - rate * mean[i] / (np.sqrt(square[i]) + eps)
 
 
-@njit(parallel=True, fastmath=True, cache=True)
+@njit(parallel=True, fastmath={"contract", "nsz", "arcp"}, error_model="numpy", cache=True)
 def _touched_cpu(p, grad, mean, square, rate, b1, b2, eps, keep):
-    bits = grad.view(np.int32)
-    for block in prange((len(p) + BLOCK - 1) // BLOCK):
-        first, last = block * BLOCK, min(len(p), (block + 1) * BLOCK)
-        some = np.int32(0)
-        for i in range(first, last):
-            some |= bits[i]
-        if some:
-            for i in range(first, last):
-                _move(p, grad, mean, square, i, rate, b1, b2, eps, keep)
+    zero, one = np.float32(0), np.float32(1)
+    for chunk in prange((len(p) + CHUNK - 1) // CHUNK):
+        first, last = chunk * CHUNK, min(len(p), (chunk + 1) * CHUNK)
+        whole = last - (last - first) % LANES
+        for i in range(first, whole, LANES):
+            g = fetch(grad, i)
+            touched = g != zero
+            if some(touched):
+                old, old_mean, old_square = fetch(p, i), fetch(mean, i), fetch(square, i)
+                m, s = b1 * old_mean + (one - b1) * g, b2 * old_square + (one - b2) * g * g
+                put(mean, i, where(touched, m, old_mean))
+                put(square, i, where(touched, s, old_square))
+                put(p, i, where(touched, keep * old - rate * m / (root(s) + eps), old))
+        for i in range(whole, last):
+            _move(p, grad, mean, square, i, rate, b1, b2, eps, keep)
 
 
 @njit(parallel=True, fastmath=True, cache=True)

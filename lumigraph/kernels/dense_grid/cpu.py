@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
+from .._lanes import ahead
 from .._operation import differentiable, empty
 from ..hash_encode.cpu import BLOCK, blend, spread
 
@@ -48,6 +49,8 @@ def _look_up(points, grid, box, shape, lanes, out):
                 entries[2 * side * BLOCK + i], entries[(2 * side + 1) * BLOCK + i] = entry, entry + plane
                 weights[2 * side * BLOCK + i] = (ONE - fx) * shares[side]
                 weights[(2 * side + 1) * BLOCK + i] = fx * shares[side]
+                ahead(grid, entry)
+                ahead(grid, entry + plane)
         for i in range(count):
             blend(grid, entries, weights, i, lanes, out, first + i, n)
 

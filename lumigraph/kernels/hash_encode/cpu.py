@@ -1,13 +1,29 @@
 """Numba. Work goes level by level, so that one level's table stays in cache, and features are kept in planes (feature,
 sample), as a matrix product likes them. Looking up, threads share out the points; spreading gradients, the levels, so
-that no two threads add to one place and the sum is the same every time."""
+that no two threads add to one place and the sum is the same every time.
+
+Before many points are looked up, a level is read once in order: random reads from the main memory are slower."""
 
 from functools import cache
 
 import numpy as np
 from numba import get_num_threads, njit, prange
 
-from .._lanes import LANES, fetch, fetch_like, gather, highest, lowest, put, real, scatter, whole
+from .._lanes import (
+    LANES,
+    SIXTEEN,
+    ahead,
+    fetch,
+    fetch_like,
+    filled,
+    gather,
+    highest,
+    lowest,
+    put,
+    real,
+    scatter,
+    whole,
+)
 from .._operation import differentiable, empty
 from ..sparse_grid.cpu import cell_of
 from . import PRIMES
@@ -15,6 +31,7 @@ from . import PRIMES
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0), np.float32(1)
 BLOCK = 64  # points whose corners are worked out together; entries and weights are laid out corner by corner
+PASS = 64  # entries of a level, for each point looked up, up to which it is read in order first
 CHUNK = 1 << 16  # points a thread takes at most at a time: many, so that a level's table is fetched once
 
 
@@ -95,6 +112,18 @@ def spread(grad, at, stride, entries, weights, i, features, table):
         put(table, entries[k], fetch_like(table, entries[k], features) + weights[k] * g)
 
 
+@njit(inline="always")
+def _pass_over(table, first, last):
+    """Read a level's entries in order, which brings them into the caches at more than the rate of random reads.
+
+    The sum is for nothing; it keeps the compiler from dropping the loop.
+    """
+    total = filled(ZERO, SIXTEEN)
+    for at in range(first, last - LANES + 1, LANES):
+        total = total + fetch(table, at)
+    return total
+
+
 @njit(parallel=True, fastmath=True, cache=True)
 def _look_up(points, n, table, resolutions, offsets, masks, features, out, share):
     width = len(features)
@@ -103,9 +132,14 @@ def _look_up(points, n, table, resolutions, offsets, masks, features, out, share
         last = min(n, (chunk + 1) * share)
         for level in range(len(resolutions)):
             base, plane = offsets[level], level * width * n
+            if PASS * (last - chunk * share) >= offsets[level + 1] - base:
+                put(weights, 0, _pass_over(table, base * width, offsets[level + 1] * width))
             for first in range(chunk * share, last, BLOCK):
                 count = min(BLOCK, last - first)
                 _place(points, n, first, count, resolutions[level], masks[level], base, features, entries, weights)
+                for corner in range(8):
+                    for i in range(count):
+                        ahead(table, entries[corner * BLOCK + i])
                 for i in range(count):
                     blend(table, entries, weights, i, features, out, plane + first + i, n)
 

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._lanes import LANES, fetch_like, filled, highest, put, turn, where
+from .._lanes import LANES, SIXTEEN, ahead, fetch, fetch_like, filled, highest, put, turn, where
 from .._operation import differentiable, empty
 
 FAST = {"cache": True, "fastmath": True, "error_model": "numpy"}
 BLOCK = 32  # samples, whose values of one feature are lanes; a buffer has feature f of sample s at [f BLOCK + s]
-TILE = 8  # outputs that are summed up together: each weight that is read serves BLOCK products
+TILE = 4  # outputs that are summed up together: with LANES samples each, sums fill half of sixteen registers
 ROW = (0,) * BLOCK
 ZERO = np.float32(0)
 
@@ -34,36 +34,28 @@ def _rectified(total, block, gate):
 
 @njit(inline="always")
 def _gated(total, block, gate):
-    return where(_row(block, gate) > ZERO, total, ZERO)
+    return where(fetch(block, gate) > ZERO, total, ZERO)
 
 
 @njit(inline="always")
 def _added(total, block, gate):
-    return total + _row(block, gate)
+    return total + fetch(block, gate)
 
 
 @njit(inline="always")
-def _eight(values, x, depth, weights, w, down, across, out, y, gate, finish):
-    """`_product` of eight outputs, whose sums stay in registers."""
-    a = b = c = d = e = f = g = h = filled(ZERO, ROW)
+def _four(values, x, depth, weights, w, down, across, out, y, gate, finish):
+    """`_product` of four outputs for sixteen samples, whose sums stay in registers."""
+    a = b = c = d = filled(ZERO, SIXTEEN)
     for i in range(depth):
-        value, k = _row(values, x + i), w + down * i
+        value, k = fetch(values, x + BLOCK * i), w + down * i
         a = a + weights[np.uint64(k)] * value
         b = b + weights[np.uint64(k + across)] * value
         c = c + weights[np.uint64(k + 2 * across)] * value
         d = d + weights[np.uint64(k + 3 * across)] * value
-        e = e + weights[np.uint64(k + 4 * across)] * value
-        f = f + weights[np.uint64(k + 5 * across)] * value
-        g = g + weights[np.uint64(k + 6 * across)] * value
-        h = h + weights[np.uint64(k + 7 * across)] * value
-    put(out, y * BLOCK, finish(a, out, gate))
-    put(out, (y + 1) * BLOCK, finish(b, out, gate + 1))
-    put(out, (y + 2) * BLOCK, finish(c, out, gate + 2))
-    put(out, (y + 3) * BLOCK, finish(d, out, gate + 3))
-    put(out, (y + 4) * BLOCK, finish(e, out, gate + 4))
-    put(out, (y + 5) * BLOCK, finish(f, out, gate + 5))
-    put(out, (y + 6) * BLOCK, finish(g, out, gate + 6))
-    put(out, (y + 7) * BLOCK, finish(h, out, gate + 7))
+    put(out, y, finish(a, out, gate))
+    put(out, y + BLOCK, finish(b, out, gate + BLOCK))
+    put(out, y + 2 * BLOCK, finish(c, out, gate + 2 * BLOCK))
+    put(out, y + 3 * BLOCK, finish(d, out, gate + 3 * BLOCK))
 
 
 @njit(inline="always")
@@ -74,13 +66,16 @@ def _product(values, x, depth, weights, w, down, across, count, out, y, gate, fi
     w_io is number w + down i + across o of `weights`.
     """
     whole = count - count % TILE
-    for o in range(0, whole, TILE):
-        _eight(values, x, depth, weights, w + across * o, down, across, out, y + o, gate + o, finish)
-    for o in range(whole, count):
-        total = filled(ZERO, ROW)
-        for i in range(depth):
-            total = total + weights[np.uint64(w + down * i + across * o)] * _row(values, x + i)
-        put(out, (y + o) * BLOCK, finish(total, out, gate + o))
+    for s in range(0, BLOCK, LANES):
+        at = x * BLOCK + s
+        for o in range(0, whole, TILE):
+            to, by = (y + o) * BLOCK + s, (gate + o) * BLOCK + s
+            _four(values, at, depth, weights, w + across * o, down, across, out, to, by, finish)
+        for o in range(whole, count):
+            total = filled(ZERO, SIXTEEN)
+            for i in range(depth):
+                total = total + weights[np.uint64(w + down * i + across * o)] * fetch(values, at + BLOCK * i)
+            put(out, (y + o) * BLOCK + s, finish(total, out, (gate + o) * BLOCK + s))
 
 
 @njit(inline="always")
@@ -89,6 +84,8 @@ def _fetch(planes, n, features, first, count, block, row):
     for f in range(features):
         if count == BLOCK:
             put(block, (row + f) * BLOCK, fetch_like(planes, f * n + first, ROW))
+            for s in range(0, BLOCK, LANES):
+                ahead(planes, min(f * n + first + BLOCK + s, len(planes) - 1))
         else:
             block[(row + f) * BLOCK : (row + f + 1) * BLOCK] = 0
             for s in range(count):

@@ -5,7 +5,7 @@ import numpy as np
 from numba import njit, prange
 
 from .._operation import empty
-from ..contract.cpu import scale_of
+from ..contract.cpu import cube_root, scale_of
 
 BLOCK = 64  # rays that share their memory
 
@@ -52,16 +52,6 @@ def exponential(x):
     power = np.float32(0.2402265069) + f * (np.float32(0.0555041087) + f * power)
     power = np.float32(1) + f * (np.float32(0.6931471806) + f * power)
     return power * np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
-
-
-@njit(inline="always")
-def cube_root(x):
-    """x^(1/3) of numbers above 0, likewise: a third of the exponent, then Newton's method."""
-    third = np.int32(np.float32(np.float32(x).view(np.int32)) * np.float32(1 / 3))
-    y = np.int32(third + np.int32(709921077)).view(np.float32)
-    for _ in range(3):
-        y = np.float32(2 / 3) * y + x / (np.float32(3) * y * y)
-    return y
 
 
 @njit(inline="always")

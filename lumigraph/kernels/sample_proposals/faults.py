@@ -5,7 +5,6 @@ FAULTS = {
     "weight of the uniform part forgotten": ("cpu", "_sample", "below += found[i] + least", "below += found[i]"),
     "grid looked up at a bin's start": ("cpu", "_look_up", "0.5) * (edges[i] + edges[i + 1])", "1) * edges[i]"),
     "the far corners of another plane": ("cpu", "_interpolated", "high = (values[plane]", "high = (values[at]"),
-    "Newton's method ends early": ("cpu", "cube_root", "range(3)", "range(1)"),
     "frustum's stretch as far as near": ("cpu", "_look_up", "inverse * cube_root(inverse)", "inverse"),
     "bin in its own shadow": ("gpu", "_sample", "tl.exp(tau - tl.cumsum(tau, 0))", "tl.exp(-tl.cumsum(tau, 0))"),
     "not annealed": ("gpu", "_sample", "tl.exp2(sharpness * tl.log2(", "tl.exp2(1.0 * tl.log2("),
