@@ -27,6 +27,7 @@ from urllib.request import urlopen
 
 import psutil
 from PIL import Image
+from playwright.sync_api import Error as PlaywrightError
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from browser import ARGUMENTS, find_chromium
@@ -122,7 +123,8 @@ class Walk:
         phone.goto(place)
         phone.locator("main").wait_for()
         if panel:
-            phone.get_by_label(panel, exact=True).scroll_into_view_if_needed()
+            with contextlib.suppress(PlaywrightError):  # it leaves the page when the work ends
+                phone.get_by_label(panel, exact=True).scroll_into_view_if_needed(timeout=10_000)
         if scene:
             phone.frame_locator("iframe").get_by_text(scene).first.wait_for(state="attached")
             phone.wait_for_timeout(15_000)
