@@ -11,7 +11,7 @@ from typing import Any
 PAGES = {  # method, scene, seconds of training
     "splats": ("gaussian-splatting", "procedural:still-life", 60),
     "moving": ("deformable-splatting", "procedural:jelly", 90),
-    "volume": ("plenoctrees", "procedural:still-life", 60),
+    "volume": ("instant-ngp", "procedural:still-life", 60),
 }
 
 
