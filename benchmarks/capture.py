@@ -29,6 +29,7 @@ from rich.table import Table
 
 from lumigraph import files
 from lumigraph.capture.motion.agreement import agreement
+from lumigraph.capture.motion.diagnosis import read_matches
 from lumigraph.capture.pictures import list_images
 from lumigraph.geometry import evenly
 from lumigraph.system.console import console
@@ -108,7 +109,7 @@ def measured(models: Path, database: Path, seconds: tuple[float, float]) -> Plac
         return Placed(0, 0.0, [], 0.0, 0, *seconds)
     best = found[0]
     apart = [model.num_reg_images() for model in found[1:]]
-    share, error = agreement(best, database).share, best.compute_mean_reprojection_error()
+    share, error = agreement(best, database, read_matches(database)).share, best.compute_mean_reprojection_error()
     return Placed(best.num_reg_images(), share, apart, error, best.num_points3D(), *seconds)
 
 

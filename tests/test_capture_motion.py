@@ -671,10 +671,11 @@ def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeyp
         (models / "0" / f"{mapper}{seed}").touch()
 
     monkeypatch.setattr(reconstruction, "largest", lambda models: 8)
+    monkeypatch.setattr(reconstruction, "read_matches", lambda database: Matches({}, {}, 0))
     work = object.__new__(Reconstruction)
     work.stages, work.models, work.unfolded = Stages(tmp_path), tmp_path / "models", tmp_path / "unfolded"
     work.database, work.options = tmp_path / "database.db", MotionOptions(mapper=asked)
-    work.map, work.agreement = mapped, lambda models: Agreement(100, shares[tried[-1]])
+    work.map, work.agreement = mapped, lambda *_: Agreement(100, shares[tried[-1]])
     for _ in range(2):  # once it is there it stays
         work.place("key")
         assert tried == [(asked, 0), (other, 0), ("incremental", 1)]
@@ -695,17 +696,18 @@ def synthetic_model(place, frames, model="SIMPLE_RADIAL", params=(1280.0, 512.0,
 
 
 def test_matches_contradict_wrong_cameras(tmp_path):
-    model = synthetic_model(tmp_path, 8)
-    whole = agreement(model, tmp_path / "database.db")
+    model, database = synthetic_model(tmp_path, 8), tmp_path / "database.db"
+    matches = read_matches(database)
+    whole = agreement(model, database, matches)
     assert whole.share > 0.99 and whole.matches > 1000
     frames = sorted(model.reg_frame_ids())
     part = pycolmap.Reconstruction(model)
     part.deregister_frame(frames[0])  # a match of a photograph without a place is not confirmed
-    assert agreement(part, tmp_path / "database.db").share == pytest.approx(6 / 8, abs=0.05)
+    assert agreement(part, database, matches).share == pytest.approx(6 / 8, abs=0.05)
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0, np.sin(0.1), 0, np.cos(0.1)])), np.zeros(3))
     frame = model.frame(frames[0])
     frame.rig_from_world = turn * frame.rig_from_world
-    assert agreement(model, tmp_path / "database.db").share == pytest.approx(6 / 8, abs=0.1)
+    assert agreement(model, database, matches).share == pytest.approx(6 / 8, abs=0.1)
 
 
 @pytest.mark.parametrize("shared", [0, 3])

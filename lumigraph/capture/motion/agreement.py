@@ -9,14 +9,13 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
 from ...geometry import evenly
 from ...system.library import pycolmap
-from .diagnosis import MIN_MATCHES
+from .diagnosis import MIN_MATCHES, Matches
 
 MAX_PAIRS = 4000  # pairs of photographs that are looked at
 MAX_EPIPOLAR_ERROR = 0.003  # distance from the epipolar line, of a photograph's longer side
@@ -36,32 +35,26 @@ class Agreement:
         return self.confirmed / self.matches if self.matches else 1.0
 
 
-def agreement(model: pycolmap.Reconstruction, database: Path) -> Agreement:
-    """Agreement of a model of flat photographs with the matches in COLMAP's database."""
+def agreement(model: pycolmap.Reconstruction, database: Path, matched: Matches) -> Agreement:
+    """Agreement of a model of flat photographs with the matches in COLMAP's database. matched: what was read of it"""
     placed = {image.name: image for image in model.images.values() if image.has_pose}
+    near = {name for group in matched.groups() if not group.isdisjoint(placed) for name in group}
     matches = confirmed = 0
     with closing(pycolmap.Database.open(database)) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         features = {number: opened.read_keypoints(number)[:, :2] for number in names}
         pairs = [
-            (pycolmap.pair_id_to_image_pair(number), found.inlier_matches)
+            (a, b, found.inlier_matches)
             for number, found in zip(*opened.read_two_view_geometries(), strict=True)
-            if len(found.inlier_matches) >= MIN_MATCHES
+            for a, b in [pycolmap.pair_id_to_image_pair(number)]
+            if len(found.inlier_matches) >= MIN_MATCHES and names[a] in near
         ]
-    near = connected(pairs, {number for number, name in names.items() if name in placed})
-    for (a, b), matched in evenly(near, MAX_PAIRS):
-        matches += len(matched)
+    for a, b, pair in evenly(pairs, MAX_PAIRS):
+        matches += len(pair)
         first, second = placed.get(names[a]), placed.get(names[b])
         if first is not None and second is not None:
-            confirmed += int(on_epipolar_lines(model, first, second, features[a], features[b], matched).sum())
+            confirmed += int(on_epipolar_lines(model, first, second, features[a], features[b], pair).sum())
     return Agreement(matches, confirmed)
-
-
-def connected(pairs: list[tuple[tuple[int, int], Any]], numbers: set[int]) -> list[tuple[tuple[int, int], Any]]:
-    """Pairs of photographs that other pairs connect with some of these."""
-    while new := {x for pair, _ in pairs for x in pair if numbers.intersection(pair)} - numbers:
-        numbers = numbers | new
-    return [(pair, found) for pair, found in pairs if numbers.intersection(pair)]
 
 
 def on_epipolar_lines(

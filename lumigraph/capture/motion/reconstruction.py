@@ -347,12 +347,12 @@ class Reconstruction:
         asked = self.options.mapper
         ways = [(asked, 0), (OTHER_MAPPER[asked], 0), *(("incremental", seed) for seed in OTHER_SEEDS)]
         with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as chosen:
-            found: list[Agreement] = []
+            found, matches = list[Agreement](), read_matches(self.database)
             for mapper, seed in ways:
                 attempt = chosen / "attempt"
                 attempt.mkdir()
                 self.map(self.database, attempt, mapper, seed=seed)
-                now = self.agreement(attempt)
+                now = self.agreement(attempt, matches)
                 if all(now.confirmed > other.confirmed for other in found):
                     for place in set(chosen.iterdir()) - {attempt}:
                         remove(place)
@@ -366,12 +366,12 @@ class Reconstruction:
                 if now.share >= MIN_AGREEMENT:
                     break
 
-    def agreement(self, models: Path) -> Agreement:
+    def agreement(self, models: Path, matches: Matches) -> Agreement:
         """Agreement of the largest of some models with the matches. Panoramas are taken as they are."""
         found = read_models(models)
         if not found or found[0].num_reg_images() < MIN_VIEWS:
             return Agreement(matches=1, confirmed=0)
-        return Agreement(0, 0) if self.spherical else agreement(found[0], self.database)
+        return Agreement(0, 0) if self.spherical else agreement(found[0], self.database, matches)
 
     def unfold(self, key: str) -> None:
         """If the model leaps between neighbours, make another from what near neighbours share alone. Far ones that
@@ -502,7 +502,7 @@ class Reconstruction:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
         database = self.second if self.second.is_file() else self.database
         matches = read_matches(database)
-        found, told, _ = self.choose(matches)
+        found, told, chosen = self.choose(matches)
         if self.refined.is_dir():
             found = [pycolmap.Reconstruction(self.refined), *found]
         flat = bool(found) and matches.are_turned() and triangulation_angle(found[0]) < MIN_PARALLAX
@@ -520,7 +520,8 @@ class Reconstruction:
         known = place is not None and place.new_from_old is not None
         if self.options.moving:
             told.append(self.found_to_move().say())
-        if not self.spherical and (share := agreement(model, database).share) < MIN_AGREEMENT:
+        used = self.second if self.second.is_file() else chosen  # without far matches, where the model was unfolded
+        if not self.spherical and (share := agreement(model, used, matches).share) < MIN_AGREEMENT:
             told.append(
                 f"{1 - share:.0%} of the matches contradict the cameras' places, so some may be wrong; look at "
                 f"capture.png, and take photographs between those that stand far apart"
