@@ -63,6 +63,12 @@ def exact(inputs: Sequence) -> tuple:
     return tuple(x.double() if torch.is_tensor(x) and x.is_floating_point() else x for x in inputs)
 
 
+def moved(inputs: Sequence, engine: str) -> list:
+    """The same inputs on the engine's device; what is done to them reaches no other engine's."""
+    detached = (x.detach() if torch.is_tensor(x) else x for x in inputs)
+    return [x.to(DEVICES[engine]) if hasattr(x, "to") else x for x in detached]
+
+
 def outputs_and_gradients(name: str, engine: str, inputs: Sequence, wanted=None, used=None) -> list[Tensor]:
     """All outputs, then the gradient of a fixed mixture of them in each input that is real.
 
@@ -70,8 +76,7 @@ def outputs_and_gradients(name: str, engine: str, inputs: Sequence, wanted=None,
     used:   the only output that takes part in the mixture; all if None
     """
     real = [i for i, x in enumerate(inputs) if torch.is_tensor(x) and x.is_floating_point()]
-    inputs = [x.detach() if torch.is_tensor(x) else x for x in inputs]
-    inputs = [x.to(DEVICES[engine]) if hasattr(x, "to") else x for x in inputs]
+    inputs = moved(inputs, engine)
     differentiated = [inputs[i].requires_grad_() for i in real if wanted in (None, i)]
     outputs = call(name, engine, inputs)
     mixture = []
@@ -85,6 +90,21 @@ def outputs_and_gradients(name: str, engine: str, inputs: Sequence, wanted=None,
         return list(outputs)
     with mock.patch.dict(os.environ, LUMIGRAPH_DEBUG="1"):
         return [*outputs, *torch.autograd.grad(sum(mixture), differentiated, materialize_grads=True)]
+
+
+def in_bfloat16(name: str, engine: str) -> bool:
+    """True for what multiplies in bfloat16: the perceptron on a GPU."""
+    return name == "perceptron" and DEVICES[engine] == "cuda"
+
+
+def assert_near(actual: Tensor, expected: Tensor, bound: float) -> None:
+    """By norms. In bfloat16, rounded on a CPU, outputs of the perceptron's cases differ by up to 0.0055 of theirs, and
+    gradients by 0.165: a hidden unit near zero changes sides, and its gradient comes or goes."""
+    gap, size = (actual - expected).norm().item(), expected.norm().item()
+    assert gap <= bound * size, f"{gap / size:.3g} of the norm, more than {bound}"
+
+
+OUTPUT_BOUND, GRADIENT_BOUND = 0.01, 0.25  # for `assert_near`
 
 
 @functools.cache
@@ -105,6 +125,9 @@ def assert_agrees(
     inputs = [laid_out(x) if torch.is_tensor(x) else x for x in cases(name)[case]]
     found = outputs_and_gradients(name, engine, inputs, wanted, used)
     for i, (expected, actual) in enumerate(zip(truth(name, case, wanted, used), found, strict=True)):
+        if in_bfloat16(name, engine):
+            assert_near(actual.cpu().double(), expected, OUTPUT_BOUND if i < facts(name).outputs else GRADIENT_BOUND)
+            continue
         scale = max(1.0, expected.abs().max().item()) if expected.numel() else 1.0
         torch.testing.assert_close(
             actual.cpu().to(expected.dtype),

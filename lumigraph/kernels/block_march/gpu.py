@@ -91,7 +91,9 @@ def _cell_of(x, b, B: tl.constexpr):
 @triton.jit
 def _voxel_of(x, y, z, bx, by, bz, B: tl.constexpr):
     """The first of the eight voxels around each place, counted in its block, and the place beyond it."""
-    (cx, fx), (cy, fy), (cz, fz) = _cell_of(x, bx, B), _cell_of(y, by, B), _cell_of(z, bz, B)
+    cx, fx = _cell_of(x, bx, B)  # one pair a line: Triton 3.6 assigns to no nested tuple
+    cy, fy = _cell_of(y, by, B)
+    cz, fz = _cell_of(z, bz, B)
     return (cx, cy, cz), (fx, fy, fz)
 
 

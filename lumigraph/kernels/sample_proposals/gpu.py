@@ -21,7 +21,9 @@ def _axis(x, size):
 
 @triton.jit
 def _interpolated(values, X, Y, Z, x, y, z, here):
-    (i, a), (j, b), (k, c) = _axis(x, X), _axis(y, Y), _axis(z, Z)
+    i, a = _axis(x, X)  # one pair a line: Triton 3.6 assigns to no nested tuple
+    j, b = _axis(y, Y)
+    k, c = _axis(z, Z)
     total = tl.zeros_like(x)
     for corner in tl.static_range(8):
         di, dj, dk = corner // 4, corner // 2 % 2, corner % 2

@@ -22,7 +22,9 @@ def _along(x, cells):
 def cell_of(points, i, here, X, Y, Z):
     """Cell of X Y Z that holds each point, its place in the cell, and the axes along which it lies in the cube."""
     x, y, z = load_row(points, i, here)
-    (cx, fx), (cy, fy), (cz, fz) = _along(x, X), _along(y, Y), _along(z, Z)
+    cx, fx = _along(x, X)  # one pair a line: Triton 3.6 assigns to no nested tuple
+    cy, fy = _along(y, Y)
+    cz, fz = _along(z, Z)
     inside = (x >= 0.0) & (x <= 1.0), (y >= 0.0) & (y <= 1.0), (z >= 0.0) & (z <= 1.0)
     return (cx, cy, cz), (fx, fy, fz), inside
 

@@ -241,7 +241,7 @@ class GANcraft(Method):
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
         width, height = camera.size[0].tolist()
-        rays = camera.rays(bordered(0, 0, width, height)).to(self.device)
+        rays = camera.to(self.device).rays(bordered(0, 0, width, height).to(self.device))
         rgb, depth, opacity = self.picture(rays, (width, height), self.shown_code)
         return Rendering(0.5 + 0.5 * rgb[0].movedim(0, -1), depth, opacity)
 
