@@ -104,7 +104,7 @@ def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:
     width, height = camera.size[0].tolist()
     distortion = lens.distortion[0] if isinstance(lens, OpenCV) else lens.focal.new_zeros(8)
     rotation = camera.pose[0, :, :3].T
-    limits = _limits(lens, width, height)
+    limits = _limits(lens.to("cpu"), width, height).to(lens.device)  # few numbers in many operations
     return kernels.View(
         rotation, camera.position[0], lens.focal[0], lens.centre[0], distortion, limits, (width, height), near
     )
