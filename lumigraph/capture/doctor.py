@@ -299,6 +299,8 @@ def of_tracks(
             fault = "shows something else"
             if t.mirrored > alike - MIN_LIKENESS_DROP:
                 fault, evidence = "mirrored", f"{evidence}, mirrored {t.mirrored:.2f}"
+            else:
+                evidence += ": or its place is another, as where two sides of the subject look alike"
             found.append(Finding(shot.name, fault, evidence, leave_out(shot)))
     return found
 
