@@ -1,4 +1,4 @@
-"""Hook of the site (mkdocs.yml): fences of the language math, which hold LaTeX, become MathML, which browsers draw by themselves."""
+"""Hook of the site (mkdocs.yml): fences of the language math, which hold LaTeX, become MathML."""
 
 from __future__ import annotations
 
