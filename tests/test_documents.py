@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import runpy
 from functools import cache
 from pathlib import Path
 from textwrap import indent
@@ -160,7 +161,8 @@ def test_structure_from_motion_has_the_names_it_is_called_by():
 
 def commands(text: str) -> list[str]:
     """Commands of a page: lines of code blocks, and code in prose, which may run over the end of a line."""
-    lines = [line for block in re.findall(r"(?ms)^```\n(.*?)^```", text) for line in block.splitlines()]
+    fences = re.findall(r"(?ms)^```(\w*)\n(.*?)^```", text)
+    lines = [line for language, block in fences if not language for line in block.splitlines()]
     prose = re.sub(r"(?ms)^```.*?^```", "", text)
     lines += [" ".join(code.split()) for code in re.findall(r"`([^`]+)`", prose)]
     parts = [part.strip() for line in lines for part in re.split(r"[;#]", line)]
@@ -224,3 +226,32 @@ def test_a_lost_option_is_noticed():
     ]
     assert lost_options("lumigraph train METHOD a --log2-hashmap-size 8") == []
     assert lost_options("python benchmarks/mesh.py --exact A --wievs 2") == ["wievs"]
+    behind = "```math\na\n```\n\n```\nlumigraph eval RUN\n```"
+    assert commands(behind) == ["lumigraph eval RUN"]
+
+
+# Equations in the documents become MathML on the site
+
+
+def test_equations_are_readable():
+    equation = runpy.run_path(str(ROOT / "docs" / "site_math.py"))["equation"]
+    pages = sorted((ROOT / "docs").rglob("*.md"))
+    sources = [
+        source for page in pages for source in re.findall(r"(?ms)^ *```math\n(.*?)^ *```", page.read_text("utf-8"))
+    ]
+    assert len(sources) > 100
+    for source in sources:
+        assert equation(source).startswith('<div class="equation"><math display="block">')
+
+
+@pytest.mark.parametrize("source", [r"\unknown{x}", r"\frac{a}{b", "a & b", "a_", r"\left( a", r"\text{\alpha}"])
+def test_an_unreadable_equation_is_an_error(source):
+    site_math = runpy.run_path(str(ROOT / "docs" / "site_math.py"))
+    with pytest.raises(site_math["SuperFencesException"], match="in this equation"):
+        site_math["equation"](source)
+
+
+def test_the_minus_of_one_operand_has_no_space():
+    mathml = runpy.run_path(str(ROOT / "docs" / "site_math.py"))["mathml"]
+    assert '<mo form="prefix">−</mo>' in mathml("f(-x)") and "prefix" not in mathml("a - x")
+    assert mathml(r"\sum_i").count("<munder>") == 1
