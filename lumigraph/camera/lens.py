@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -107,7 +107,7 @@ class Lens(ABC):
         """The lenses of some cameras; an int gives a batch of one."""
         return self._map(lambda x: x[one_or_more(index)])
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> Lens:
         """The same lenses on a device; tensors that are there already are not copied."""
         return self._map(lambda x: x.to(device))
 
@@ -166,7 +166,7 @@ class Lens(ABC):
     def _numbers(self) -> dict[str, Tensor]:
         return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Lens:
         return type(self)(**{k: change(v) for k, v in self._numbers().items()})
 
 

@@ -104,19 +104,20 @@ def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:
     width, height = camera.size[0].tolist()
     distortion = lens.distortion[0] if isinstance(lens, OpenCV) else lens.focal.new_zeros(8)
     rotation = camera.pose[0, :, :3].T
-    limits = _limits(lens.to("cpu"), width, height).to(lens.device)  # few numbers in many operations
+    limits = _limits(lens, width, height)
     return kernels.View(
         rotation, camera.position[0], lens.focal[0], lens.centre[0], distortion, limits, (width, height), near
     )
 
 
 def _limits(lens: Pinhole | OpenCV, width: int, height: int) -> Float[Tensor, " 4"]:
-    """The part of the plane z = 1 that the picture shows, and a margin around it."""
-    x, y = (torch.linspace(0, n, EDGE_SAMPLES, device=lens.device) for n in (width, height))
+    """The part of the plane z = 1 that the picture shows, and a margin around it. Found on the processor: on a GPU it
+    would be few numbers in hundreds of launches."""
+    x, y = (torch.linspace(0, n, EDGE_SAMPLES) for n in (width, height))
     left, top = torch.zeros_like(y), torch.zeros_like(x)
     edges = [torch.stack(pair, -1) for pair in ((left, y), (left + width, y), (x, top), (x, top + height))]
-    directions = lens.unproject(torch.cat(edges))
+    directions = lens.to("cpu").unproject(torch.cat(edges))
     plane = directions[:, :2] / directions[:, 2:]
     low, high = plane.amin(0), plane.amax(0)
     margin = IMAGE_MARGIN * (high - low)
-    return torch.stack([low - margin, high + margin], -1).flatten()
+    return torch.stack([low - margin, high + margin], -1).flatten().to(lens.device)
