@@ -16,6 +16,7 @@ import pytest
 
 NAMES = "chromium", "chromium-browser", "google-chrome"
 SIZE = {"width": 800, "height": 600}
+PATIENCE = 60_000  # ms; at a load of 8 to 12 a click took more than 20 s, twice
 ARGUMENTS = [
     "--use-gl=angle",
     "--use-angle=swiftshader",
@@ -53,7 +54,7 @@ def chromium() -> Iterator[Any]:
 def page(chromium: Any) -> Iterator[Any]:
     """A playwright Page of 800x600 pixels in a context of its own."""
     context = chromium.new_context(viewport=SIZE)
-    context.set_default_timeout(20_000)
+    context.set_default_timeout(PATIENCE)
     yield context.new_page()
     context.close()
 
