@@ -38,7 +38,7 @@ def mathml(source: str) -> str:
     if bare.count("{") != bare.count("}"):
         raise ValueError("Braces do not match.")
     try:
-        written = convert(re.sub(r"{aligned}", "{split}", source), display="block")
+        written = convert(source.replace("{aligned}", "{split}"), display="block")
         tree = fromstring(written.replace(NAMESPACE, ""))
     except ParseError as error:
         raise ValueError("An & or < is outside {aligned} and {cases}; write \\lt for the sign.") from error

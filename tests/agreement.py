@@ -25,6 +25,7 @@ from lumigraph.kernels._operation import Facts, operations, tensors
 
 OPERATIONS = operations()
 ENGINES = ["cpu", "gpu"]
+OUTPUT_BOUND, GRADIENT_BOUND = 0.01, 0.25  # of their norms, for products in bfloat16: see `assert_near`
 DEVICES = {"reference": "cpu", "cpu": "cpu", "gpu": "cuda" if torch.cuda.is_available() else "cpu"}
 
 
@@ -102,9 +103,6 @@ def assert_near(actual: Tensor, expected: Tensor, bound: float) -> None:
     gradients by 0.165: a hidden unit near zero changes sides, and its gradient comes or goes."""
     gap, size = (actual - expected).norm().item(), expected.norm().item()
     assert gap <= bound * size, f"{gap / size:.3g} of the norm, more than {bound}"
-
-
-OUTPUT_BOUND, GRADIENT_BOUND = 0.01, 0.25  # for `assert_near`
 
 
 @functools.cache

@@ -233,8 +233,14 @@ def test_a_lost_option_is_noticed():
 # Equations in the documents become MathML on the site
 
 
+@cache
+def site_math() -> dict[str, Any]:
+    """What the hook of the site that makes them defines."""
+    return runpy.run_path(str(ROOT / "docs" / "site_math.py"))
+
+
 def test_equations_are_readable():
-    equation = runpy.run_path(str(ROOT / "docs" / "site_math.py"))["equation"]
+    equation = site_math()["equation"]
     pages = sorted((ROOT / "docs").rglob("*.md"))
     sources = [
         source for page in pages for source in re.findall(r"(?ms)^ *```math\n(.*?)^ *```", page.read_text("utf-8"))
@@ -246,12 +252,11 @@ def test_equations_are_readable():
 
 @pytest.mark.parametrize("source", [r"\unknown{x}", r"\frac{a}{b", "a & b", "a_", r"\left( a", r"\text{\alpha}"])
 def test_an_unreadable_equation_is_an_error(source):
-    site_math = runpy.run_path(str(ROOT / "docs" / "site_math.py"))
-    with pytest.raises(site_math["SuperFencesException"], match="in this equation"):
-        site_math["equation"](source)
+    with pytest.raises(site_math()["SuperFencesException"], match="in this equation"):
+        site_math()["equation"](source)
 
 
 def test_the_minus_of_one_operand_has_no_space():
-    mathml = runpy.run_path(str(ROOT / "docs" / "site_math.py"))["mathml"]
+    mathml = site_math()["mathml"]
     assert '<mo form="prefix">−</mo>' in mathml("f(-x)") and "prefix" not in mathml("a - x")
     assert mathml(r"\sum_i").count("<munder>") == 1
