@@ -32,7 +32,7 @@ def lazy_adam(p, grad, mean, square, rates, rate, b1, b2, eps, keep):
     """A step of `LazyAdam`, in place. rates: of rows, or None"""
     given = rates is not None
     tensors = p, grad.contiguous(), mean, square, rates if given else p
-    numbers = p.numel(), p[0].numel() if p.dim() else 1, rate, b1, b2, eps, keep
+    numbers = p.numel(), math.prod(p.shape[1:]), rate, b1, b2, eps, keep
     launch(_lazy, (blocks(p.numel(), BLOCK),), *tensors, *numbers, RATES=given)
 
 
