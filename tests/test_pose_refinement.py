@@ -20,6 +20,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
+from lumigraph.capture.doctor import of_folds
 from lumigraph.capture.oddities import about_fold
 from lumigraph.components.clouds.initialization import random_cloud
 from lumigraph.components.clouds.moved_cloud import seen_from
@@ -398,6 +399,8 @@ def test_a_capture_is_said_to_be_folded_where_it_leaps_and_its_photographs_do_no
     assert about_fold(photographed(tmp_path, walk, steady), walk) is None
     said = about_fold(photographed(tmp_path, folded, steady), folded)
     assert said is not None and "19.png and 20.png" in said and "folded" in said
+    (finding,) = of_folds(photographed(tmp_path, folded, steady), tmp_path)
+    assert "19.png and 20.png" in finding.evidence and f"lumigraph capture {tmp_path}" in finding.advice
     assert about_fold(photographed(tmp_path, folded, leaping), folded) is None  # somebody walked there
     shuffled = folded[np.random.default_rng(0).permutation(40)]
     assert about_fold(photographed(tmp_path, shuffled, steady), shuffled) is None  # in no order

@@ -18,7 +18,7 @@ from ..geometry import evenly
 from . import colmap
 from .capture import Capture, Shot
 from .coverage import coverage
-from .oddities import in_steps
+from .oddities import fold, in_steps
 from .photos import Photo
 from .photos.judge import JUDGED_SIDE, Judgement, blurred, exposure_jumps, judge
 from .pictures import eight_bits
@@ -40,6 +40,7 @@ FLOATING_DEVIATIONS = 3.0  # of PSNR that floating surfaces come with; alone the
 MIRRORED_PSNR = 1.5  # dB by which a mirrored photograph must fit its rendering better
 
 BLURRED = "blurred"  # fault of a photograph
+FOLDED = "folded cameras"  # fault of a capture whose cameras leap where its photographs do not
 LACKING = "lacking directions"  # fault of a capture with directions that lack photographs
 
 Array = Float[np.ndarray, " photo"]
@@ -124,6 +125,7 @@ def findings(
         found += of_pixels(shots, {photo.name: photo for photo in judged})
         found += of_tracks(shots, tracks_of(capture), folder, {f.photograph for f in found if f.fault == BLURRED})
         found += of_residuals(residuals, shots, {f.photograph for f in found})
+        found += of_folds(shots, folder)
     poses = np.stack([shot.pose for shot in shots])
     turned = poses if upright is None else upright @ poses
     if capture.bounds is None and (around := coverage([shot.name for shot in shots], turned)) is not None:
@@ -149,6 +151,24 @@ def leave_out(shot: Shot) -> str:
         return "leave it out"
     moves = [shlex.join(["mv", str(path), f"{path}.out"]) for path in shot.image.values()]
     return f"retake it, or leave it out: {' && '.join(moves)}"
+
+
+def find_again(shot: Shot, folder: Path) -> str:
+    """Advice with the command that finds the poses of all photographs anew. shot: one of them"""
+    source = str(first_file(shot).parent) if isinstance(shot.image, dict) else "PHOTOS"
+    again = shlex.join(["lumigraph", "capture", source, "--output", f"{folder}-again"])
+    return f"find the poses again: {again}"
+
+
+def of_folds(shots: Sequence[Shot], folder: Path) -> list[Finding]:
+    """A leap of the cameras between two photographs in a row that show the same."""
+    if (found := fold(shots, np.stack([shot.pose for shot in shots]))) is None:
+        return []
+    evidence = (
+        f"{found.before} and {found.after} are next to each other and show the same, but their cameras are "
+        f"{found.times:.0f} times as far apart as neighbours usually are"
+    )
+    return [Finding("", FOLDED, evidence, find_again(shots[0], folder))]
 
 
 def of_pixels(shots: Sequence[Shot], before: Mapping[str, Photo]) -> list[Finding]:
@@ -291,9 +311,7 @@ def of_tracks(
                 f"its details are {t.error:.0f} pixels from their points (per 1000), those of others {usual:.1f}; "
                 f"{100 * t.share:.0f} % of its tracks disagree"
             )
-            source = str(first_file(shot).parent) if isinstance(shot.image, dict) else "PHOTOS"
-            again = shlex.join(["lumigraph", "capture", source, "--output", f"{folder}-again"])
-            found.append(Finding(shot.name, "placed badly", evidence, f"find the poses again: {again}"))
+            found.append(Finding(shot.name, "placed badly", evidence, find_again(shot, folder)))
         if shot.name not in blurred and t.likeness < min(MAX_LIKENESS, alike - MIN_LIKENESS_DROP):
             evidence = f"correlation with the colours of its points {t.likeness:.2f}, others {alike:.2f}"
             fault = "shows something else"

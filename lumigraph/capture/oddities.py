@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -134,8 +135,26 @@ def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
 
 
 def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> str | None:
-    """A sentence about the widest leap between neighbours whose photographs show the same, if there is one and the
-    order of photographs tells anything.
+    """A sentence about a possible fold, if there is one."""
+    found = fold(shots, poses)
+    return found and (
+        f"has {found.before} and {found.after} next to each other, showing the same, but {found.times:.0f} times "
+        "as far apart as neighbours usually are: its model may be folded there; look at its cameras, and if they are "
+        "wrong find them anew with `lumigraph capture`"
+    )
+
+
+class Fold(NamedTuple):
+    """Names of two neighbours whose photographs show the same, and the distance of their cameras over the usual one."""
+
+    before: str
+    after: str
+    times: float
+
+
+def fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> Fold | None:
+    """The widest leap between neighbours whose photographs show the same, if there is one and the order of photographs
+    tells anything.
 
     Those of each published split are a list of their own. Photographs are looked at only where cameras leap.
     """
@@ -145,11 +164,7 @@ def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> 
     if not leaps:
         return None
     times, (before, after) = max(leaps)
-    return (
-        f"has {shots[before].name} and {shots[after].name} next to each other, showing the same, but {times:.0f} times "
-        "as far apart as neighbours usually are: its model may be folded there; look at its cameras, and if they are "
-        "wrong find them anew with `lumigraph capture`"
-    )
+    return Fold(shots[before].name, shots[after].name, times)
 
 
 def leaps_alike(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> list[tuple[int, float]]:

@@ -30,6 +30,7 @@ NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "e
 
 def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = nullcontext) -> None:
     """Print the state of a Run after an Outcome, and the next commands. turn: see `examine`"""
+    from ..capture.doctor import FOLDED
     from ..evaluation.photographs import RESULT_FILE
     from ..evaluation.tracking import tracks
     from ..metrics.rows import last_psnr
@@ -69,6 +70,10 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
         rows["advice"] = advice(trend, enough, more, photographed(run, data))
     if enough and not method.complete and gap > MEMORISED_DB:
         rows["advice"] = memorised(gap, run, method, [one.photograph for one in checked.of("test")])
+    if any(finding.fault == FOLDED for finding in checked.findings):
+        rows["advice"] = (
+            "cameras contradict each other, and neither time nor photographs mend that; find them anew, below"
+        )
     show(rows | finding_rows(checked.findings, str(run.folder / RESULT_FILE)) | next_commands(run))
 
 
