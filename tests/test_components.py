@@ -102,7 +102,7 @@ def test_lazy_adam_leaves_alone_what_has_no_gradient(generator):
 
 @pytest.mark.parametrize("by_row", [False, True])
 def test_lazy_adam_moves_the_same_on_a_gpu(by_row, generator):
-    gpu = pytest.importorskip("lumigraph.components.training.row_optimizers_gpu", exc_type=ImportError)
+    gpu = pytest.importorskip("lumigraph.kernels._row_optimizers", exc_type=ImportError)
     start, device = torch.randn(900, 4, generator=generator), "cuda" if torch.cuda.is_available() else "cpu"
     p, rates = torch.nn.Parameter(start.clone()), torch.rand(900, generator=generator).round(decimals=1)
     optimizer = LazyAdam([p], weight_decay=0.1)

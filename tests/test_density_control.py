@@ -55,7 +55,7 @@ def test_where_everything_moves_it_is_adam(generator):
 
 @pytest.mark.parametrize("columns", [None, [1.0, 0.5, 0.05]])
 def test_a_gpu_moves_the_same_rows_as_far(columns, generator):
-    gpu = pytest.importorskip("lumigraph.components.training.row_optimizers_gpu", exc_type=ImportError)
+    gpu = pytest.importorskip("lumigraph.kernels._row_optimizers", exc_type=ImportError)
     start, device = torch.randn(900, 3, generator=generator), "cuda" if torch.cuda.is_available() else "cpu"
     p = torch.nn.Parameter(start.clone())
     optimizer = CloudAdam([{"params": [p], "lr": 0.02, "columns": columns}])

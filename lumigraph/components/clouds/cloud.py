@@ -173,7 +173,7 @@ class CloudAdam(RowOptimizer):
         given = p, grad.contiguous(), state["mean"], state["square"]
         tensors = *(x.detach().view(-1, width) for x in given), state["last"]
         if p.is_cuda:
-            from ..training.row_optimizers_gpu import cloud_adam
+            from ...kernels._row_optimizers import cloud_adam
 
             cloud_adam(*tensors, columns, t, rate, (b1, b2), group["eps"])
         else:

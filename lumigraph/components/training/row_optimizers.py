@@ -106,7 +106,7 @@ class LazyAdam(RowOptimizer):
         if rates is not None and len(rates) != len(p):
             raise ValueError(f"{len(rates)} rates are given for {len(p)} rows")
         if p.is_cuda:
-            from .row_optimizers_gpu import lazy_adam
+            from ...kernels._row_optimizers import lazy_adam
 
             lazy_adam(*tensors, rates, rate, b1, b2, group["eps"], keep)
             return

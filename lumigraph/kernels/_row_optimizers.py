@@ -5,7 +5,7 @@ import math
 import triton
 import triton.language as tl
 
-from ...kernels._gpu import blocks, indices, launch
+from ._gpu import blocks, indices, launch
 
 BLOCK = tl.constexpr(1024)  # elements
 TILE = 2048  # elements of the rows that a program takes
