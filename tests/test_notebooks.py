@@ -24,11 +24,14 @@ from lumigraph.commands import notebook_page
 pytestmark = budget("house")
 
 
-def test_a_picture_shows_itself():
+def test_a_picture_shows_itself_beside_its_depth():
     rgb = torch.linspace(-0.2, 1.2, 4 * 6 * 3).view(4, 6, 3)
-    seen = Rendering(rgb, torch.ones(4, 6), torch.ones(4, 6))
+    depth = torch.linspace(1, 4, 6).expand(4, 6)
+    seen = Rendering(rgb, depth, torch.ones(4, 6))
     shown = np.asarray(Image.open(io.BytesIO(seen._repr_png_())))
-    assert np.array_equal(shown, (rgb.clamp(0, 1) * 255).round().byte().numpy())
+    assert np.array_equal(shown[:, :6], (rgb.clamp(0, 1) * 255).round().byte().numpy())
+    brightness = shown[:, 6:].astype(int).sum(-1)
+    assert shown.shape == (4, 12, 3) and (np.diff(brightness) < 0).all()  # near is bright, far is dark
     assert seen.reshape(24)._repr_png_() is None  # rays are no picture
 
 
@@ -97,6 +100,6 @@ def test_the_notebook_of_the_documents_runs(ball_folder, tmp_path, monkeypatch):
     bar = next(one for cell in done.cells for one in cell.get("outputs", ()) if "<progress" in str(one))
     assert "100 % · step 40" in str(bar)
     sizes = [Image.open(io.BytesIO(base64.b64decode(one["image/png"]))).size for one in (view, own)]
-    assert sizes == [(tiny.SIZE, tiny.SIZE)] * 2
+    assert sizes == [(2 * tiny.SIZE, tiny.SIZE)] * 2
     assert 5 < float(re.search(r"([\d.]+) dB", score["text/plain"])[1]) < 60
     assert 'src="page.html"' in "".join(page["text/html"]) and (tmp_path / "page.html").stat().st_size > 10_000

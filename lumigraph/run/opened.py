@@ -16,6 +16,7 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..exchange import size_of
+from ..figures import png
 from ..gaussians import Gaussians
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
@@ -106,9 +107,7 @@ class Opened(ABC):
     def still(self, pixels: int) -> bytes:
         """Picture as PNG from the first camera. pixels: its longer side"""
         camera = self.cameras()["train"][0]
-        picture = self.render(camera.resized(min(1.0, pixels / int(camera.size.max()))))._repr_png_()
-        assert picture is not None
-        return picture
+        return png(self.render(camera.resized(min(1.0, pixels / int(camera.size.max())))).rgb)
 
     def _repr_html_(self) -> str:
         """A notebook's view: a small page to turn, or a still, and a table of facts."""
