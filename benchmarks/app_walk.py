@@ -6,7 +6,8 @@ cropped, shared, and the page downloaded and opened. Screenshots of each step at
 --kill ends the app by SIGKILL while photographs arrive, while photographs or frames are looked at, while features are
 found, while cameras are placed, while it trains, while the scene is open, while its views are compared and while a
 page is made. Each time the app is started again and its page is loaded again; files are dropped again while they
-arrive. The walk fails if anything is lost or there twice. The browser draws in software: it gets the app's priority, and its note of that is hidden.
+arrive. The walk fails if anything is lost or there twice. The browser draws in software: it gets the app's priority,
+and its note of that is hidden.
 """
 
 from __future__ import annotations
