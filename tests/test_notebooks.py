@@ -21,7 +21,7 @@ from lumigraph import exchange
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands import notebook_page
 
-pytestmark = budget("house")
+pytestmark = budget("house", 10)
 
 
 def test_a_picture_shows_itself_beside_its_depth():
