@@ -3,9 +3,11 @@ cropped, shared, and the page downloaded and opened. Screenshots of each step at
 
     python benchmarks/app_walk.py PHOTOS_OR_VIDEO --output FOLDER [--minutes 1] [--frames 30] [--kill]
 
---kill ends the app by SIGKILL while photographs arrive, while features are found, while cameras are placed, while it
-trains and while a page is made. Each time the app is started again and its page is loaded again. The walk fails if
-anything is lost. The browser draws in software: it gets the app's priority, and its note of that is hidden.
+--kill ends the app by SIGKILL while photographs arrive, while photographs or frames are looked at, while features are
+found, while cameras are placed, while it trains, while the scene is open, while its views are compared and while a
+page is made. Each time the app is started again and its page is loaded again; files are dropped again while they
+arrive. The walk fails if anything is lost or there twice. The browser draws in software: it gets the app's priority,
+and its note of that is hidden.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ from playwright.sync_api import Error as PlaywrightError
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from browser import ARGUMENTS, find_chromium
 from waiting import until
+
+from lumigraph.app.uploads import kind_of_file
 
 DESK, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 PICTURE_BYTES = 150_000  # of a screenshot
@@ -147,6 +151,12 @@ def give_way() -> None:
             Path(f"/proc/{process.pid}/autogroup").write_text(str(NICENESS))
 
 
+def of_folders(files: list[Path]) -> list[Path]:
+    """Photographs and videos among files and in folders."""
+    found = [one for file in files for one in (file.rglob("*") if file.is_dir() else [file])]
+    return [one for one in found if kind_of_file(one.name)]
+
+
 def drop(page: Any, files: list[Path]) -> None:
     """Drag files from the desktop onto the page, and drop them."""
     session = page.context.new_cdp_session(page)
@@ -167,6 +177,7 @@ def windows(walk: Walk, arguments: Sequence[str] = ()) -> Iterator[tuple[Any, An
         for page in (desk, phone):
             page.add_init_script(NO_CARD_NAME)
             page.set_default_timeout(1000 * walk.patience)
+            page.on("dialog", lambda dialog: dialog.accept())  # "leave the page?" while files arrive
             page.on("pageerror", lambda error: walk.faults.append(str(error)))
         give_way()
         yield desk, phone
@@ -184,11 +195,15 @@ def go(walk: Walk, files: list[Path], advanced: dict[str, float], kill: bool) ->
         desk.wait_for_url("**/#*")
         key = desk.url.rpartition("#")[2]
         if kill:
-            walk.kill(f"photographs arrive, {len(walk.detail(key)['photographs'])} of {len(files)} there")
-        until(lambda: len(walk.detail(key)["photographs"]) == len(files), walk.patience)
+            walk.kill(f"photographs arrive, {len(walk.detail(key)['photographs'])} there", desk)
+            drop(desk, files)
+        count = len(of_folders(files))
+        until(lambda: len(walk.detail(key)["photographs"]) >= count, walk.patience)
         desk.get_by_role("button", name="Make the scene").wait_for()
         walk.mark("all files are there")
         desk.wait_for_timeout(3000)
+        if (there := len(walk.detail(key)["photographs"])) != count:
+            raise SystemExit(f"{count} photographs were dropped, and {there} are there")
         walk.shots(desk, phone, "2-photographs")
         if advanced:
             desk.get_by_text("Advanced").click()
@@ -215,6 +230,9 @@ def stages(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> None:
         states = json.load(urlopen(f"{walk.url}/api/items/{key}/states", timeout=120)).values()
         return sum(bool(one.get("features")) for one in states)
 
+    if kill:
+        until(lambda: making()["state"] == "running", walk.patience)
+        walk.kill("photographs are looked at", desk)
     until(lambda: making()["stage"] == "train" or marks() > 3, walk.patience)
     walk.mark("details of four photographs")
     if kill:
@@ -255,6 +273,8 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> N
     """From a scene to a page of a part of it, downloaded and opened."""
     scene = desk.frame_locator("iframe")
     scene.get_by_role("tab", name="Crop").wait_for()
+    if kill:
+        kill_at_rest(walk, desk, key)
     desk.wait_for_timeout(20_000)
     walk.mark("the finished scene is open")
     run = walk.detail(key)["runs"][-1]["name"]
@@ -288,6 +308,23 @@ def crop_and_share(walk: Walk, desk: Any, phone: Any, key: str, kill: bool) -> N
         if name == "desk":
             walk.mark("the downloaded page is open")
         walk.shot(window, f"9-page-{name}")
+
+
+def kill_at_rest(walk: Walk, desk: Any, key: str) -> None:
+    """Kill the app while the finished scene is open, and while its views are compared with the photographs."""
+    before = [run["name"] for run in walk.detail(key)["runs"]]
+    walk.kill("the scene is open", desk)
+    desk.get_by_role("tab", name="Compare").click()
+    desk.get_by_role("button", name="Compare with photographs").click()
+    desk.get_by_text("Rendering", exact=True).wait_for()
+    walk.kill("its views are compared", desk)
+    desk.get_by_role("tab", name="Compare").click()
+    desk.get_by_label("Photograph against rendering").wait_for()
+    walk.mark("its views are compared")
+    if (after := [run["name"] for run in walk.detail(key)["runs"]]) != before:
+        raise SystemExit(f"The scene had {before} and has {after}")
+    desk.get_by_role("tab", name="Scene").click()
+    desk.frame_locator("iframe").get_by_role("tab", name="Crop").wait_for()
 
 
 def main() -> None:

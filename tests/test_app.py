@@ -12,6 +12,7 @@ import sys
 import threading
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from starlette.websockets import WebSocketDisconnect
 from waiting import until
 from websockets.sync.server import serve as serve_websockets
 
-from lumigraph.app import jobs, progress, projects, uploads
+from lumigraph.app import jobs, progress, projects, sharing, uploads
 from lumigraph.app.job_record import read_job
 from lumigraph.app.projects import find_item, new_project
 from lumigraph.app.scene_views import SceneView
@@ -400,6 +401,21 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     assert "sandbox" in file.headers["Content-Security-Policy"]
     assert running.get(f"/api/items/{project}/shares/..%2fproject.json").status_code in (400, 404)
     assert running.delete(f"/api/items/{project}/shares/{row['name']}").json()["shares"] == []
+
+
+def test_the_folder_is_shown_on_its_own_machine_alone(app, client, project, tmp_path, monkeypatch):
+    folder, asked = app.root / project / "shared", []
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "No file manager was found" in client.post(f"/api/items/{project}/reveal").json()["fault"]
+    monkeypatch.setattr(sharing.subprocess, "Popen", lambda words, **options: asked.append(words))
+    for platform, program in (("linux", "xdg-open"), ("darwin", "open"), ("win32", "explorer")):
+        monkeypatch.setattr(sharing, "sys", SimpleNamespace(platform=platform))
+        assert client.post(f"/api/items/{project}/reveal").status_code == 200
+        assert asked.pop() == [program, folder]
+    monkeypatch.setattr(app, "address", Address("0.0.0.0", 8080, TOKEN))
+    with pytest.raises(LumigraphError, match="browsers on its machine"):
+        app.reveal(find_item(app.root, project))
+    assert asked == []
 
 
 def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run):

@@ -205,6 +205,7 @@ class App:
             "title": record.title,
             "phone": f"{url}#{item.key}" if (url := self.phone_url) else "",
             "folder": str(item.path),
+            "local": self.is_local,
             "source": record.source,
             "photographs": [
                 {"name": name, "version": pictures.version_of(path), "video": pictures.is_film(path)}
@@ -282,6 +283,12 @@ class App:
         jobs.ask_to_share(item, job)
         self.runner.wake()
         return self.detail(item)
+
+    def reveal(self, item: Item) -> dict[str, Any]:
+        if not self.is_local:
+            raise LumigraphError("A folder is shown to browsers on its machine; download the file instead")
+        sharing.reveal(item.path / SHARED)
+        return {}
 
     def view(self, item: Item, run: str) -> dict[str, Any]:
         """Address of the scene view of a run, and whether it answers."""
@@ -439,6 +446,7 @@ def build(app: App) -> ASGIApp:
         Route(f"{item}/view", asked(RunBody, lambda one, body: app.view(one, body.run)), methods=["POST"]),
         Route(f"{item}/kinds", asked(RunBody, kinds), methods=["POST"]),
         Route(f"{item}/shares", asked(ShareBody, app.share), methods=["POST"]),
+        Route(f"{item}/reveal", asked(None, app.reveal), methods=["POST"]),
         Route(f"{item}/shares/{{name}}", shared),
         Route(f"{item}/shares/{{name}}", forget, methods=["DELETE"]),
         Route("/scene/{key}/{run}/{rest:path}", scene),

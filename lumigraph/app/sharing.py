@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ from .projects import SHARED, Item, is_splats
 # Sizes: bytes of a Gaussian or of a second of film. Page and .spz: as measured on a cloud of 53,453 of degree 3.
 PAGE_BYTES, PAGE_BYTES_PER_GAUSSIAN = 1_400_000, 36
 SPZ_BYTES_PER_GAUSSIAN = 18
+FILE_MANAGERS = {"darwin": "open", "win32": "explorer"}  # by system; elsewhere xdg-open
 VIEWS_PAGE_BYTES = 72 * 30_000
 FILM_SECONDS, FILM_BYTES_PER_SECOND = 4, 700_000
 MESH_BYTES, POINTS_BYTES = 6_000_000, 4_000_000
@@ -120,3 +123,12 @@ def command_of(item: Item, job: ShareJob) -> list[str]:
     place.parent.mkdir(exist_ok=True)
     output = ["--output", str(place)] if job.kind == "film" else [str(place)]
     return [*KINDS[job.kind].words, str(run), *output, *job.options]
+
+
+def reveal(folder: Path) -> None:
+    """Open a folder in the system's file manager. Raises LumigraphError where there is none."""
+    program, pipe = FILE_MANAGERS.get(sys.platform, "xdg-open"), subprocess.DEVNULL
+    try:
+        subprocess.Popen([program, folder], stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True)
+    except OSError as fault:
+        raise LumigraphError(f"No file manager was found ({program}); the files are in {folder}") from fault

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
-from PIL import Image
 from torch import Tensor
 
+from ..figures import colour_depth, depth_range, png
 from .loops import fill_midpoints
 
 
@@ -154,12 +153,11 @@ class Rendering:
         return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape), extra)
 
     def _repr_png_(self) -> bytes | None:
-        """A notebook's view of a picture; None for rays."""
+        """A notebook's view of a picture: its colours, and its depth beside them. None for rays."""
         if self.depth.ndim != 2:
             return None
-        held, pixels = io.BytesIO(), (self.rgb.detach().cpu().clamp(0, 1) * 255).round().byte()
-        Image.fromarray(pixels.numpy()).save(held, "PNG")
-        return held.getvalue()
+        depth = colour_depth(self.depth, self.opacity, depth_range(self.depth, self.opacity))
+        return png(torch.cat([self.rgb, depth], 1))
 
     def cpu(self) -> Rendering:
         extra = {k: v.cpu() for k, v in self.extra.items()}

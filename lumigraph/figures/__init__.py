@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,6 +32,11 @@ def to_bytes(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "height widt
 
 def to_image(rgb: Float[Tensor, "height width 3"]) -> Image.Image:
     return Image.fromarray(to_bytes(rgb).numpy())
+
+
+def png(rgb: Float[Tensor, "height width 3"]) -> bytes:
+    to_image(rgb).save(held := io.BytesIO(), "PNG")
+    return held.getvalue()
 
 
 def save_picture(

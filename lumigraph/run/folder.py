@@ -13,9 +13,7 @@ Nothing in it runs code when opened: a method's file runs only as the user has l
 
 from __future__ import annotations
 
-import base64
 import contextlib
-import html
 import json
 import os
 import platform
@@ -240,18 +238,11 @@ class Run(Trained):
         said = read_cameras(self._cameras)
         return dict(zip(said.names, said.digests, strict=False))
 
-    def _repr_html_(self) -> str:
-        """A notebook's view: the latest preview, and a table of what was trained on what."""
+    def facts(self) -> dict[str, object]:
         state, scores = self.state if self.has_state else State(), self.evaluation() or {}
-        rows = {"run": self.folder, "method": self.method_name, self.kind: self.settings.scene.source}
-        rows |= {"trained": f"{state.step:,} steps in {state.seconds:.1f} s"}
-        rows |= {"PSNR": f"{scores['psnr']:.2f} dB, held out"} if scores.get("psnr") is not None else {}
-        cells = "".join(f"<tr><th>{name}</th><td>{html.escape(str(value))}</td></tr>" for name, value in rows.items())
-        picture = ""
-        if previews := self.previews():
-            data = base64.b64encode(files.read_bytes(previews[max(previews)])).decode()
-            picture = f'<img alt="preview" src="data:image/png;base64,{data}">'
-        return f"{picture}<table>{cells}</table>"
+        rows: dict[str, object] = {"run": self.folder, "method": self.method_name}
+        rows |= {self.kind: self.settings.scene.source, "trained": f"{state.step:,} steps in {state.seconds:.1f} s"}
+        return rows | ({"PSNR": f"{scores['psnr']:.2f} dB, held out"} if scores.get("psnr") is not None else {})
 
     # Its state
 

@@ -16,6 +16,7 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..exchange import size_of
+from ..figures import png
 from ..gaussians import Gaussians
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
@@ -59,13 +60,17 @@ class Opened(ABC):
         camera:   in `frame`, as those of `cameras()`
         controls: values of the method's controls, such as time=0.3
         """
+        with at_work(), torch.no_grad():
+            return self.ready(device).given(**controls).render(camera)
+
+    def ready(self, device: str = "auto") -> Method:
+        """Method of the present version, loaded once."""
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         version = (self.version, device)
         if self._ready is None or self._ready[0] != version:
             self._ready = version, self.method(device)
-        with at_work(), torch.no_grad():
-            return self._ready[1].given(**controls).render(camera)
+        return self._ready[1]
 
     def film(self, file: Path | str, /, **options: Any) -> Path:
         """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
@@ -94,6 +99,19 @@ class Opened(ABC):
     def clean(self, output: Path | str, /, **options: Any) -> Opened:
         """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
         return calls().derive("clean", self, output, **options)
+
+    def facts(self) -> dict[str, object]:
+        """Rows of the table below its picture in a notebook."""
+        return {"file": self.path}
+
+    def still(self, pixels: int) -> bytes:
+        """Picture as PNG from the first camera. pixels: its longer side"""
+        camera = self.cameras()["train"][0]
+        return png(self.render(camera.resized(min(1.0, pixels / int(camera.size.max())))).rgb)
+
+    def _repr_html_(self) -> str:
+        """A notebook's view: a small page to turn, or a still, and a table of facts."""
+        return importlib.import_module("..commands.notebook_page", __package__).shown(self)
 
     @property
     def version(self) -> str:

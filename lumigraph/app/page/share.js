@@ -27,6 +27,7 @@ export function Share({ detail, run, act, say }) {
         </li>`;
       })}
     </ul>
-    ${detail.shares.some((one) => one.bytes) && html`<p class="faint">In ${detail.folder}/shared</p>`}
+    ${detail.shares.some((one) => one.bytes) && html`<p class="faint">In ${detail.folder}/shared</p>
+      ${detail.local && html`<button onClick=${() => act(() => api("POST", `${of(detail.key)}/reveal`))}>Show in folder</button>`}`}
   </section>`;
 }
