@@ -33,7 +33,7 @@ from .controls import Controls, MethodControls
 from .crop_panel import CropPanel
 from .export_panel import ExportPanel
 from .modes import along_axis, extra_modes, picture
-from .painter import MOVING_SECONDS, Pace, Painter
+from .painter import MOVING_SECONDS, MovingPace, Pace, Painter
 from .path_panel import PathPanel
 from .ruler_panel import RulerPanel
 from .shared import Shared
@@ -60,6 +60,7 @@ class Visitor:
     def __init__(self, shared: Shared, client: Any):
         self._shared, self._client = shared, client
         self._pace, self._bands, self._said = Pace(), Pace(), ""  # whole pictures, all waiting included; bands of them
+        self._moving = MovingPace()
         self._splats: Any = None
         self._sent: tuple[Any, ...] = ()  # which splats the client has
         self._eye = torch.zeros(3)  # towards which their colours are
@@ -214,12 +215,19 @@ class Visitor:
             request = replace(request, depth=False)  # before the rendering, however deep
         elif self._splats is not None:
             self._splats.visible = False
-        size = request.full if seconds == float("inf") else self._pace.size(request.full, seconds)
+        moving, size = seconds == MOVING_SECONDS, request.full
+        divisor = self._moving.divisor(size) if moving else 1
+        if moving:
+            size = max(1, round(size[0] / divisor)), max(1, round(size[1] / divisor))
+        elif seconds != float("inf"):
+            size = self._pace.size(size, seconds)
         begin = time.perf_counter()
         rendering, camera = self._render(request, size, wanted)
         took = time.perf_counter() - begin
         self._pace.note(size[0] * size[1], took)
-        self._show(rendering, camera, request, QUALITY_MOVING if seconds == MOVING_SECONDS else QUALITY)
+        self._show(rendering, camera, request, QUALITY_MOVING if moving else QUALITY)
+        if moving:
+            self._moving.note(divisor, time.perf_counter() - begin)
         if not by_browser:
             self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
         return size == request.full
@@ -240,10 +248,11 @@ class Visitor:
         return bool(np.abs(np.array(pose) - self._shared.subject.opening.pose).max() < PLACE_TOLERANCE)
 
     def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
-        """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon."""
+        """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon, of a cloud
+        one, because each would project all Gaussians."""
         camera, (width, height) = request.camera(size), size
         band = max(MIN_BAND_ROWS, int(self._bands.pixels(MOVING_SECONDS)) // width)
-        band = height if band >= 0.7 * height else band
+        band = height if self._shared.is_cloud or band >= 0.7 * height else band
         parts = []
         for first in range(0, height, band):
             if not wanted():
