@@ -1,9 +1,9 @@
 """Frames of the viewer while its camera turns: their rate, their size, their likeness to exact pictures.
 
-    python benchmarks/frames.py RUN_OR_FILE [--size 800x800] [--degrees 1.5] [--seconds 6] [--output frames]
+    python benchmarks/frames.py RUN_OR_FILE [--size 800x800] [--turn 45] [--seconds 6] [--output frames]
 
 Opens the viewer and connects a client without a browser, which has a cloud drawn exactly, moves its camera around the
-scene 60 times a second, by so many degrees in 1/30 s, and then rests. Printed:
+scene 60 times a second, by so many degrees a second, and then rests. Printed:
 frames per second that reached the client, milliseconds of their parts, seconds of the first sharp picture after the
 camera came to rest, and PSNR of moving pictures, enlarged as the browser does, against exact ones. Written: a strip of
 consecutive moving pictures above exact ones, and the figures.
@@ -54,7 +54,7 @@ STRIP, STRIP_HEIGHT = 6, 240  # pictures, pixels
 class Options:
     source: Annotated[Positional[Path], tyro.conf.arg(metavar="RUN_OR_FILE")]
     size: str = "800x800"
-    degrees: float = 1.5
+    turn: float = 45.0
     seconds: float = 6.0
     compared: int = 8
     output: Path = Path("frames")
@@ -62,10 +62,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture that was drawn: when it was done, for which view, its size, seconds of its parts."""
+    """A picture that was drawn: when it was done, for which view, the size it was rendered at, seconds of its parts."""
 
     done: float
     request: ViewRequest
+    size: tuple[int, int]
     pixels: np.ndarray
     parts: dict[str, float]
 
@@ -84,7 +85,7 @@ def main(options: Options) -> None:
             client.turn(handle, value)
         client.turn(visitor.controls._sharpest, max(width, height))
         until(lambda: visitor.request().exact and not visitor.request().depth, PATIENCE)
-        turning = 30 * math.radians(options.degrees)  # a second
+        turning = math.radians(options.turn)
 
         def turn(seconds: float, angle: float) -> tuple[float, float, float]:
             begin = time.perf_counter()
@@ -101,12 +102,12 @@ def main(options: Options) -> None:
         until(visitor.painter.settled.is_set, PATIENCE)
         client.close()
     moving = [frame for frame in frames if begin <= frame.done <= end]
-    sharp = next(frame for frame in frames if frame.done > end and frame.pixels.shape[:2] == (height, width))
+    sharp = next(frame for frame in frames if frame.done > end and frame.size == (width, height))
     found = {
         "source": options.source.name,
         "window": options.size,
         "frames_per_second": round(sum(begin <= when <= end for when in arrived) / (end - begin), 1),
-        "moving_size": "x".join(map(str, np.median([f.pixels.shape[1::-1] for f in moving], 0).astype(int))),
+        "moving_size": "x".join(map(str, np.median([frame.size for frame in moving], 0).astype(int))),
         "first_sharp_seconds": round(sharp.done - end, 2),
         "sharp_ms": {name: round(1000 * seconds, 1) for name, seconds in sharp.parts.items()},
         "moving_ms": {
@@ -130,7 +131,7 @@ def drawn_frames() -> Iterator[list[Frame]]:
     frames: list[Frame] = []
     stream, render = Visitor._stream, Visitor._render
     parts: dict[str, float] = {}
-    views: list[ViewRequest] = []
+    views: list[tuple[ViewRequest, tuple[int, int]]] = []
 
     def timed(name: str, call: Callable[[], Any], inputs: tuple = ()) -> Any:
         begin = time.perf_counter()
@@ -138,15 +139,15 @@ def drawn_frames() -> Iterator[list[Frame]]:
         parts[name] = parts.get(name, 0.0) + time.perf_counter() - begin
         return result
 
-    def rendered(self: Any, request: ViewRequest, *rest: Any) -> Any:
+    def rendered(self: Any, request: ViewRequest, size: tuple[int, int], *rest: Any) -> Any:
         parts.clear()
-        views.append(request)
-        return timed("rendering", lambda: render(self, request, *rest))
+        views.append((request, size))
+        return timed("rendering", lambda: render(self, request, size, *rest))
 
     def streamed(self: Any, pixels: np.ndarray, *rest: Any) -> None:
         timed("encoding", lambda: stream(self, pixels, *rest))
         if views:
-            frames.append(Frame(time.perf_counter(), views[-1], pixels, dict(parts)))
+            frames.append(Frame(time.perf_counter(), *views[-1], pixels, dict(parts)))
 
     Visitor._stream, Visitor._render = streamed, rendered  # type: ignore[method-assign]
     try:

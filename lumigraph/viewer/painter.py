@@ -62,7 +62,7 @@ FRAME_SECONDS = 1 / 30  # for a picture of full size while the camera moves
 MIN_FRAME_SECONDS = 1 / 60  # seconds between pictures
 NO_DEADLINE = float("inf")
 DIVISORS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # of width and height while the camera moves
-KEPT_PICTURES = 90  # moving pictures after which an unused size's time is forgotten, and the size tried again
+KEPT_PICTURES = 60  # moving pictures after which an unused size's time is forgotten, and the size tried again
 FIXED_COST_FACTOR = 1.5  # on the least time of any size, which a picture may take if none is quick enough
 
 
@@ -95,9 +95,15 @@ class MovingPace:
         return next(k for k in possible if expected[k] <= (FRAME_SECONDS if k == 1 else most) or k == possible[-1])
 
     def _expected(self, divisor: int) -> float:
-        """Seconds of a picture: measured, or in proportion to the side of the nearest size that was."""
-        nearest = min(self._seconds, key=lambda k: abs(math.log(k / divisor)))
-        return self._seconds[nearest] * nearest / divisor
+        """Seconds of a picture: as measured, on a line through those of other numbers of pixels, or in proportion to
+        the side of the only size that was measured."""
+        if divisor in self._seconds:
+            return self._seconds[divisor]
+        sizes, seconds = 1 / np.array([*self._seconds]) ** 2.0, np.array([*self._seconds.values()])
+        if len(sizes) == 1:
+            return float(seconds[0] * math.sqrt(1 / sizes[0]) / divisor)
+        slope = max(0.0, float(np.cov(sizes, seconds)[0, 1] / sizes.var(ddof=1)))
+        return max(0.0, float(seconds.mean()) + slope * (1 / divisor**2 - float(sizes.mean())))
 
 
 Draw = Callable[[float, Callable[[], bool]], bool]
