@@ -15,7 +15,7 @@ from lumigraph.components.fields.layers import MLP, truncated_exp
 from lumigraph.components.sampling.occupancy import OccupancyGrid, visual_hull
 from lumigraph.components.training.photometric import Exposure
 from lumigraph.components.training.pose_refinement import PoseRefinement
-from lumigraph.components.training.row_optimizers import LazyAdam
+from lumigraph.components.training.row_optimizers import LazyAdam, adam_rate
 from lumigraph.datasets.images import ImageStore
 from lumigraph.run.checkpoint import take_shapes
 
@@ -98,6 +98,24 @@ def test_lazy_adam_leaves_alone_what_has_no_gradient(generator):
     for now, before in zip((p, optimizer.state[p]["mean"], optimizer.state[p]["square"]), held, strict=True):
         assert torch.equal(now[::3], before[::3])
         assert (now[1::3] != before[1::3]).all()
+
+
+@pytest.mark.parametrize("by_row", [False, True])
+def test_lazy_adam_moves_the_same_on_a_gpu(by_row, generator):
+    gpu = pytest.importorskip("lumigraph.components.training.row_optimizers_gpu", exc_type=ImportError)
+    start, device = torch.randn(900, 4, generator=generator), "cuda" if torch.cuda.is_available() else "cpu"
+    p, rates = torch.nn.Parameter(start.clone()), torch.rand(900, generator=generator).round(decimals=1)
+    optimizer = LazyAdam([p], weight_decay=0.1)
+    (group,) = optimizer.param_groups
+    group["rates"] = rates if by_row else None
+    theirs = [x.to(device) for x in (start.clone(), *torch.zeros(2, 900, 4))]
+    for t in range(1, 6):
+        p.grad = torch.randn(900, 4, generator=generator) * (torch.rand(900, 4, generator=generator) < 0.5)
+        descend(optimizer, p, p.grad[None])
+        numbers = adam_rate(group, t), *group["betas"], group["eps"], 1 - group["lr"] * group["weight_decay"]
+        gpu.lazy_adam(theirs[0], p.grad.to(device), *theirs[1:], rates.to(device) if by_row else None, *numbers)
+    for a, b in zip((p.detach(), *(optimizer.state[p][name] for name in ("mean", "square"))), theirs, strict=True):
+        torch.testing.assert_close(a, b.cpu(), rtol=1e-4, atol=1e-6)
 
 
 def test_lazy_adam_goes_on_from_a_saved_state(generator):

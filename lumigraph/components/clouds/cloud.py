@@ -169,41 +169,28 @@ class CloudAdam(RowOptimizer):
         state["step"] += 1
         (b1, b2), t = group["betas"], float(state["step"])
         width = math.prod(p.shape[1:])
-        rates = adam_rate(group, t) * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
+        rate, columns = adam_rate(group, t), _factors(p.device, *group["columns"] or [1.0] * width)
         given = p, grad.contiguous(), state["mean"], state["square"]
-        values, grad, mean, square = (x.detach().view(-1, width) for x in given)
+        tensors = *(x.detach().view(-1, width) for x in given), state["last"]
         if p.is_cuda:
-            _rows(values, grad, mean, square, state["last"], rates, t, b1, b2, group["eps"])
+            from ..training.row_optimizers_gpu import cloud_adam
+
+            cloud_adam(*tensors, columns, t, rate, (b1, b2), group["eps"])
         else:
-            tensors = values, grad, mean, square, state["last"], rates
-            _rows_cpu(*(x.numpy() for x in tensors), np.float32(t), _powers(b1), _powers(b2), np.float32(group["eps"]))
+            numbers = np.float32(t), _powers(b1), _powers(b2), np.float32(group["eps"])
+            _rows_cpu(*(x.numpy() for x in (*tensors, rate * columns)), *numbers)
+
+
+@lru_cache
+def _factors(device: torch.device, *columns: float) -> Float[Tensor, " column"]:
+    """Factors of the columns' rates, kept on their device."""
+    return torch.tensor(columns, device=device)
 
 
 @lru_cache
 def _powers(base: float, count: int = 1 << 14) -> np.ndarray:
     """A table of base^n for n from 0, quicker to read than a power; after its last entry a moment is nothing."""
     return (base ** np.arange(count)).astype(np.float32)
-
-
-def _rows(
-    p: Float[Tensor, "row column"],
-    grad: Float[Tensor, "row column"],
-    mean: Float[Tensor, "row column"],
-    square: Float[Tensor, "row column"],
-    last: Float[Tensor, " row"],
-    rates: Float[Tensor, " column"],
-    t: float,
-    b1: float,
-    b2: float,
-    eps: float,
-) -> None:
-    touched = (grad != 0).any(-1, keepdim=True)
-    kept1, kept2 = b1 ** (t - last)[:, None], b2 ** (t - last)[:, None]
-    mean.copy_(torch.where(touched, kept1 * mean + (1 - b1) * grad, mean))
-    square.copy_(torch.where(touched, kept2 * square + (1 - b2) * grad * grad, square))
-    far = rates * (1 - kept1) / (1 - b1)
-    p.copy_(torch.where(touched, p - far * mean / (square.sqrt() + eps), p))
-    last.copy_(torch.where(touched[:, 0], t, last))
 
 
 @njit(parallel=True, fastmath=True, cache=True)

@@ -106,8 +106,9 @@ class LazyAdam(RowOptimizer):
         if rates is not None and len(rates) != len(p):
             raise ValueError(f"{len(rates)} rates are given for {len(p)} rows")
         if p.is_cuda:
-            rate = rate if rates is None else rate * rates.view(-1, *[1] * (p.dim() - 1))
-            _touched(*tensors, rate, b1, b2, group["eps"], keep)
+            from .row_optimizers_gpu import lazy_adam
+
+            lazy_adam(*tensors, rates, rate, b1, b2, group["eps"], keep)
             return
         numbers = [np.float32(x) for x in (rate, b1, b2, group["eps"], keep)]
         arrays = [x.detach().view(-1).numpy() for x in tensors]
@@ -115,13 +116,6 @@ class LazyAdam(RowOptimizer):
             _touched_cpu(*arrays, *numbers)
         else:
             _touched_rows_cpu(*arrays, rates.numpy(), *numbers)
-
-
-def _touched(p, grad, mean, square, rate, b1, b2, eps, keep):
-    touched = grad != 0
-    mean.copy_(torch.where(touched, b1 * mean + (1 - b1) * grad, mean))
-    square.copy_(torch.where(touched, b2 * square + (1 - b2) * grad * grad, square))
-    p.copy_(torch.where(touched, keep * p - rate * mean / (square.sqrt() + eps), p))
 
 
 @njit(inline="always")
