@@ -287,7 +287,7 @@ def joined(parts: list[Features]) -> Features:
     """Features of several sets of points one after the other, laid out as `rows_of` has them."""
     if isinstance(parts[0], tuple):
         return tuple(torch.cat([x.t() for x in each], 1).t() for each in zip(*parts, strict=True))
-    return torch.cat([x.t() for x in parts], 1).t()
+    return torch.cat([x.t() for x in parts if isinstance(x, Tensor)], 1).t()
 
 
 def rows_of(features: Features, rows: Int[Tensor, " row"]) -> Features:
