@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from . import kernels
@@ -48,10 +48,10 @@ FIRST_STRETCH = 8  # samples per ray in the first query; each further query has 
 
 
 @torch.no_grad()
-def visible(
+def visible_weights(
     samples: Samples, thickness_of: Callable[[Int[Tensor, " asked"]], Float[Tensor, " asked"]], stop: float
-) -> Bool[Tensor, " sample"]:
-    """Mask of samples that light reaches, with few queries: front to back, a stretch of each ray at a time.
+) -> Float[Tensor, " sample"]:
+    """Weights of samples, 0 where no light comes, with few queries: front to back, a stretch of each ray at a time.
 
     thickness_of: optical thickness of the samples of these numbers
     stop:         transmittance below which a ray is spent, as in `composite`
@@ -68,7 +68,7 @@ def visible(
         tau[asked] = thickness
         light = light * (1 - kernels.composite(thickness, thickness[:, None], starts)[1])
         begin, stretch = begin + stretch, 2 * stretch
-    return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2] > 0
+    return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2]
 
 
 def packed(counts: Int[Tensor, " ray"]) -> Int[Tensor, " ray_plus_one"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -101,6 +101,13 @@ def test_a_picture_is_never_smaller_than_a_pixel(generator):
 def test_pixels_row_by_row():
     camera = Camera(torch.eye(3, 4)[None], Pinhole(torch.ones(1, 2), torch.ones(1, 2)), torch.tensor([[3, 2]]))
     assert camera.pixels().tolist() == [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cosines_are_those_of_the_rays(kind, generator):
+    camera = replace(random_camera(kind, generator)[0], size=torch.tensor([[13, 7]]))
+    along = camera.rays(camera.pixels()).directions @ camera.forward[0]
+    assert torch.allclose(camera.cosines(), along.view(7, 13), atol=1e-6)
 
 
 def test_pixels_of_several_cameras_at_once_are_refused(generator):

@@ -40,7 +40,7 @@ from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
 from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, rows, upwards
 from lumigraph.viewer.modes import PALETTE, along_axis, extra_modes, normals, picture
-from lumigraph.viewer.painter import Pace, Painter
+from lumigraph.viewer.painter import FRAME_SECONDS, MOVING_SECONDS, MovingPace, Pace, Painter
 from lumigraph.viewer.shared import render_inside
 from lumigraph.viewer.turns import RENDER_SHARE, NotWantedError, Turns
 from lumigraph.viewer.visitor import UNIT_SCALE, splats
@@ -423,6 +423,40 @@ def test_pace_learns_what_a_picture_costs():
     assert width * height == pytest.approx(80_000, rel=0.02)
     assert width / height == pytest.approx(16 / 9, rel=0.02)
     assert pace.size((160, 90), 0.1) == (160, 90)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "a_pixel", "settled"),
+    [
+        (0.005, 1e-8, 1),  # all of it within FRAME_SECONDS
+        (0.03, 1e-7, 2),  # half of it within MOVING_SECONDS
+        (0.0, 1e-6, 3),  # rays: no fixed cost
+        (0.0, 6e-6, 8),
+        (0.2, 1e-7, 2),  # many Gaussians: a smaller picture would hardly be quicker
+        (0.0, 1e-2, 8),  # nothing is quick enough
+    ],
+)
+def test_the_size_of_moving_pictures_settles(fixed, a_pixel, settled):
+    """It is never stuck at the first and smallest one, and changes at most now and then to try the next."""
+    pace, full = MovingPace(), (800, 800)
+    sizes = [pace.divisor(full)]
+    for _ in range(300):
+        pace.note(sizes[-1], fixed + a_pixel * 800 * 800 / sizes[-1] ** 2)
+        sizes.append(pace.divisor(full))
+    assert sizes[0] == 8
+    assert sizes[20:].count(settled) > 270
+    assert max(fixed + a_pixel * 640_000, FRAME_SECONDS) == FRAME_SECONDS or settled > 1
+    if fixed == 0 and settled < 8:
+        assert a_pixel * 640_000 / settled**2 <= MOVING_SECONDS
+
+
+def test_moving_pictures_recover_from_a_slow_moment():
+    pace, full = MovingPace(), (800, 600)
+    for i in range(400):
+        divisor = pace.divisor(full)
+        pace.note(divisor, 1.0 if 100 <= i < 110 else 0.02)
+        assert i < 20 or divisor == 1 or 100 < i < 200
+    assert divisor == 1
 
 
 @pytest.fixture

@@ -14,10 +14,15 @@ from websockets.sync.client import connect
 
 
 class Client:
-    """Connected from the moment it is made. size: of its window."""
+    """Connected from the moment it is made.
 
-    def __init__(self, url: str, position=(3.0, 0.0, 0.5), size=(120, 90)):
-        self.size = size
+    size:   of its window
+    target: looked at
+    angle:  of view, vertical, radians
+    """
+
+    def __init__(self, url: str, position=(3.0, 0.0, 0.5), size=(120, 90), target=(0.0, 0.0, 0.0), angle=0.8):
+        self.size, self.target, self.angle = size, target, angle
         self.socket = connect(
             url.replace("http", "ws"),
             subprotocols=[f"viser-v{viser.__version__}"],
@@ -28,8 +33,9 @@ class Client:
         self.look_from(position)
 
     def look_from(self, position) -> None:
-        """Look at the origin from there."""
-        forward = -np.array(position) / np.linalg.norm(position)
+        """Look at the target from there."""
+        forward = np.array(self.target) - position
+        forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward], 1)
@@ -37,12 +43,12 @@ class Client:
             "type": "ViewerCameraMessage",
             "wxyz": viser.transforms.SO3.from_matrix(rotation).wxyz.tolist(),
             "position": [float(x) for x in position],
-            "fov": 0.8,
+            "fov": self.angle,
             "near": 0.01,
             "far": 1000.0,
             "image_height": self.size[1],
             "image_width": self.size[0],
-            "look_at": [0.0, 0.0, 0.0],
+            "look_at": [float(x) for x in self.target],
             "up_direction": [0.0, 0.0, 1.0],
         }
         self.socket.send(msgspec.msgpack.encode(message))

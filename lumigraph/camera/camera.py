@@ -85,6 +85,16 @@ class Camera:
         time, image_index = (gather(x, index, len(pixels)) for x in (self.time, self.image_index))
         return Rays(origins.expand(len(pixels), 3), rotate(pose, inward), radius, time, image_index)
 
+    def cosines(self) -> Float[Tensor, "height width"]:
+        """Cosine of the angle between each pixel's ray and the optical axis, of a batch of one."""
+        width, height = self.size[0].tolist()
+        lens = self.lens
+        if not isinstance(lens, Pinhole):
+            return lens.unproject(self.pixels())[:, 2].view(height, width)
+        axes = zip((width, height), lens.centre[0], lens.focal[0], strict=True)
+        x, y = ((torch.arange(n).to(c) + 0.5 - c) / f for n, c, f in axes)
+        return torch.rsqrt((1 + x * x) + (y * y)[:, None])
+
     def project(
         self, points: Float[Tensor, "point 3"], index: Int[Tensor, " point"] | None = None
     ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:

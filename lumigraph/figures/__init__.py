@@ -27,7 +27,7 @@ Range = tuple[float, float]
 
 def to_bytes(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "height width 3"]:
     """Colours in [0, 1] as bytes; others are clipped."""
-    return (rgb.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
+    return rgb.detach().cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8)
 
 
 def to_image(rgb: Float[Tensor, "height width 3"]) -> Image.Image:

@@ -55,8 +55,7 @@ class Splatted:
 
     def along_rays(self, camera: Camera) -> Float[Tensor, "height width"]:
         """Mean distance along each pixel's ray of what is opaque, infinity where nothing is."""
-        rays = camera.rays(camera.pixels()).directions
-        along = (rays @ camera.forward[0]).view(self.depth.shape).clamp_min(1e-3).to(self.depth.device)
+        along = camera.cosines().clamp_min(1e-3).to(self.depth.device)
         return torch.where(self.opacity > 1e-3, self.depth / self.opacity.clamp_min(1e-3) / along, torch.inf)
 
 
@@ -89,7 +88,9 @@ def render(
 ) -> Rendering:
     """Render a cloud for one camera over a background colour."""
     seen = splat(cloud, view_of(camera, near).to(cloud.means.device), bands, blur=blur)
-    rgb = over(seen.rgb, seen.opacity, torch.tensor(background, device=seen.rgb.device))
+    rgb = seen.rgb
+    if any(background):
+        rgb = over(rgb, seen.opacity, torch.tensor(background, device=rgb.device))
     return Rendering(rgb, seen.along_rays(camera), seen.opacity)
 
 

@@ -13,7 +13,7 @@ from .. import kernels
 from ..camera import Camera
 from ..camera.lens import OpenCV, Pinhole
 from ..camera.rays import Rendering
-from ..components.image_based.depth import Geometry, cosines, shape
+from ..components.image_based.depth import Geometry, shape
 from ..components.image_based.kept_views import focal_length
 from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import surface_seen
@@ -98,7 +98,7 @@ class Lumigraph(ImageBasedMethod):
             return self._sharp(camera, focus)
         first = self._sharp(camera, focus)
         height, width = shape(camera)
-        focus = focus or float((first.depth * cosines(camera))[height // 2, width // 2].clamp_max(1e3))
+        focus = focus or float((first.depth * camera.cosines())[height // 2, width // 2].clamp_max(1e3))
         aperture = aperture or (0.0 if self.config.geometry == "plane" else DEFAULT_APERTURE / float(self.plane))
         if not aperture:
             return first
@@ -116,7 +116,7 @@ class Lumigraph(ImageBasedMethod):
         chosen = tables.nearest(camera, c.candidate_views)
         solid = torch.ones(height, width, dtype=torch.bool, device=self.device)
         if c.geometry == "plane":
-            depth = (focus or 1 / float(self.plane)) / cosines(camera).clamp_min(1e-2)
+            depth = (focus or 1 / float(self.plane)) / camera.cosines().clamp_min(1e-2)
         else:
             depth, solid = surface_seen(self.views, chosen[: c.surface_views], camera, not self.frame.has_alpha)
         rays = camera.rays(camera.pixels())

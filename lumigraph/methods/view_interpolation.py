@@ -13,7 +13,7 @@ from torch.nn.functional import grid_sample, interpolate, normalize
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..components.image_based.depth import cosines, shape
+from ..components.image_based.depth import shape
 from ..components.image_based.kept_views import NOTHING, continued, focal_length
 from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import consensus
@@ -154,7 +154,7 @@ class ViewInterpolation(ImageBasedMethod):
         places, valid = middle.project(middle.position + turned)
         rgb = sampled(found, places).clamp(0, 1)
         rgb = torch.where(valid[:, None], rgb, self.background).view(*shape(camera), 3)
-        depth = tables.middle / cosines(camera).clamp_min(1e-2)
+        depth = tables.middle / camera.cosines().clamp_min(1e-2)
         return Rendering(rgb, depth, torch.ones_like(depth))
 
     def _pair(self, camera: Camera) -> tuple[int, int, float]:

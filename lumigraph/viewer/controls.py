@@ -113,8 +113,8 @@ class Controls:
         # What all clients share is hidden from one of them by a node of its own in the same place.
         for name, shown in ((CAMERAS, self._cameras.value), (POINTS, self._points.value)):
             if shown != self._shadows[name]:
+                self._shadows[name] = shown  # first: another thread may follow
                 self._client.scene.add_frame(name, show_axes=False, visible=shown)
-                self._shadows[name] = shown
         self._changed()
 
 

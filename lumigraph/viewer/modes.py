@@ -60,8 +60,7 @@ def normals(rendering: Rendering, camera: Camera) -> Float[Tensor, "height width
 
 def along_axis(rendering: Rendering, camera: Camera) -> Float[Tensor, "height width"]:
     """Depth along the optical axis, as graphics cards compare it, rather than along each ray."""
-    directions = camera.rays(camera.pixels()).directions
-    return rendering.depth * (directions @ camera.forward[0]).view(rendering.depth.shape)
+    return rendering.depth * camera.cosines()
 
 
 # Twenty distinct colours; labels beyond begin again at the first.

@@ -1,5 +1,5 @@
 """Painter: a thread that draws the last request of one client, coarse while its camera moves, finer once it rests.
-Pace: the size of a picture that can be rendered in a given time."""
+Pace: the size of a picture that can be rendered in a given time. MovingPace: the same while the camera moves."""
 
 from __future__ import annotations
 
@@ -58,8 +58,53 @@ class Pace:
 
 MOVING_SECONDS, RESTING_SECONDS = 0.1, 0.5  # for a picture while the camera moves, and for the first one at rest
 REST_SECONDS = 0.2  # seconds after the last request from which a client counts as resting
-MIN_FRAME_SECONDS = 1 / 30  # seconds between pictures
+FRAME_SECONDS = 1 / 30  # for a picture of full size while the camera moves
+MIN_FRAME_SECONDS = 1 / 60  # seconds between pictures
 NO_DEADLINE = float("inf")
+DIVISORS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # of width and height while the camera moves
+KEPT_PICTURES = 60  # moving pictures after which an unused size's time is forgotten, and the size tried again
+FIXED_COST_FACTOR = 1.5  # on the least time of any size, which a picture may take if none is quick enough
+
+
+class MovingPace:
+    """Size of pictures while the camera moves, by recent times of a few sizes: full size if that takes FRAME_SECONDS,
+    else half or less within MOVING_SECONDS. Few sizes, so that the resolution seldom changes."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[int, float] = {}  # by divisor
+        self._used: dict[int, int] = {}  # number of the last picture
+        self._count = 0
+
+    def note(self, divisor: int, seconds: float) -> None:
+        """Take note of a picture's time. The first is ignored: something may have been compiled for it."""
+        self._count += 1
+        if self._count > 1:
+            before = self._seconds.get(divisor, seconds)
+            self._seconds[divisor] = SMOOTHING * before + (1 - SMOOTHING) * seconds
+            self._used[divisor] = self._count
+        for old in [k for k in self._seconds if self._count - self._used[k] > KEPT_PICTURES]:
+            del self._seconds[old]
+
+    def divisor(self, full: tuple[int, int]) -> int:
+        """Divisor of the width and height of `full`; a large one at first."""
+        possible = [k for k in DIVISORS if k == 1 or max(full) >= k * MIN_RESOLUTION]
+        if not self._seconds:
+            return possible[-1]
+        expected = {k: self._expected(k) for k in possible}
+        most = max(MOVING_SECONDS, FIXED_COST_FACTOR * min(expected.values()))
+        return next(k for k in possible if expected[k] <= (FRAME_SECONDS if k == 1 else most) or k == possible[-1])
+
+    def _expected(self, divisor: int) -> float:
+        """Seconds of a picture: as measured, on a line through those of other numbers of pixels, or in proportion to
+        the side of the only size that was measured."""
+        if divisor in self._seconds:
+            return self._seconds[divisor]
+        sizes, seconds = 1 / np.array([*self._seconds]) ** 2.0, np.array([*self._seconds.values()])
+        if len(sizes) == 1:
+            return float(seconds[0] * math.sqrt(1 / sizes[0]) / divisor)
+        slope = max(0.0, float(np.cov(sizes, seconds)[0, 1] / sizes.var(ddof=1)))
+        return max(0.0, float(seconds.mean()) + slope * (1 / divisor**2 - float(sizes.mean())))
+
 
 Draw = Callable[[float, Callable[[], bool]], bool]
 

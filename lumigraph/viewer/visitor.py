@@ -33,8 +33,9 @@ from .controls import Controls, MethodControls
 from .crop_panel import CropPanel
 from .export_panel import ExportPanel
 from .modes import along_axis, extra_modes, picture
-from .painter import MOVING_SECONDS, Pace, Painter
+from .painter import MOVING_SECONDS, MovingPace, Pace, Painter
 from .path_panel import PathPanel
+from .reprojection import SharpPicture, sharpened
 from .ruler_panel import RulerPanel
 from .shared import Shared
 from .strokes_panel import StrokesPanel
@@ -43,6 +44,7 @@ from .turns import NotWantedError
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
 MIN_BAND_ROWS = 16  # of a band
+DETAIL_DIVISOR = 2.5  # of the height of a picture at rest, up to which a moving one needs none of its detail
 PICKED_PIXELS = 5  # a side of the picture around a click
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
 MAX_RECOLOURED_GAUSSIANS = 500_000  # Gaussians; more are too many to send again whenever the camera rests
@@ -60,6 +62,8 @@ class Visitor:
     def __init__(self, shared: Shared, client: Any):
         self._shared, self._client = shared, client
         self._pace, self._bands, self._said = Pace(), Pace(), ""  # whole pictures, all waiting included; bands of them
+        self._moving = MovingPace()
+        self._sharp: SharpPicture | None = None  # the last picture at rest
         self._splats: Any = None
         self._sent: tuple[Any, ...] = ()  # which splats the client has
         self._eye = torch.zeros(3)  # towards which their colours are
@@ -214,12 +218,19 @@ class Visitor:
             request = replace(request, depth=False)  # before the rendering, however deep
         elif self._splats is not None:
             self._splats.visible = False
-        size = request.full if seconds == float("inf") else self._pace.size(request.full, seconds)
+        moving, size = seconds == MOVING_SECONDS, request.full
+        divisor = self._moving.divisor(size) if moving else 1
+        if moving:
+            size = max(1, round(size[0] / divisor)), max(1, round(size[1] / divisor))
+        elif seconds != float("inf"):
+            size = self._pace.size(size, seconds)
         begin = time.perf_counter()
         rendering, camera = self._render(request, size, wanted)
         took = time.perf_counter() - begin
         self._pace.note(size[0] * size[1], took)
-        self._show(rendering, camera, request, QUALITY_MOVING if seconds == MOVING_SECONDS else QUALITY)
+        self._show(rendering, camera, request, moving)
+        if moving:
+            self._moving.note(divisor, time.perf_counter() - begin)
         if not by_browser:
             self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
         return size == request.full
@@ -240,10 +251,11 @@ class Visitor:
         return bool(np.abs(np.array(pose) - self._shared.subject.opening.pose).max() < PLACE_TOLERANCE)
 
     def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
-        """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon."""
+        """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon. A cloud is
+        drawn in one, because each would project all Gaussians."""
         camera, (width, height) = request.camera(size), size
         band = max(MIN_BAND_ROWS, int(self._bands.pixels(MOVING_SECONDS)) // width)
-        band = height if band >= 0.7 * height else band
+        band = height if self._shared.is_cloud or band >= 0.7 * height else band
         parts = []
         for first in range(0, height, band):
             if not wanted():
@@ -255,16 +267,36 @@ class Visitor:
                 self._bands.note(width * len(parts[-1].rgb), time.perf_counter() - begin)
         return Rendering.cat(parts), camera
 
-    def _show(self, rendering: Rendering, camera: Camera, request: ViewRequest, quality: int) -> None:
+    def _show(self, rendering: Rendering, camera: Camera, request: ViewRequest, moving: bool) -> None:
         self.controls.offer_modes(extra_modes(rendering))
         shown = picture(rendering, camera, request.mode, self._shared.subject.frame.background, request.background)
+        if request.mode == "colour":
+            shown = self._with_detail(shown, rendering.depth, camera, request, moving)
         depth = None
         if request.depth:
             step = -(-max(request.full) // DEPTH_SIZE) if max(rendering.depth.shape) > DEPTH_SIZE else 1
             depth = along_axis(rendering, camera).nan_to_num(1e3, 1e3)[step // 2 :: step, step // 2 :: step].numpy()
             depth = np.round(np.clip(depth, 0, 1e3) / DEPTH_STEP) * DEPTH_STEP
-        self._stream(to_bytes(shown).numpy(), quality, depth)
+        self._stream(to_bytes(shown).numpy(), QUALITY_MOVING if moving else QUALITY, depth)
         self._flat = None
+
+    def _with_detail(
+        self,
+        shown: Float[Tensor, "height width 3"],
+        depth: Float[Tensor, "height width"],
+        camera: Camera,
+        request: ViewRequest,
+        moving: bool,
+    ) -> Float[Tensor, "rows columns 3"]:
+        """A moving picture, with the detail of the last one at rest if it is much smaller than that. One at rest is
+        kept for that."""
+        settings = self._shared.step, replace(request, pose=(), angle=0.0, depth=False)
+        if not moving:
+            self._sharp = SharpPicture(shown, depth, camera, settings)
+        elif (sharp := self._sharp) is not None and sharp.settings == settings:
+            if DETAIL_DIVISOR * len(shown) <= len(sharp.picture):
+                return sharpened(shown, depth, request.camera(request.full), sharp)
+        return shown
 
     def _stream(self, pixels: UInt8[np.ndarray, "height width 3"], quality: int, depth: np.ndarray | None) -> None:
         if not self._here:

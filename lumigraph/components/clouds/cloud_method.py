@@ -236,7 +236,7 @@ class CloudMethod(Method, ABC):
         for part in self.additions:
             rgb, background = part.shown(self, seen, camera, background)
             seen = replace(seen, rgb=rgb)
-        return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
+        return replace(seen, rgb=over(seen.rgb, seen.opacity, background)) if background.any() else seen
 
     def colour_pairs(self, photograph: Photograph) -> ColourPairs:
         """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""

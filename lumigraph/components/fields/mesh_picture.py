@@ -42,7 +42,7 @@ def picture(
     columns = torch.cat([attributes, torch.ones_like(attributes[:, :1])], -1)
     values, depth, found = kernels.rasterize_mesh(corners, columns, faces, (width, height), near)
     values = kernels.antialias(values, depth.detach(), found, corners, faces, neighbours)
-    along = (camera.rays(camera.pixels()).directions @ camera.forward[0]).view(height, width).clamp_min(1e-3)
+    along = camera.cosines().clamp_min(1e-3)
     depth = torch.where(found >= 0, depth / along, torch.inf)
     return Picture(values[..., :-1], values[..., -1].clamp(0, 1), depth)
 

@@ -197,7 +197,7 @@ def typical_inverse_depth(
 ) -> float:
     """Optimum of a single plane, 1 / z = (1 / near + 1 / far) / 2 (Chai 2000, eq. 10), over known depth."""
     known = [
-        cosines(grid)[depth.isfinite()] * depth[depth.isfinite()] for depth, grid in zip(found, grids, strict=True)
+        grid.cosines()[depth.isfinite()] * depth[depth.isfinite()] for depth, grid in zip(found, grids, strict=True)
     ]
     depth = torch.cat(known)
     if not len(depth) and scene.points is not None and len(scene.points):
@@ -207,11 +207,6 @@ def typical_inverse_depth(
         depth = torch.stack([grid.position[0].norm() for grid in grids]).clamp_min(2 * scene.frame.near)
     near, far = np.quantile(depth.numpy(), (0.02, 0.98))
     return float(0.5 / near + 0.5 / far)
-
-
-def cosines(camera: Camera) -> Float[Tensor, "height width"]:
-    """Cosine between each pixel's ray and the optical axis."""
-    return (camera.rays(camera.pixels()).directions @ camera.forward[0]).view(shape(camera))
 
 
 def completed(
@@ -232,7 +227,7 @@ def completed(
     small = interpolate(picture.movedim(-1, 0)[None], depth.shape, mode="area")[0]
     grey, alpha, trust = torch.einsum("chw,c->hw", small[:3], torch.tensor(GREY)), small[3], small[4]
     solid = (alpha > OPAQUE) & ~depth.isposinf()
-    known, cosine = solid & depth.isfinite(), cosines(grid).clamp_min(1e-3)
+    known, cosine = solid & depth.isfinite(), grid.cosines().clamp_min(1e-3)
     inverse = torch.where(known, 1 / (depth * cosine), 0)
     if known.float().mean() < MIN_SURE:
         known, inverse = torch.zeros_like(known), torch.full_like(inverse, alone)

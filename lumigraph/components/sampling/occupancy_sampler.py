@@ -16,7 +16,7 @@ from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, RayCodes, codes_at
-from ...volume import visible, weights_of
+from ...volume import visible_weights, weights_of
 from .occupancy import OccupancyGrid, visual_hull
 from .spaces import Space
 
@@ -26,6 +26,7 @@ MAX_GROWTH = 1.5  # factor by which the number of rays may grow from one step to
 EARLY_INTERVAL = 4  # steps between updates of the whole grid in the first steps
 CELLS_PER_SAMPLE = 4  # cells updated at most, for each sample of a step
 MIN_RESOLUTION = 4  # cells per axis
+MIN_WEIGHT = 5e-4  # weight in a ray's colour up to which a rendering omits a sample
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,8 @@ class OccupancySampler(Sampler):
         samples = self.grid.sample(rays, self.frame.near, *self._step(field), jitter=jitter)
         if generator is not None and self.sampled_share < 1:
             samples = samples.keep(self._in_the_middle(rays, samples))
+        if generator is None and not (torch.is_grad_enabled() or field.joint or field.cheap_density):
+            return [self._visible(rays, samples, field, code_of)]
         samples, evaluated = reached(rays, samples, field, code_of, self.numbers.transmittance_threshold)
         points, directions = samples.along(rays)
         of_samples = None if code_of is None else codes_at(samples.ray_index, code_of)
@@ -152,6 +155,39 @@ class OccupancySampler(Sampler):
         coloured = (weights_of(samples, density.detach()) > field.min_weight).nonzero()[:, 0]
         features, directions = rows_of(features, coloured), directions.index_select(0, coloured)
         return [Pass("samples", samples, density, features, directions, coloured, evaluated=evaluated)]
+
+    def _visible(self, rays: Rays, found: Samples, field: Field, code: RayCodes | None) -> Pass:
+        """A pass for pictures: geometry is evaluated once, from the front until a ray terminates. Samples of at most
+        MIN_WEIGHT are left out, so those behind them get that weight."""
+        points, directions = found.along(rays)
+        codes = None if code is None else codes_at(found.ray_index, code)
+        places, evaluated = torch.zeros(len(found), dtype=torch.int64, device=points.device), 0
+        densities, features = list[Tensor](), list[Features]()
+
+        def thickness_of(asked: Int[Tensor, " asked"]) -> Float[Tensor, " asked"]:
+            nonlocal evaluated
+            places[asked] = torch.arange(evaluated, evaluated + len(asked), device=asked.device)
+            evaluated += len(asked)
+            own = None if codes is None else codes.index_select(0, asked)
+            density, feature = field.geometry(points.index_select(0, asked), own)
+            densities.append(density)
+            features.append(feature)
+            return density * found.length.index_select(0, asked)
+
+        kept = visible_weights(found, thickness_of, self.numbers.transmittance_threshold) > MIN_WEIGHT
+        if not densities:
+            thickness_of(places.new_zeros(0))  # no points, of the right widths
+        chosen = kept.nonzero()[:, 0]
+        rows, seen = places.index_select(0, chosen), found.keep(kept)
+        density = torch.cat(densities).index_select(0, rows)
+        return Pass(
+            "samples",
+            seen,
+            density,
+            rows_of(joined(features), rows),
+            directions.index_select(0, chosen),
+            evaluated=evaluated,
+        )
 
     def _step(self, field: Field) -> tuple[float, float]:
         """Length of a step in scene units, and its growth with distance (appendix E.1)."""
@@ -228,7 +264,7 @@ def reached(
     """The samples that light reaches, and the number at which density was evaluated for that, without gradients.
 
     A field with cheap density is evaluated at all samples at once, and those of no more than its least weight are left
-    out. Others are evaluated along each ray from the front until it terminates (see `volume.visible`).
+    out. Others are evaluated along each ray from the front until it terminates (see `volume.visible_weights`).
     stop: transmittance at which a ray terminates
     """
     points, _ = found.along(rays)
@@ -243,8 +279,15 @@ def reached(
         own = None if codes is None else codes.index_select(0, asked)
         return field.density(points.index_select(0, asked), own) * length.index_select(0, asked)
 
-    seen = visible(found, thickness_of, stop)
+    seen = visible_weights(found, thickness_of, stop) > 0
     return found.keep(seen), evaluated
+
+
+def joined(parts: list[Features]) -> Features:
+    """Features of several sets of points one after the other, laid out as `rows_of` has them."""
+    if isinstance(parts[0], tuple):
+        return tuple(torch.cat([x.t() for x in each], 1).t() for each in zip(*parts, strict=True))
+    return torch.cat([x.t() for x in parts if isinstance(x, Tensor)], 1).t()
 
 
 def rows_of(features: Features, rows: Int[Tensor, " row"]) -> Features:

@@ -31,7 +31,15 @@ from ..fields.hash_field import CPU_TABLE, TINY_TABLE
 from ..training.regularizers import depth_loss, distortion_loss, places_between, scale_gradients
 from ..training.row_optimizers import LazyAdam
 from ..training.schedules import falling
-from .occupancy_sampler import NGP_SCHEDULE, GridSchedule, OccupancyNumbers, OccupancySampler, StepNumbers, rows_of
+from .occupancy_sampler import (
+    MIN_WEIGHT,
+    NGP_SCHEDULE,
+    GridSchedule,
+    OccupancyNumbers,
+    OccupancySampler,
+    StepNumbers,
+    rows_of,
+)
 from .proposal import Proposal, proposal_loss
 from .spaces import Space
 
@@ -47,7 +55,6 @@ OUTLIERS = 0.02  # share of them that may be wrong, and nearer
 CLEAR_SHARE = 0.5  # of the distance to the nearest surface, in which air is clear
 CONE = 0.5  # deviation of rays through air from the ways to surfaces, of unit length
 RAYS_PER_CHUNK = 4096  # rendered at once: the activations of their samples fit into a cache
-MIN_WEIGHT = 5e-4  # weight in a ray's colour up to which a rendering omits a sample
 
 
 @dataclass(frozen=True)
