@@ -71,9 +71,7 @@ def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = 
     if enough and not method.complete and gap > MEMORISED_DB:
         rows["advice"] = memorised(gap, run, method, [one.photograph for one in checked.of("test")])
     if any(finding.fault == FOLDED for finding in checked.findings):
-        rows["advice"] = (
-            "the cameras may be wrong, which neither time nor photographs mend; find them anew first"
-        )
+        rows["advice"] = "the cameras may be wrong, which neither time nor photographs mend; find them anew first"
     show(rows | finding_rows(checked.findings, str(run.folder / RESULT_FILE)) | next_commands(run))
 
 
