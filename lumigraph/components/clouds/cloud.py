@@ -171,7 +171,8 @@ class CloudAdam(RowOptimizer):
         width = math.prod(p.shape[1:])
         rate, columns = adam_rate(group, t), _factors(p.device, *group["columns"] or [1.0] * width)
         given = p, grad.contiguous(), state["mean"], state["square"]
-        tensors = [*(x.detach().view(-1, width) for x in given), state["last"]]
+        values, slope, mean, square = (x.detach().view(-1, width) for x in given)
+        tensors = values, slope, mean, square, state["last"]
         if p.is_cuda:
             from ...kernels._row_optimizers import cloud_adam
 
