@@ -233,7 +233,7 @@ class Visitor:
             self._moving.note(divisor, time.perf_counter() - begin)
         if not by_browser:
             self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
-        return size == request.full
+        return size == request.full and not moving  # its JPEG is coarse, and it is not kept for its detail
 
     def _begins(self, request: ViewRequest) -> bool:
         """True until the client first moves or changes the scene, unless it is in training.
