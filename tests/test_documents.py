@@ -235,7 +235,7 @@ def test_a_lost_option_is_noticed():
 
 @cache
 def site_math() -> dict[str, Any]:
-    """What the hook of the site that makes them defines."""
+    """Definitions of the site's hook that makes equations."""
     return runpy.run_path(str(ROOT / "docs" / "site_math.py"))
 
 

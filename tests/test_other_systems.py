@@ -21,7 +21,7 @@ LEFTOVER = ".lumigraph-0123456789abcdef.partial"
 
 @pytest.fixture
 def on(monkeypatch):
-    """What lets modules take this system for another one."""
+    """A function that lets modules take this system for another one."""
 
     def on_(platform: str, *modules: object) -> None:
         for module in modules:

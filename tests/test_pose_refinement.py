@@ -399,7 +399,7 @@ def test_a_capture_is_said_to_be_folded_where_it_leaps_and_its_photographs_do_no
     assert about_fold(photographed(tmp_path, walk, steady), walk) is None
     said = about_fold(photographed(tmp_path, folded, steady), folded)
     assert said is not None and "19.png and 20.png" in said and "folded" in said
-    (finding,) = of_folds(photographed(tmp_path, folded, steady), tmp_path)
+    (finding,) = of_folds(photographed(tmp_path, folded, steady), folded, tmp_path)
     assert "19.png and 20.png" in finding.evidence and f"lumigraph capture {tmp_path}" in finding.advice
     assert about_fold(photographed(tmp_path, folded, leaping), folded) is None  # somebody walked there
     shuffled = folded[np.random.default_rng(0).permutation(40)]

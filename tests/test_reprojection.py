@@ -58,7 +58,7 @@ def test_the_same_view_is_the_sharp_picture():
 
 
 def test_another_view_has_the_detail_of_the_plane():
-    """What a picture of a sixth of the size has lost comes from the other view, to a fraction of a pixel."""
+    """Detail lost in a picture of a sixth of the size comes from the other view, to a fraction of a pixel."""
     source, picture, depth = seen((0.3, 0.2, 2.0))
     camera, expected, _ = seen((0.16, 0.25, 1.9))
     small = small_of((0.16, 0.25, 1.9))

@@ -117,6 +117,7 @@ def findings(
     """
     capture = replace(capture, shots=[replace(shot, name=label(shot.name)) for shot in capture.shots])
     shots, folder = capture.shots, Path(capture.source)
+    poses = np.stack([shot.pose for shot in shots])
     found = [
         Finding(name, "left out", why, "retake it, or take photographs between it and the others")
         for name, why in (said_left_out(folder) if left_out is None else left_out).items()
@@ -125,8 +126,7 @@ def findings(
         found += of_pixels(shots, {photo.name: photo for photo in judged})
         found += of_tracks(shots, tracks_of(capture), folder, {f.photograph for f in found if f.fault == BLURRED})
         found += of_residuals(residuals, shots, {f.photograph for f in found})
-        found += of_folds(shots, folder)
-    poses = np.stack([shot.pose for shot in shots])
+        found += of_folds(shots, poses, folder)
     turned = poses if upright is None else upright @ poses
     if capture.bounds is None and (around := coverage([shot.name for shot in shots], turned)) is not None:
         covered = f"photographs cover {around.degrees:.0f} of 360 degrees around the subject"
@@ -160,9 +160,9 @@ def find_again(shot: Shot, folder: Path) -> str:
     return f"find the poses again: {again}"
 
 
-def of_folds(shots: Sequence[Shot], folder: Path) -> list[Finding]:
+def of_folds(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"], folder: Path) -> list[Finding]:
     """A leap of the cameras between two photographs in a row that show the same."""
-    if (found := fold(shots, np.stack([shot.pose for shot in shots]))) is None:
+    if (found := fold(shots, poses)) is None:
         return []
     evidence = (
         f"{found.before} and {found.after} are next to each other and show the same, but their cameras are "
