@@ -16,12 +16,13 @@ from budgets import budget
 from PIL import Image, ImageFilter, ImageOps
 from views import FOCAL, HEIGHT, WALL, WIDTH, between, look_at, pattern, write_views
 
+from lumigraph import methods
 from lumigraph.capture import read_capture
 from lumigraph.capture.coverage import coverage
 from lumigraph.capture.doctor import LACKING, Finding, Residual, deviations, findings, grouped, of_residuals
 from lumigraph.commands.cli import main
 from lumigraph.datasets.images import ImageStore
-from lumigraph.evaluation.photographs import RESULT_FILE, compare_all, examine, examined
+from lumigraph.evaluation.photographs import RESULT_FILE, compare_all, examine, examined, rendered
 from lumigraph.evaluation.report import write_report
 from lumigraph.training import fit
 
@@ -148,6 +149,19 @@ def test_a_run_names_photographs_that_it_cannot_render(learnt):
     for finding in of_residuals([one.residual for one in compare_all(method, wrong)], (), set()):
         faults[finding.photograph].add(finding.fault)
     assert faults == {"ball_1": {"mirrored"}, "ball_6": {"rendered badly"}, "ball_10": {"rendered badly"}}
+
+
+def test_clouds_are_compared_at_the_size_of_the_photographs():
+    """Small pictures of Gaussians are means of whole ones; drawn small, Gaussians would be wider."""
+    scene = tiny.scene()
+    method = methods.find("gaussian-splatting")(scene.frame)
+    shot, camera, seen = rendered(method, scene, 3, int(scene.cameras.size.max()) / 4)
+    whole = method.render(scene.cameras[3])
+    height, width = (n // 4 for n in whole.depth.shape)
+    means = whole.rgb[: 4 * height, : 4 * width].view(height, 4, width, 4, 3).mean((1, 3))
+    assert shot.rgb.shape == seen.rgb.shape == (height, width, 3) and camera.size.tolist() == [[width, height]]
+    torch.testing.assert_close(seen.rgb, means)
+    assert not torch.allclose(seen.rgb, method.render(camera).rgb, atol=1e-3)
 
 
 def test_the_worst_photographs_stand_in_the_report(learnt):

@@ -146,12 +146,20 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
 
 def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Photograph, Camera, Rendering]:
     """A photograph reduced to a longer side, its refined camera, and the rendering with its own exposure or appearance
-    where the method has learnt one."""
-    shot = scene.photograph(index)
-    shot = shot.reduced(max(1, round(int(shot.camera.size.max()) / side)))
+    where the method has learnt one. Gaussians are drawn at the photograph's size and reduced like it: drawn small, their
+    low-pass filter would widen them, by 3 to 8 dB."""
+    whole = scene.photograph(index)
+    factor = max(1, round(int(whole.camera.size.max()) / side))
+    shot = whole.reduced(factor)
     own = {control.name: str(index) for control in method.controls if control.of_photographs}
+    method = method.given(**own) if own else method
     camera = method.refined(shot.camera)
-    return shot, camera, (method.given(**own) if own else method).render(camera).cpu()
+    if factor == 1 or not can(method, HasGaussians):
+        return shot, camera, method.render(camera).cpu()
+    seen = method.render(method.refined(whole.camera)).cpu()
+    layers = {"depth": seen.depth, "opacity": seen.opacity}
+    small = replace(whole, rgb=seen.rgb, alpha=None, mask=None, extra=layers).reduced(factor)
+    return shot, camera, Rendering(small.rgb, **small.extra)
 
 
 def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[int], float]:
@@ -159,12 +167,16 @@ def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[
 
     camera: of one of them, with which the speed is measured
     """
-    small = camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
-    method.render(small)  # compiles
+    cloud = can(method, HasGaussians)
+    tried = camera if cloud else camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
+    method.render(tried)  # compiles
     begin = time.perf_counter()
-    method.render(small).cpu()  # waits for a GPU
-    pixels, least = int(small.size.prod()), int(small.size.max())
-    budget = min(PIXEL_BUDGET, MAX_SECONDS * pixels / (time.perf_counter() - begin))
+    method.render(tried).cpu()  # waits for a GPU
+    seconds = time.perf_counter() - begin
+    if cloud:
+        return evenly(chosen, max(MIN_JUDGED, int(MAX_SECONDS / seconds))), MAX_SIDE
+    pixels, least = int(tried.size.prod()), int(tried.size.max())
+    budget = min(PIXEL_BUDGET, MAX_SECONDS * pixels / seconds)
     chosen = evenly(chosen, max(MIN_JUDGED, int(budget / pixels)))
     return chosen, min(max(least * (budget / len(chosen) / pixels) ** 0.5, least), MAX_SIDE)
 
