@@ -3,9 +3,9 @@
     python benchmarks/notebook.py --photographs FOLDER [--output executed.ipynb]
     python benchmarks/notebook.py --steps [--rounds 3]
 
-With photographs, docs/photographs-to-page.ipynb is executed as it is, in a temporary folder. `--steps` trains for two
-numbers of steps, by `lumigraph train` and by `lumigraph.train` in a kernel, in turn. The processor seconds of the
-longer one less those of the shorter one are those of the steps alone, without Python's start, data and compiling.
+With photographs, docs/photographs-to-page.ipynb is executed as it is, in a temporary folder. `--steps` trains by
+`lumigraph train` and by `lumigraph.train` in a kernel, in turn, and compares the seconds of training that the runs
+state, which are those of their steps alone. Nothing else should run meanwhile.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -23,13 +22,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lumigraph.run import Run
+
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOK = ROOT / "docs" / "photographs-to-page.ipynb"
-SCENE, METHOD, STEPS = "procedural:still-life", "instant-ngp", (50, 250)
-CELL = """import time, lumigraph
-begin = time.process_time()
-lumigraph.train({scene!r}, {method!r}, {output!r}, steps={steps})
-time.process_time() - begin"""
+SCENE, METHOD, STEPS = "procedural:still-life", "instant-ngp", 500
+CELL = "import lumigraph\nlumigraph.train({scene!r}, {method!r}, {output!r}, steps={steps})"
 
 
 def execute(notebook: Any, folder: Path, changes: Mapping[str, str] | None = None, seconds: int = 3600) -> Any:
@@ -69,33 +67,28 @@ def run_photographs(photographs: Path, output: Path | None) -> None:
         nbformat.write(notebook, output)
 
 
-def by_command(folder: Path, steps: int) -> float:
-    """Processor seconds of `lumigraph train`."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    words = ["train", METHOD, SCENE, "--steps", str(steps), "--output", str(folder / f"command-{time.time_ns()}")]
+def by_command(output: Path) -> None:
+    """A run by `lumigraph train`."""
+    words = ["train", METHOD, SCENE, "--steps", str(STEPS), "--output", str(output)]
     subprocess.run([sys.executable, "-m", "lumigraph", *words], check=True, capture_output=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def by_notebook(folder: Path, steps: int) -> float:
-    """Processor seconds of `lumigraph.train` in a kernel."""
+def by_notebook(output: Path) -> None:
+    """A run by `lumigraph.train` in a kernel."""
     import nbformat.v4
 
-    source = CELL.format(scene=SCENE, method=METHOD, output=str(folder / f"notebook-{time.time_ns()}"), steps=steps)
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
-    execute(notebook, folder)
-    return float(outputs(notebook.cells[0])["text/plain"])
+    source = CELL.format(scene=SCENE, method=METHOD, output=str(output), steps=STEPS)
+    execute(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)]), output.parent)
 
 
 def compare_steps(rounds: int) -> None:
     costs: dict[str, list[float]] = {"command line": [], "notebook": []}
     with tempfile.TemporaryDirectory() as folder:
-        for _ in range(rounds):
-            for name, measure in (("command line", by_command), ("notebook", by_notebook)):
-                few, many = (measure(Path(folder), steps) for steps in STEPS)
-                costs[name].append(1000 * (many - few) / (STEPS[1] - STEPS[0]))
-                print(f"{name}: {costs[name][-1]:.2f} processor ms a step", flush=True)
+        for turn in range(rounds):
+            for name, train in (("command line", by_command), ("notebook", by_notebook)):
+                train(output := Path(folder) / f"{name}-{turn}")
+                costs[name].append(1000 * Run(output).state.seconds / STEPS)
+                print(f"{name}: {costs[name][-1]:.2f} ms a step", flush=True)
     medians = {name: statistics.median(values) for name, values in costs.items()}
     ratio = medians["notebook"] / medians["command line"]
     print(json.dumps(medians | {"notebook / command line": round(ratio, 4)}))

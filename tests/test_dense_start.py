@@ -125,7 +125,10 @@ def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator):
     assert {tuple(p) for p in known.tolist()} <= {tuple(p) for p in begun.means.tolist()}
     begun = initialization.initial_cloud(scene, "dense", 200, 5000, 1, generator, lambda: dense(alpha=False))
     assert (begun.means[-40:].norm(dim=-1) > 1.7).all()  # a fifth of 200, outside the box
-    assert len(initialization.initial_cloud(scene, "random", 200, 5000, 1, generator)) == 200
+    swept = initialization.initial_cloud(scene, "sparse", 200, 5000, 1, generator, lambda: dense(alpha=False))
+    assert len(swept) == len(begun)  # a place without known points
+    for object_or_none, kind in ((ball(), "sparse"), (scene, "random")):
+        assert len(initialization.initial_cloud(object_or_none, kind, 200, 5000, 1, generator)) == 200
 
 
 def test_the_same_photographs_give_the_same_cloud():

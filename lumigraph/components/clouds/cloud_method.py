@@ -88,7 +88,7 @@ class CloudMethod(Method, ABC):
 
     def compile_begin(self) -> None:
         super().compile_begin()
-        if self.config.initialization == "dense":
+        if self.config.initialization == "dense" or self.config.initialization == "sparse" and self.frame.is_open:
             compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:

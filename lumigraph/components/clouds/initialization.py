@@ -42,14 +42,16 @@ def initial_cloud(
     """At most `max_count` Gaussians at the points that are known, or where there are none, `count` random ones.
 
     initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
-                    points as they are, "random" takes neither
+                    points as they are, and swept ones of a place that has none, "random" takes neither
     sweep:          gives points that plane sweeps find; `seen_points` by default
     Random ones lie inside the silhouettes of photographs with alpha, otherwise inside the box of interest.
     """
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
         means, colours = sparse_points(scene, max_count, generator)
-    if initialization == "dense" and len(means) < (dense_count := math.ceil(MAX_DENSE_SHARE * max_count)):
+    lacking = initialization == "sparse" and len(means) < 2 and scene.frame.is_open
+    dense_count = math.ceil(MAX_DENSE_SHARE * max_count)
+    if lacking or initialization == "dense" and len(means) < dense_count:
         found = thinned((sweep or partial(seen_points, scene))())
         means, colours = with_dense_points(scene, means, colours, count, dense_count, generator, found)
     if len(means) < 2:
