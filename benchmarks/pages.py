@@ -6,7 +6,8 @@
 Opens the page in a headless Chromium, which draws in software unless --webgl gives other switches. For some of the
 run's cameras, at 400x400 pixels: PSNR of a screenshot against `Method.render`, and the milliseconds that a picture
 takes to draw in full, all its bands together. Writes both pictures beside each other with four times their
-difference, and what the page shows at first at a desktop's and at a phone's size.
+difference, and what the page shows at first at a desktop's and at a phone's size; and frames per second there while
+the scene turns.
 """
 
 from __future__ import annotations
@@ -44,6 +45,17 @@ CLOCK = """{
     readPixels(...all) { readPixels.apply(this, all); if (width === innerWidth) spent += performance.now() - begin; },
   });
 }"""
+# Turns the scene by its keys, one turn for each frame that the browser shows; frames per second.
+TURN = """async (seconds) => {
+  const canvas = document.querySelector("#stage canvas"), begin = performance.now();
+  let frames = 0;
+  for (; performance.now() - begin < 1000 * seconds; frames++) {
+    canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" }));
+    await new Promise(requestAnimationFrame);
+  }
+  return frames / seconds;
+}"""
+TURNED = 4.0  # seconds
 BARE = "#caption, #buttons, #wait { display: none !important } * { transition: none !important }"
 
 
@@ -71,13 +83,16 @@ def main(options: Options) -> None:
         for i in evenly(range(len(some)), options.views):
             found.append(compared(page, method, square(some[i]), options.output / f"{options.page.stem}-{i}.png"))
             print(found[-1], flush=True)
+        turning = {}
         for name, window in WINDOWS.items():
             shown, _ = visited(browser, options.page, *window)
             shown.evaluate("lumigraph.rest()")
             shown.screenshot(path=options.output / f"{options.page.stem}-{name}.png")
+            turning[name] = round(shown.evaluate(TURN, TURNED), 1)
             shown.close()
         browser.close()
     about = {"page": options.page.name, "megabytes": options.page.stat().st_size / 1e6, "seconds_to_open": loading}
+    about["frames_per_second"] = turning
     write_json(options.output / f"{options.page.stem}.json", about | {"views": found})
     print(about)
 

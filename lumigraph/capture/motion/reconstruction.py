@@ -23,7 +23,7 @@ from ...system.library import pycolmap
 from ...system.memory import free_memory
 from ...system.progress import counting, tell
 from ..colmap import poses_of
-from ..doctor import findings
+from ..doctor import FOLDED, findings
 from ..photos import Intake, Photo, gather
 from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
@@ -541,7 +541,8 @@ class Reconstruction:
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)
         found = findings(read_transforms(self.folder), diagnosis.left_out, judged=self.photos)
-        result = self.summary(key, model, place, diagnosis) | {"findings": [asdict(finding) for finding in found]}
+        told_once = [asdict(finding) for finding in found if finding.fault != FOLDED]  # the warnings know, by matches
+        result = self.summary(key, model, place, diagnosis) | {"findings": told_once}
         write_json(self.folder / RESULT_FILE, result, "capture")
         return read_json(self.folder / RESULT_FILE)
 
