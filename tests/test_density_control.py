@@ -11,7 +11,7 @@ from test_gaussians import NAMES, cloud
 from lumigraph import methods
 from lumigraph.components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from lumigraph.components.clouds.cloud import Cloud, CloudAdam
-from lumigraph.components.clouds.density_control import PRUNE_OPACITY, RefineNumbers
+from lumigraph.components.clouds.density_control import MIN_CAP, PRUNE_OPACITY, RefineNumbers
 from lumigraph.components.clouds.initialization import initial_cloud, nearest_distance
 from lumigraph.components.training.row_optimizers import adam_rate
 from lumigraph.errors import LumigraphError
@@ -150,6 +150,25 @@ def test_a_cap_may_rise_over_the_budget_and_need_not_be(ramp, monkeypatch):
         control.initial_count.fill_(10)
         found = [control.current_cap(some, progress) for progress in (0.0, 0.25, 0.5)]
         assert found == (list(caps) if ramp else [caps[-1]] * 3)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "steps", "cap"),
+    [
+        (RefineNumbers(500_000, gaussians_per_step=15.0), 1000, MIN_CAP),
+        (RefineNumbers(500_000, gaussians_per_step=15.0), 20_000, 300_000),
+        (RefineNumbers(500_000, gaussians_per_step=15.0), 100_000, 500_000),
+        (RefineNumbers(50_000, gaussians_per_step=15.0), 20_000, 50_000),
+        (RefineNumbers(500_000), 1000, 500_000),
+    ],
+)
+def test_a_cap_may_follow_the_budget(numbers, steps, cap, monkeypatch):
+    from lumigraph.components.clouds import density_control
+
+    monkeypatch.setattr(density_control, "room_for", lambda size, device: 1_000_000)
+    control = AdaptiveDensity(numbers, AdaptiveNumbers(), 10)
+    assert control.allowed(steps) == control.max_count(Cloud(cloud(10)), steps) == cap
+    assert control.current_cap(Cloud(cloud(10)), 0.5, steps) == cap
 
 
 def test_a_chain_needs_a_cap():

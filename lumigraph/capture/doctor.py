@@ -154,8 +154,10 @@ def leave_out(shot: Shot) -> str:
 
 
 def find_again(shot: Shot, folder: Path) -> str:
-    """Advice with the command that finds the poses of all photographs anew: by the other mapper, if ours has found them.
-    shot: one of them"""
+    """Advice with the command that finds the poses of all photographs anew; by another mapper, if we have found them.
+
+    shot: one of them
+    """
     source = str(first_file(shot).parent) if isinstance(shot.image, dict) else "PHOTOS"
     other = ["--mapper", "global"] if (folder / "capture.json").is_file() else []
     again = shlex.join(["lumigraph", "capture", source, "--output", f"{folder}-again", *other])

@@ -146,8 +146,8 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
 
 def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Photograph, Camera, Rendering]:
     """A photograph reduced to a longer side, its refined camera, and the rendering with its own exposure or appearance
-    where the method has learnt one. Gaussians are drawn at the photograph's size and reduced like it: drawn small, their
-    low-pass filter would widen them, by 3 to 8 dB."""
+    where the method has learnt one. Gaussians are drawn at the photograph's size and reduced like it: drawn small, they
+    would be widened by their low-pass filter, which costs 3 to 8 dB."""
     whole = scene.photograph(index)
     factor = max(1, round(int(whole.camera.size.max()) / side))
     shot = whole.reduced(factor)

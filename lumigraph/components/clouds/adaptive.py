@@ -70,19 +70,19 @@ class AdaptiveDensity(DensityControl):
             return
         height, width = picture.opacity.shape
         self.record(picture.centres.grad, picture.opacities > 0, (width, height))
+        steps = step / max(progress, 1e-6)  # of the whole budget
         if method.current.due:
-            cap = self.current_cap(cloud, progress)
+            cap = self.current_cap(cloud, progress, steps)
             full = self.refine(cloud, float(cloud.extent), cap, method.random(step))
-            if full and len(cloud) >= NEARLY_FULL * self.max_count(cloud):
-                self.warn_full(cloud)
+            if full and len(cloud) >= NEARLY_FULL * self.max_count(cloud, steps):
+                self.warn_full(cloud, steps)
         every, full_size = self.numbers.opacity_reset_interval, progress >= method.config.half_resolution_until
-        left = step / max(progress, 1e-6) - step
-        if step and step % every == 0 and full_size and left >= RECOVERY_INTERVALS * every:
+        if step and step % every == 0 and full_size and steps - step >= RECOVERY_INTERVALS * every:
             self.reset_opacity(cloud)
 
-    def current_cap(self, cloud: Cloud, progress: float) -> int:
-        """Cap at this share of the budget: with `cap_ramp` it rises evenly until `refine_until`."""
-        first, cap = int(self.initial_count), self.max_count(cloud)
+    def current_cap(self, cloud: Cloud, progress: float, steps: float = 0.0) -> int:
+        """Cap at this share of a budget of so many steps: with `cap_ramp` it rises evenly until `refine_until`."""
+        first, cap = int(self.initial_count), self.max_count(cloud, steps)
         if not self.refining.cap_ramp:
             return cap
         share = min(1.0, progress / self.refining.refine_until)

@@ -12,13 +12,14 @@ import torch
 from torch import Tensor
 
 from ...errors import LumigraphWarning
-from ...files.ranges import PositiveShare, Share, Steps, between
+from ...files.ranges import NonNegative, PositiveShare, Share, Steps, between
 from ...system.memory import room_for
 from .addition import Addition
 from .cloud import Cloud
 from .interval_schedule import IntervalSchedule, intervals
 
 PRUNE_OPACITY = 0.005  # below which a Gaussian is pruned or relocated (Kerbl 2023 and Kheradmand 2024)
+MIN_CAP = 120_000  # Gaussians that a budget of few steps may have, where the cap follows the budget
 BYTES_PER_GAUSSIAN = 4096  # lower bound while it learns: itself, its gradient and moments, its share of a picture
 
 
@@ -27,6 +28,7 @@ class RefineNumbers:
     """A Config's numbers of when a strategy changes the cloud."""
 
     max_gaussians: Annotated[int, between(0, 100_000_000)] = 0  # Gaussians at most; more cost time; 0: as memory allows
+    gaussians_per_step: NonNegative = 0.0  # of the budget, at most, beyond 120,000; 0: the cap follows no budget
     cap_ramp: bool = False  # raise the cap evenly until refine_until, with adaptive, so that early steps are quick
     refine_every: Steps = 100  # steps between density control, section 5.2; or the share below, if sooner
     refine_every_share: PositiveShare = 0.1  # share of the budget between density control, if that is sooner
@@ -62,15 +64,23 @@ class DensityControl(Addition, ABC):
         ended = self.schedule.due(step, progress)
         return ended and intervals(step, progress, self.refining.refine_from, self.refining.refine_from_share) >= 1
 
-    def max_count(self, cloud: Cloud) -> int:
-        """Cap on the number of Gaussians: `max_gaussians`, or as many as fit into free memory."""
-        fit = len(cloud) + room_for(BYTES_PER_GAUSSIAN, cloud.means.device)
-        return min(self.refining.max_gaussians or fit, fit)
+    def allowed(self, steps: float = 0.0) -> float:
+        """Gaussians that the numbers allow in a budget of so many steps; infinitely many without `max_gaussians`."""
+        n = self.refining
+        by_budget = max(MIN_CAP, n.gaussians_per_step * steps) if n.gaussians_per_step else math.inf
+        return min(n.max_gaussians or math.inf, by_budget)
 
-    def warn_full(self, cloud: Cloud) -> None:
+    def max_count(self, cloud: Cloud, steps: float = 0.0) -> int:
+        """Cap on the number of Gaussians: `allowed`, or as many as fit into free memory."""
+        fit = len(cloud) + room_for(BYTES_PER_GAUSSIAN, cloud.means.device)
+        return int(min(self.allowed(steps), fit))
+
+    def warn_full(self, cloud: Cloud, steps: float = 0.0) -> None:
         """Warn, once, that the cloud has reached its cap."""
         if not self.warned:
             self.warned = True
-            by_option = len(cloud) >= 0.95 * (self.refining.max_gaussians or math.inf)
-            why = "--max-gaussians says so" if by_option else "memory is short"
+            allowed, why = self.allowed(steps), "memory is short"
+            if len(cloud) >= 0.95 * allowed:
+                by_option = allowed == self.refining.max_gaussians
+                why = "--max-gaussians says so" if by_option else "a budget of more steps would allow more"
             warnings.warn(f"The cloud stops growing at {len(cloud):,} Gaussians, for {why}", LumigraphWarning, 2)

@@ -94,7 +94,8 @@ class GaussianSplatting(CloudMethod):
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
         c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
-        c = replace(c, refine=RefineNumbers(120_000, cap_ramp=True), mcmc=McmcNumbers(joining_per_step=120.0))
+        refine = RefineNumbers(500_000, gaussians_per_step=15.0, cap_ramp=True)
+        c = replace(c, refine=refine, mcmc=McmcNumbers(joining_per_step=120.0))
         return replace(
             c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"), groups=CPU_GROUPS
         )

@@ -53,7 +53,7 @@ class MarkovChain(DensityControl):
             if method.progress < self.refining.refine_until:
                 joined = int(self.initial_count) + step * self.numbers.joining_per_step
                 wanted = int(max(GROWTH_FACTOR * count, joined))
-            if wanted > max(cap := self.max_count(cloud), count) and cap != self.refining.max_gaussians:
+            if wanted > max(cap := self.max_count(cloud), count) and cap < self.allowed():
                 self.warn_full(cloud)
             self.refine(cloud, min(wanted, max(cap, count)), generator)
         self.explore(cloud, cloud.optimizer.param_groups[0]["lr"], generator)
