@@ -159,7 +159,7 @@ def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Pho
     seen = method.render(method.refined(whole.camera)).cpu()
     layers = {"depth": seen.depth, "opacity": seen.opacity}
     small = replace(whole, rgb=seen.rgb, alpha=None, mask=None, extra=layers).reduced(factor)
-    return shot, camera, Rendering(small.rgb, **small.extra)
+    return shot, camera, Rendering(small.rgb, small.extra["depth"], small.extra["opacity"])
 
 
 def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[int], float]:

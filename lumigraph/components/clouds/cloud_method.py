@@ -82,7 +82,7 @@ class CloudMethod(Method, ABC):
         return NEAR_PLANE_SCALE * self.frame.near
 
     def growth_bytes(self) -> int:
-        return BYTES_PER_GAUSSIAN * self.density_control.max_count(self.cloud)
+        return BYTES_PER_GAUSSIAN * self.density_control.max_count(self.cloud, math.inf)
 
     # Initialisation
 
