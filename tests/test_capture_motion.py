@@ -659,9 +659,10 @@ def test_one_photograph_is_an_intake_too():
 
 @pytest.mark.parametrize(("asked", "other"), [("incremental", "global"), ("global", "incremental")])
 @pytest.mark.parametrize("first", [0, 50])
-def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeypatch, asked, other, first):
+@pytest.mark.parametrize("count", [8, reconstruction.MAX_RETRIED + 1])
+def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeypatch, asked, other, first, count):
     """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once; and a
-    wrong model has a small error too."""
+    wrong model has a small error too. Many photographs are not placed a third time."""
     tried: list[tuple[str, int]] = []
     shares = {(asked, 0): first, (other, 0): 40, ("incremental", 1): 90}
 
@@ -676,9 +677,14 @@ def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeyp
     work.stages, work.models, work.unfolded = Stages(tmp_path), tmp_path / "models", tmp_path / "unfolded"
     work.database, work.options = tmp_path / "database.db", MotionOptions(mapper=asked)
     work.map, work.agreement = mapped, lambda *_: Agreement(100, shares[tried[-1]])
+    work.photos = [photo("a.jpg")] * count
+    few = count <= reconstruction.MAX_RETRIED
     for _ in range(2):  # once it is there it stays
         work.place("key")
-        assert tried == [(asked, 0), (other, 0), ("incremental", 1)]
+        assert tried == [(asked, 0), (other, 0), ("incremental", 1)][: 3 if few else 2]
+        if not few:
+            assert (work.models / "0" / f"{other if first < 40 else asked}0").exists()
+            continue
         assert {place.name for place in work.models.iterdir()} == {"0", reconstruction.NOTE_FILE}
         assert (work.models / "0" / "incremental1").exists()
         note = (work.models / reconstruction.NOTE_FILE).read_text()
