@@ -6,7 +6,7 @@ Splats: tile, project, rasterize, photometric. instant-ngp: hash_encode, percept
 Inputs are each kernel's `benchmark_case`. Floating-point operations are counted by the formulas of `OPERATIONS`, an
 addition, a multiplication and an exponential as one each. Bytes: each input read once and each output written once;
 backward, gradients too. The machine's peaks are measured first: products of two matrices of 2048 rows, and a copy of
-256 MB. The limit of a kernel is the longer of its operations at the one rate and its bytes at the other.
+256 MB.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ import torch
 import tyro
 from torch import Tensor
 
+from lumigraph.benchmark.step import memory_rate
 from lumigraph.files import write_json
 from lumigraph.kernels import using
+from lumigraph.kernels._operation import tensors
 
-# Operations of each unit, forward; backward as a multiple of forward.
 WINDOW, CHANNELS, MAPS = 11, 3, 5  # of SSIM: taps of a pass, colours, blurred maps
 LEVELS, CORNERS, FEATURES = 16, 8, 2  # of the hash table
 COMPONENTS, TAPS = 48, 6  # of VM-192's density: of three planes and lines, and values that each takes
 EVALUATION = 30  # of a Gaussian at a pixel: exponent, exponential, blending of four values
-ROWS, COPIED = 2048, 1 << 26  # of the matrices; float32 numbers of the copy
+ROWS = 2048  # of the matrices
 CALLS = 7
 
 
@@ -68,7 +69,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    rate, moved = peaks()
+    rate, moved = arithmetic_rate(), memory_rate()
     print(f"{torch.get_num_threads()} threads: {rate / 1e9:.0f} GFLOP/s, {moved / 1e9:.1f} GB/s")
     rows = {}
     for name, (operations, backward) in OPERATIONS.items():
@@ -78,7 +79,7 @@ def main(options: Options) -> None:
         wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
         run = getattr(folder, name)
         with using("cpu"):
-            outputs = tensors_of(run(*inputs))
+            outputs = tensors(run(*inputs))
             rows[f"{name}, forward"] = row(count, [*inputs, *outputs], median(lambda: run(*inputs)), rate, moved)  # noqa: B023
             if not (wanted and backward):
                 continue
@@ -95,15 +96,14 @@ def main(options: Options) -> None:
         write_json(options.output, {"GFLOP/s": rate / 1e9, "GB/s": moved / 1e9, "kernels": rows})
 
 
-def peaks() -> tuple[float, float]:
-    """Floating-point operations and bytes of a second, of matrix products and of a copy."""
+def arithmetic_rate() -> float:
+    """Floating-point operations of a second, of matrix products."""
     a, b = torch.randn(2, ROWS, ROWS)
-    source, target = torch.randn(COPIED), torch.empty(COPIED)
-    return 2 * ROWS**3 / median(lambda: a @ b), 8 * COPIED / median(lambda: target.copy_(source))
+    return 2 * ROWS**3 / median(lambda: a @ b)
 
 
 def row(operations: float, parts: Sequence[Any], seconds: float, rate: float, moved: float) -> dict[str, float]:
-    bytes_ = sum(x.nbytes for x in tensors_of(parts))
+    bytes_ = sum(x.nbytes for part in parts for x in tensors(part) if isinstance(x, Tensor))
     return {
         "ms": 1000 * seconds,
         "GFLOP/s": operations / seconds / 1e9,
@@ -111,15 +111,6 @@ def row(operations: float, parts: Sequence[Any], seconds: float, rate: float, mo
         "GB/s": bytes_ / seconds / 1e9,
         "of memory": bytes_ / seconds / moved,
     }
-
-
-def tensors_of(found: Any) -> list[Tensor]:
-    """Tensors of nested values."""
-    if isinstance(found, Tensor):
-        return [found]
-    if isinstance(found, Sequence) and not isinstance(found, str):
-        return [x for part in found for x in tensors_of(part)]
-    return [x for x in vars(found).values() if isinstance(x, Tensor)] if hasattr(found, "__dict__") else []
 
 
 def median(call: Callable[[], Any]) -> float:
