@@ -56,6 +56,7 @@ _homes = {
     "Scene": "datasets.scene",
     "Shapes": "datasets.shapes",
     "call": "commands.calls",
+    "capture": "capture",  # the package itself can be called
     "composite": "volume",
     "fit": "training",
     "open": "commands.calls",
@@ -72,7 +73,8 @@ def __getattr__(name: str) -> Any:
     """Load a public name when it is first asked for, so that `lumigraph --help` need not wait for PyTorch."""
     if name not in _homes:
         raise AttributeError(f"module 'lumigraph' has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_homes[name]}", __name__), name)
+    home = importlib.import_module(f".{_homes[name]}", __name__)
+    value = home if _homes[name] == name else getattr(home, name)
     globals()[name] = value
     return value
 
