@@ -31,16 +31,18 @@ MIN_MOMENTS = 2
 class Filmed(Pictures):
     """Options of every scene, and of those that are filmed.
 
-    views: photographs of one moving camera, each at a moment of its own, or of all cameras of a rig
-    rig:   cameras of a rig, which photograph every moment; 0 for one moving camera
+    views:  photographs of one moving camera, each at a moment of its own, or of all cameras of a rig
+    rig:    cameras of a rig, which photograph every moment; 0 for one moving camera
+    sweeps: times that the moving camera goes to one side, to the other, and back
     """
 
     rig: Annotated[int, between(0, 100)] = 0
+    sweeps: Annotated[int, between(1, 100)] = 1
 
 
-def film(size: int, views: int, seed: int, rig: int, radius: float = 3.6) -> dict[str, Camera]:
+def film(size: int, views: int, seed: int, rig: int, sweeps: int = 1, radius: float = 3.6) -> dict[str, Camera]:
     """Cameras by split. The moving one goes to one side, to the other, and back, 2.4 degrees from one of 100
-    photographs to the next, 3.8 at most; the seed shifts where it begins."""
+    photographs to the next, 3.8 at most, and as many times that as it sweeps; the seed shifts where it begins."""
     random = np.random.default_rng(seed)
     start, aside = random.uniform(0, 2 * math.pi), random.normal(0, 2.0, 2)
     moments = np.linspace(0, 1, max(views // rig, MIN_MOMENTS) if rig else max(views, MIN_MOMENTS))
@@ -48,7 +50,7 @@ def film(size: int, views: int, seed: int, rig: int, radius: float = 3.6) -> dic
         places = [(360 * k / rig, ELEVATION + CLIMB * (-1) ** k) for k in range(rig)]
         train = [(*places[k], t) for t in moments for k in range(rig)]
     else:
-        turns = start + 2 * math.pi * moments
+        turns = start + 2 * math.pi * sweeps * moments
         across, up = SWEEP * np.sin(turns), ELEVATION + CLIMB * np.cos(2 * turns)
         train = list(zip(across, up, moments, strict=True))
     halfway = 0.5 * (moments[:-1] + moments[1:])[BETWEEN // 2 :: BETWEEN]

@@ -73,8 +73,8 @@ class DeformableSplatting(CloudMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A smaller cloud that begins dense, coarser planes, and higher rates for few steps."""
-        motion = MotionNumbers(plane_resolution=32, plane_features=8, plane_moments=32, still_until=0.08)
+        """A smaller cloud that begins dense, carried by nodes, coarser planes, and higher rates for few steps."""
+        motion = MotionNumbers(plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, still_until=0.08)
         motion = replace(motion, planes_lr=4e-3, motion_lr=1e-3, final_rate=0.1)
         c = Config(initialization="dense", initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, motion=motion)
         c = replace(c, refine=RefineNumbers(40_000, cap_ramp=True), tidying=ALL_RULES)

@@ -89,13 +89,14 @@ class MotionField(Part):
         self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"]
     ) -> Float[Tensor, "point 3 3"]:
         """Derivatives of canonical positions, [i, j] of coordinate i along axis j; differentiable in the network."""
-        weights = window(self.bands, self.alpha)
+        weights, slope = window(self.bands, self.alpha), self.space.jacobian(points)
 
-        def warped(x: Tensor) -> Tensor:
-            return moved(x, self.network.differentiable(self.space.warp(x), code, weights))
+        def warped(x: Tensor, coordinates: Tensor) -> Tensor:
+            return moved(x, self.network.differentiable(coordinates, code, weights))
 
-        axes = torch.eye(3, device=points.device)
-        return torch.stack([torch.func.jvp(warped, (points,), (a.expand_as(points),))[1] for a in axes], -1)
+        at, axes = (points, self.space.warp(points)), torch.eye(3).to(points)
+        along = ((a.expand_as(points), slope @ a) for a in axes)
+        return torch.stack([torch.func.jvp(warped, at, tangents)[1] for tangents in along], -1)
 
     def inverse(
         self, canonical: Float[Tensor, "point 3"], code: Float[Tensor, "point code"], start: Tensor, steps: int = 20

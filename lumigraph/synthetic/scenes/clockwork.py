@@ -70,6 +70,6 @@ def world(time: float) -> World:
     return World(parts, (key, fill), sky)
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0) -> SyntheticStage:
+def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0, sweeps: int = 1) -> SyntheticStage:
     bounds = ((-0.8, -0.55, -0.75), (0.8, 0.15, 0.7))
-    return SyntheticStage(world(0.0), film(size, views, seed, rig), bounds, reach=0.8, near=1.5, moving=world)
+    return SyntheticStage(world(0.0), film(size, views, seed, rig, sweeps), bounds, reach=0.8, near=1.5, moving=world)

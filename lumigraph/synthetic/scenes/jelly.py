@@ -45,6 +45,6 @@ def world(time: float) -> World:
     return World((still, jelly(time)), (key, fill), sky)
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0) -> SyntheticStage:
+def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0, sweeps: int = 1) -> SyntheticStage:
     bounds = ((-0.95, -0.75, -0.75), (0.95, 0.75, 0.75))
-    return SyntheticStage(world(0.0), film(size, views, seed, rig), bounds, reach=0.95, near=1.5, moving=world)
+    return SyntheticStage(world(0.0), film(size, views, seed, rig, sweeps), bounds, reach=0.95, near=1.5, moving=world)

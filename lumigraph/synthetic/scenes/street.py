@@ -76,6 +76,6 @@ def world(time: float) -> World:
     return World((*still, *walkers), (key, fill), sky)
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0) -> SyntheticStage:
+def stage(size: int = 200, views: int = 100, seed: int = 0, rig: int = 0, sweeps: int = 1) -> SyntheticStage:
     bounds = ((-0.96, -0.46, -0.72), (0.96, 0.52, 0.5))
-    return SyntheticStage(world(0.0), film(size, views, seed, rig), bounds, reach=0.96, near=1.5, moving=world)
+    return SyntheticStage(world(0.0), film(size, views, seed, rig, sweeps), bounds, reach=0.96, near=1.5, moving=world)
