@@ -146,10 +146,12 @@ def test_the_first_sample_of_each_ray_is_found():
 def test_photographs_without_masks_are_refused():
     scene = tiny.scene()
     images = ImageStore.from_arrays([scene.images[i].numpy()[..., :3].copy() for i in range(len(scene))])
-    with pytest.raises(LumigraphError, match="masks"):
-        ball().begin(replace(scene, images=images))
-    with pytest.raises(LumigraphError, match="without bounds"):
-        ball().begin(replace(scene, frame=replace(scene.frame, reach=8.0)))
+    bare, place = replace(scene, images=images), replace(scene, frame=replace(scene.frame, reach=8.0))
+    for data, lacking in ((bare, "masks"), (place, "without bounds")):
+        with pytest.raises(LumigraphError, match=lacking):
+            ball().begin(data)
+        with pytest.raises(LumigraphError, match=lacking):  # before that, kernels are compiled with a batch
+            ball().batch(data, torch.Generator())
 
 
 def test_the_papers_network_learns_the_same_terms():

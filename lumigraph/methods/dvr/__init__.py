@@ -128,14 +128,8 @@ class DVR(SurfaceMethod):
     # Learning
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """Find the visual hull and the first sphere. Raises LumigraphError for photographs without masks, and for
-        places without bounds."""
-        if not data.images.has_alpha or data.frame.is_open:
-            lacking = "have no masks" if not data.images.has_alpha else "show a place without bounds"
-            raise LumigraphError(
-                f"dvr learns one object from photographs with masks, and those of {data.source} {lacking}; give PNG "
-                "files with alpha or a folder object_masks, or train neus"
-            )
+        """Find the visual hull and the first sphere. Raises as `batch` does."""
+        confirm(data)
         if self.config.hull_cells:
             self.cells.rule_out(visual_hull(data, self.config.hull_cells)[None])
         hull = (visual_hull(data, HULL_CELLS).nonzero() + 0.5) * (2 / HULL_CELLS) - 1
@@ -152,6 +146,8 @@ class DVR(SurfaceMethod):
         self._march_steps = round(c.march_steps / 2 ** math.ceil((1 - share) * doublings))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        """Raises LumigraphError for photographs without masks, and for places without bounds."""
+        confirm(data)
         layers = ("depth",) if self.config.depth_weight else ()
         return data.sample_rays(self.config.rays_per_step, generator, layers=layers).to(self.device)
 
@@ -280,3 +276,13 @@ def first_of_each(chosen: Bool[Tensor, " sample"], samples: Samples) -> Tensor:
 def sum_of_lengths(a: Float[Tensor, "point 3"], b: Float[Tensor, "point 3"]) -> Float[Tensor, ""]:
     """Sum of |a - b|, with a gradient also where they agree."""
     return ((a - b).square().sum(-1) + 1e-12).sqrt().sum()
+
+
+def confirm(data: Scene) -> None:
+    """Raises LumigraphError for photographs without masks, and for places without bounds."""
+    if not data.images.has_alpha or data.frame.is_open:
+        lacking = "have no masks" if not data.images.has_alpha else "show a place without bounds"
+        raise LumigraphError(
+            f"dvr learns one object from photographs with masks, and those of {data.source} {lacking}; give PNG files "
+            "with alpha or a folder object_masks, or train neus"
+        )

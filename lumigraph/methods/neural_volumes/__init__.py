@@ -36,6 +36,7 @@ class Config:
     code: Annotated[int, between(1, 4096)] = 256  # numbers of a moment's code, section 4.1
     volume_resolution: Side = 128  # voxels along each side of the template, a power of two, section 4.2
     volume_width: Width = 1024  # channels of its first layer; each doubling of its side halves them, every other time
+    shared_resolution: Annotated[int, between(0, 1024)] = 0  # voxels along a side of what all moments share; 0: nothing
     affines: Annotated[int, between(0, 256)] = 16  # affine maps that warp it, section 5.2; 0: no warp
     warp_resolution: Side = 32  # cells along each side of the warp, section 5.2
     warp_width: Width = 128  # channels of the layers that make affine maps
@@ -48,6 +49,7 @@ class Config:
     opacity_weight: NonNegative = 0.01  # of rays that are neither opaque nor clear, section 5.4
     smooth_weight: NonNegative = 0.01  # of the total variation of log opacity, section 5.4
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher: faster, may diverge
+    shared_rate: NonNegative = 25.0  # learning rate of what all moments share, as a multiple of the others'
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -76,7 +78,7 @@ class NeuralVolumes(RayMethod):
             torch.manual_seed(c.seed)
             self.encoder = Encoder(c.encoder_cameras, c.encoder_size, c.encoder_width, c.code)
             warp = c.affines, c.warp_resolution, c.warp_width
-            self.decoder = VolumeDecoder(c.code, c.volume_resolution, c.volume_width, *warp, c.view_dependence)
+            self.decoder = VolumeDecoder(c.code, c.volume_resolution, c.volume_width, *warp, c.shared_resolution, c.view_dependence)
         self.rig = Rig(c.encoder_cameras, c.encoder_size)
         self.backgrounds = Backgrounds(frame, c.background_size, learns_background=not frame.has_alpha)
         self.decoded: tuple[Any, Any] = (None, None)  # of the last picture
@@ -236,4 +238,8 @@ class NeuralVolumes(RayMethod):
         return [(origin == i).nonzero()[:, 0] for i in range(int(origin.max()) + 1)]
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        return [torch.optim.Adam(self.parameters(), self.config.learning_rate), *super().optimizers()]
+        shared = self.decoder.shared
+        groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if p is not shared]}]
+        if shared is not None:
+            groups.append({"params": [shared], "scale": self.config.shared_rate})
+        return [torch.optim.Adam(groups, self.config.learning_rate), *super().optimizers()]

@@ -7,7 +7,7 @@ import math
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import grid_sample, softplus
+from torch.nn.functional import grid_sample, interpolate, softplus
 
 from ...geometry import to_matrix
 
@@ -134,10 +134,13 @@ def lattice(side: int) -> Float[Tensor, "side side side 3"]:
 class VolumeDecoder(nn.Module):
     """TemplateVolume volume, inverse warp and the affine map of the whole from a code (section 4.2).
 
+    shared: voxels along each side of a volume that is added to the decoded one at every moment; 0: none
     viewed: colours depend on the camera's direction too; opacity does not
     """
 
-    def __init__(self, code: int, side: int, width: int, maps: int, warp_side: int, warp_width: int, viewed: bool):
+    def __init__(
+        self, code: int, side: int, width: int, maps: int, warp_side: int, warp_width: int, shared: int, viewed: bool
+    ):
         super().__init__()
         if viewed:
             self.colour: TemplateVolume | None = TemplateVolume(code + 3, 3, side, width)
@@ -146,12 +149,15 @@ class VolumeDecoder(nn.Module):
             self.colour, self.template = None, TemplateVolume(code, 4, side, width)
         self.warp = AffineMixture(code, maps, warp_side, warp_width) if maps else None
         self.whole = Affine(code, 1, warp_width, GLOBAL_SHIFT_SCALE)
+        self.shared = nn.Parameter(torch.zeros(1, 4, shared, shared, shared)) if shared else None
 
     def forward(self, code: Code, toward: Float[Tensor, " 3"]) -> tuple[Volume, Lattice | None]:
         """toward: unit direction from the volume to the camera"""
         raw = self.template(code)
         if self.colour is not None:
             raw = torch.cat([self.colour(torch.cat([code, toward[None]], 1)), raw], 1)
+        if self.shared is not None:
+            raw = self.shared + interpolate(raw, self.shared.shape[2:], mode="trilinear")
         colour = softplus(COLOUR_BIAS + COLOUR_SCALE * raw[:, :3]) / 255
         return torch.cat([colour, softplus(raw[:, 3:])], 1), None if self.warp is None else self.warp(code)
 
