@@ -63,7 +63,8 @@ class Config:
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
         """Lower bound of the bytes of a decoded volume's activations."""
-        return 4 * self.volume_resolution**3 * (4 + self.volume_width // 64) * (2 if learning else 1)
+        decoded = self.volume_resolution**3 * (4 + self.volume_width // 64)
+        return 4 * (decoded + 4 * self.shared_resolution**3) * (2 if learning else 1)
 
 
 class NeuralVolumes(RayMethod):
@@ -89,17 +90,19 @@ class NeuralVolumes(RayMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """Smaller pictures, volume and networks, and one moment in a step, at a higher learning rate."""
-        c = Config(encoder_size=64, encoder_width=16, code=64, volume_resolution=64, volume_width=256, affines=8)
+        """Smaller pictures and networks, one moment in a step, a higher learning rate, and a finer volume that all
+        moments share."""
+        c = Config(encoder_size=64, encoder_width=16, code=64, volume_resolution=32, volume_width=256, affines=8)
+        c = replace(c, shared_resolution=64)
         c = replace(c, warp_resolution=16, warp_width=64, background_size=32, samples=64, moments_per_step=1)
         return replace(c, rays_per_step=2048, learning_rate=2e-3, final_learning_rate=2e-4, decay_start=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
-        """Tiny pictures and a volume of 16 voxels a side, within some twenty quick steps."""
+        """Tiny pictures and volumes of 16 voxels a side, within some twenty quick steps."""
         c = Config(encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2)
         c = replace(c, warp_resolution=8, warp_width=8, background_size=8, samples=24, moments_per_step=1)
-        return replace(c, rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3)
+        return replace(c, shared_resolution=16, rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3)
 
     # Codes and volumes
 
@@ -242,4 +245,4 @@ class NeuralVolumes(RayMethod):
         groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if p is not shared]}]
         if shared is not None:
             groups.append({"params": [shared], "scale": self.config.shared_rate})
-        return [torch.optim.Adam(groups, self.config.learning_rate), *super().optimizers()]
+        return [torch.optim.Adam(groups, self.config.learning_rate, fused=True), *super().optimizers()]
