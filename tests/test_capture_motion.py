@@ -659,7 +659,7 @@ def test_one_photograph_is_an_intake_too():
 
 @pytest.mark.parametrize(("asked", "other"), [("incremental", "global"), ("global", "incremental")])
 @pytest.mark.parametrize("first", [0, 50])
-@pytest.mark.parametrize("count", [8, reconstruction.MAX_RETRIED + 1])
+@pytest.mark.parametrize("count", [8, reconstruction.MAX_THOROUGH + 1])
 def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeypatch, asked, other, first, count):
     """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once; and a
     wrong model has a small error too. Many photographs are not placed a third time."""
@@ -678,7 +678,7 @@ def test_where_matches_contradict_a_model_other_ways_are_tried(tmp_path, monkeyp
     work.database, work.options = tmp_path / "database.db", MotionOptions(mapper=asked)
     work.map, work.agreement = mapped, lambda *_: Agreement(100, shares[tried[-1]])
     work.photos = [photo("a.jpg")] * count
-    few = count <= reconstruction.MAX_RETRIED
+    few = count <= reconstruction.MAX_THOROUGH
     for _ in range(2):  # once it is there it stays
         work.place("key")
         assert tried == [(asked, 0), (other, 0), ("incremental", 1)][: 3 if few else 2]

@@ -76,7 +76,7 @@ MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must
 MIN_AGREEMENT = 0.8  # share of the matches, below which photographs are placed in other ways too
 NOTE_FILE = "note.txt"  # beside models that were made in another way than was asked for: why, in a sentence
 OTHER_SEEDS = 1, 2
-MAX_RETRIED = 400  # photographs up to which other first pairs are tried; mapping more takes tens of minutes
+MAX_THOROUGH = 400  # photographs up to which other first pairs are tried, and models adjusted as often as by COLMAP
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
 WAYS = {"incremental": "one by one", "global": "all at once"}
 SNAPSHOTS, MAX_SNAPSHOTS = "snapshots", 40  # folder among the work of models while cameras are placed, and their number
@@ -346,7 +346,7 @@ class Reconstruction:
         if self.stages.is_done("mapping", key) and self.models.is_dir() and largest(self.models) >= MIN_VIEWS:
             return
         asked = self.options.mapper
-        seeds = OTHER_SEEDS if len(self.photos) <= MAX_RETRIED else ()
+        seeds = OTHER_SEEDS if len(self.photos) <= MAX_THOROUGH else ()
         ways = [(asked, 0), (OTHER_MAPPER[asked], 0), *(("incremental", seed) for seed in seeds)]
         with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as chosen:
             found, matches = list[Agreement](), read_matches(self.database)
@@ -475,6 +475,7 @@ class Reconstruction:
             models=str(models),
             model=model and str(model),
             seed=seed,
+            seldom=len(self.names) > MAX_THOROUGH,
             snapshots=str(snapshots),
             snapshot_every=max(1, len(self.names) // MAX_SNAPSHOTS),
             calibrate=not (self.spherical or all(prior(group)[1] for group in self.groups)),

@@ -32,6 +32,7 @@ BLOCK_VIEWS = 16  # photographs whose features are written to the database toget
 BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the database
 MIN_MODEL_VIEWS = 3  # photographs of a model
 MAX_THREADS = 16  # more threads need more memory than they save time
+SELDOM_GROWTH, SELDOM_REFINEMENTS = 1.4, 2  # of a large model between two adjustments of all of it; COLMAP's are 1.1, 5
 MIN_ADDED_INLIERS = 18  # inliers that place a photograph in a finished model; COLMAP's 30 hold while it grows
 MIN_VIEW_POINTS = 15  # points that a placed photograph shows in the end, as two photographs must share to be compared
 MAX_ADJUSTMENT_STEPS = 10  # in a model that is adjusted already: more do not change the error of held-out tracks
@@ -122,12 +123,16 @@ def incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOpti
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = job["threads"], job["seed"]
     options.min_model_size = MIN_MODEL_VIEWS
+    if job.get("seldom"):
+        options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM_GROWTH
+        options.ba_global_max_refinements = SELDOM_REFINEMENTS
     return options
 
 
 def place_one_by_one(job: dict[str, Any]) -> None:
     """Incremental structure from motion (Schönberger and Frahm 2016), from the start or from a model, to which
-    photographs are added with fewer inliers: the model is there to contradict them."""
+    photographs are added with fewer inliers: the model is there to contradict them. seldom: adjust all of it at larger
+    steps of its growth, which spares most of the time of large models"""
     options, placed = incremental_options(job), 2
     options.snapshot_path, options.snapshot_frames_freq = job["snapshots"], job["snapshot_every"]
     if job["model"]:

@@ -30,7 +30,7 @@ from .appearance import SplatAppearance
 from .cloud import Cloud, picture_share, thinned
 from .dense_points import Points, compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl
-from .initialization import cloud_of, initial_cloud, random_cloud, surface_cloud
+from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
 from .interval_schedule import intervals
 from .moved_cloud import seen_from
 
@@ -88,7 +88,7 @@ class CloudMethod(Method, ABC):
 
     def compile_begin(self) -> None:
         super().compile_begin()
-        if self.config.initialization == "dense" or self.config.initialization == "sparse" and self.frame.is_open:
+        if may_sweep(self.config.initialization, self.frame):
             compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:

@@ -49,15 +49,19 @@ def initial_cloud(
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
         means, colours = sparse_points(scene, max_count, generator)
-    lacking = initialization == "sparse" and len(means) < 2 and scene.frame.is_open
     dense_count = math.ceil(MAX_DENSE_SHARE * max_count)
-    if lacking or initialization == "dense" and len(means) < dense_count:
+    if may_sweep(initialization, scene.frame) and len(means) < (dense_count if initialization == "dense" else 2):
         found = thinned((sweep or partial(seen_points, scene))())
         means, colours = with_dense_points(scene, means, colours, count, dense_count, generator, found)
     if len(means) < 2:
         means = random_points(scene, min(count, max_count), generator)
         colours = torch.rand(len(means), 3, generator=generator)
     return round_gaussians(means, colours, degree)
+
+
+def may_sweep(initialization: Initialization, frame: Frame) -> bool:
+    """Whether a cloud may begin with points of plane sweeps: always, or in a place without sparse points."""
+    return initialization == "dense" or initialization == "sparse" and frame.is_open
 
 
 def sparse_points(scene: Scene, max_count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -79,7 +79,8 @@ class NeuralVolumes(RayMethod):
             torch.manual_seed(c.seed)
             self.encoder = Encoder(c.encoder_cameras, c.encoder_size, c.encoder_width, c.code)
             warp = c.affines, c.warp_resolution, c.warp_width
-            self.decoder = VolumeDecoder(c.code, c.volume_resolution, c.volume_width, *warp, c.shared_resolution, c.view_dependence)
+            sides = c.shared_resolution, c.view_dependence
+            self.decoder = VolumeDecoder(c.code, c.volume_resolution, c.volume_width, *warp, *sides)
         self.rig = Rig(c.encoder_cameras, c.encoder_size)
         self.backgrounds = Backgrounds(frame, c.background_size, learns_background=not frame.has_alpha)
         self.decoded: tuple[Any, Any] = (None, None)  # of the last picture
