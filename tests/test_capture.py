@@ -527,6 +527,7 @@ def test_without_points_the_axes_tell_where_to_look():
     centre = np.array(frame.source_from_scene)[:3, 3]
     assert np.abs(centre).max() < 0.05 and frame.reach == 16
     assert assemble(Capture("x", capture.shots, reach=6.0)).frame.reach == 4
+    assert assemble(Capture("x", capture.shots, reach=0.5)).frame.reach == 16  # photographs show what is around
     assert 0.01 < frame.near < 1
 
 
