@@ -32,7 +32,8 @@ BLOCK_VIEWS = 16  # photographs whose features are written to the database toget
 BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the database
 MIN_MODEL_VIEWS = 3  # photographs of a model
 MAX_THREADS = 16  # more threads need more memory than they save time
-SELDOM_GROWTH, SELDOM_REFINEMENTS = 1.4, 2  # of a large model between two adjustments of all of it; COLMAP's are 1.1, 5
+SELDOM_GROWTH = 1.4  # of a large model between two adjustments of all of it; COLMAP's is 1.1
+SELDOM_REFINEMENTS, SELDOM_STEPS = 2, 15  # passes of such an adjustment and their steps; COLMAP's are 5 and 50
 MIN_ADDED_INLIERS = 18  # inliers that place a photograph in a finished model; COLMAP's 30 hold while it grows
 MIN_VIEW_POINTS = 15  # points that a placed photograph shows in the end, as two photographs must share to be compared
 MAX_ADJUSTMENT_STEPS = 10  # in a model that is adjusted already: more do not change the error of held-out tracks
@@ -125,7 +126,7 @@ def incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOpti
     options.min_model_size = MIN_MODEL_VIEWS
     if job.get("seldom"):
         options.ba_global_frames_ratio = options.ba_global_points_ratio = SELDOM_GROWTH
-        options.ba_global_max_refinements = SELDOM_REFINEMENTS
+        options.ba_global_max_refinements, options.ba_global_max_num_iterations = SELDOM_REFINEMENTS, SELDOM_STEPS
     return options
 
 
