@@ -10,7 +10,7 @@ from typing import Any
 
 PAGES = {  # method, scene, seconds of training
     "splats": ("gaussian-splatting", "procedural:still-life", 60),
-    "moving": ("deformable-splatting", "procedural:jelly", 90),
+    "moving": ("deformable-splatting", "procedural:jelly,sweeps=12", 90),
     "volume": ("instant-ngp", "procedural:still-life", 60),
 }
 

@@ -28,7 +28,7 @@ from .table import size
 
 PAGE, LOG = "gallery.html", "captions.log"
 MESH, PICTURE, CAPTIONS = "data/knot.ply", "data/picture.png", "data/captions"
-OBJECT, MOVING = "procedural:still-life,size=160,views=40", "procedural:jelly,size=100,views=60"
+OBJECT, MOVING = "procedural:still-life,size=160,views=40", "procedural:jelly,size=100,views=60,sweeps=8"
 TOYS, CHAIRS = "procedural:toys,count=20,size=48,views=12", "procedural:chairs,count=20,size=48,views=12"
 RECORDING = "procedural:room,depth,views=60,size=120"
 EVAL_VIEWS = 3
@@ -138,7 +138,7 @@ SECTIONS: dict[str, dict[str, Showpiece]] = {
         ),
         "nsff": Showpiece(MOVING, "Scene flow between moments.", "19.53 dB, DyCheck, masked (Li 2021)"),
         "neural-volumes": Showpiece(
-            "procedural:jelly,rig=6,size=80,views=60", "Photographs of a moment become a warped volume."
+            "procedural:jelly,rig=12,size=80,views=120", "Photographs of a moment become a warped volume."
         ),
         "deformable-splatting": Showpiece(
             MOVING, "Gaussians moved by planes of space and time.", "34.05 dB, D-NeRF's eight scenes (Wu 2024)"
