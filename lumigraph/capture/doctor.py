@@ -52,7 +52,7 @@ class Finding:
 
     photograph: its name; empty for the whole capture
     fault:      in a few words
-    evidence:   the measurement
+    evidence:   the measurement; empty for that of the finding before
     advice:     what to do, with the command where there is one
     """
 
@@ -63,7 +63,7 @@ class Finding:
 
     def __str__(self) -> str:
         name = f"{self.photograph}: " if self.photograph else ""
-        return f"{name}{self.evidence}{'; ' if self.advice else ''}{self.advice}"
+        return name + "; ".join(filter(None, (self.evidence, self.advice)))
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def findings(
     turned = poses if upright is None else upright @ poses
     if capture.bounds is None and (around := coverage([shot.name for shot in shots], turned)) is not None:
         covered = f"photographs cover {around.degrees:.0f} of 360 degrees around the subject"
-        found += [Finding("", LACKING, covered, advice) for advice in around.advice]
+        found += [Finding("", LACKING, "" if i else covered, advice) for i, advice in enumerate(around.advice)]
     return found
 
 
