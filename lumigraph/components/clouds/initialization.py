@@ -60,7 +60,7 @@ def initial_cloud(
 
 
 def may_sweep(initialization: Initialization, frame: Frame) -> bool:
-    """Whether a cloud may begin with points of plane sweeps: always, or in a place without sparse points."""
+    """True if a cloud may begin with points of plane sweeps: a dense one, or one of a place without sparse points."""
     return initialization == "dense" or initialization == "sparse" and frame.is_open
 
 
