@@ -59,7 +59,7 @@ def main(options: Options) -> None:
 
 @torch.no_grad()
 def singular_values(method: Nerfies, scene: Scene) -> np.ndarray:
-    """Of the Jacobian of the motion at points of surfaces, all three of each."""
+    """Singular values of the motion's Jacobian at points of surfaces, three of each point."""
     random, found = np.random.default_rng(0), list[Tensor]()
     motion = method.network.motion
     assert motion is not None

@@ -232,3 +232,5 @@ def test_photographs_with_the_same_fault_stand_in_one_line():
         "left out": ["a.jpg, b.jpg: in another group of 2; retake it", "c.jpg: black; retake it"],
         "floaters": ["3 of 9"],
     }
+    around = [Finding("", LACKING, "half is covered", f"{side} more") for side in ("one", "two")]
+    assert grouped(around) == {LACKING: ["half is covered; one more", "two more"]}

@@ -52,7 +52,7 @@ class Finding:
 
     photograph: its name; empty for the whole capture
     fault:      in a few words
-    evidence:   the measurement; empty for that of the finding before
+    evidence:   the measurement
     advice:     what to do, with the command where there is one
     """
 
@@ -63,7 +63,7 @@ class Finding:
 
     def __str__(self) -> str:
         name = f"{self.photograph}: " if self.photograph else ""
-        return name + "; ".join(filter(None, (self.evidence, self.advice)))
+        return f"{name}{self.evidence}{'; ' if self.advice else ''}{self.advice}"
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def findings(
     turned = poses if upright is None else upright @ poses
     if capture.bounds is None and (around := coverage([shot.name for shot in shots], turned)) is not None:
         covered = f"photographs cover {around.degrees:.0f} of 360 degrees around the subject"
-        found += [Finding("", LACKING, "" if i else covered, advice) for i, advice in enumerate(around.advice)]
+        found += [Finding("", LACKING, covered, advice) for advice in around.advice]
     return found
 
 
@@ -365,12 +365,18 @@ def deviations(values: Array, least: float) -> Array:
 
 
 def grouped(found: Sequence[Finding]) -> dict[str, list[str]]:
-    """Lines for display, by fault; photographs with the same evidence and advice in one line."""
+    """Lines for display, by fault; photographs with the same evidence and advice in one line. Evidence on the whole
+    capture that the line before has given is not repeated."""
     lines: dict[str, dict[Finding, list[str]]] = {}
     for finding in found:
         alike = lines.setdefault(finding.fault, {})
         alike.setdefault(replace(finding, photograph=""), []).append(finding.photograph)
-    return {
-        fault: [str(replace(finding, photograph=", ".join(filter(None, names)))) for finding, names in alike.items()]
-        for fault, alike in lines.items()
-    }
+    told: dict[str, list[str]] = {}
+    for fault, alike in lines.items():
+        given = ""
+        for finding, photographs in alike.items():
+            names = ", ".join(filter(None, photographs))
+            again = not names and finding.evidence == given
+            told.setdefault(fault, []).append(finding.advice if again else str(replace(finding, photograph=names)))
+            given = finding.evidence
+    return told

@@ -81,7 +81,7 @@ def find_place(
     moves = cameras.time is not None and len(cameras.time.unique()) > 1
     box = None if found is None else hull_box(found[0], gaze.centre, gaze.distance, moves)
     if found is None or box is None:
-        return open_place(capture, upright, gaze, background, images.may_have_masks)
+        return open_place(capture, images, upright, gaze, background)
     return object_place(upright, box, turned, capture.background or found[1])
 
 
@@ -197,12 +197,11 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
 
 
 def open_place(
-    capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector, masked: bool = False
+    capture: Capture, images: ImageStore, upright: np.ndarray, gaze: Gaze, background: Vector
 ) -> ScenePlacement:
     """A room or the open: a box in the middle of what is looked at, and cubes around it as far as the points go.
 
-    masked: whether masks may leave out what lies around an object. If not, the photographs show it, and a stated reach
-            of the object alone is not taken.
+    A stated reach of an object alone is taken only where masks may leave out what lies around it.
     """
     centre, half = gaze.centre, gaze.half
     reach = DEFAULT_REACH
@@ -213,7 +212,7 @@ def open_place(
     elif all(shot.depths is not None for shot in capture.shots):
         farthest = max(shot.depths[1] for shot in capture.shots if shot.depths is not None)
         reach = power_of_two((farthest + gaze.distance) / half)
-    if capture.reach is not None and (masked or capture.reach > half):
+    if capture.reach is not None and (images.may_have_masks or capture.reach > half):
         reach = power_of_two(capture.reach / half)
     near = NEAR_SCALE * gaze.nearest if capture.near is None else capture.near
     frame = Frame(UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
