@@ -26,6 +26,7 @@ from lumigraph.files import write_bytes
 from lumigraph.geometry import evenly
 from lumigraph.methods.nerfies import Nerfies
 from lumigraph.run import build
+from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
 PHOTOGRAPHS, POINTS = 12, 400  # that are looked at; points of each
@@ -46,7 +47,7 @@ def main(options: Options) -> None:
         config = Nerfies.cpu_preset()
         config = replace(config, deformation=replace(config.deformation, elastic_weight=weight))
         method = build(methods.find("nerfies"), scene.frame, config, torch.device("cpu"), 0, learning=True)
-        fit(method, scene, steps=options.steps, show=False)
+        go_on_unless(fit(method, scene, steps=options.steps, show=False).signal)
         values, psnr = singular_values(method, scene), evaluate(method, scene, views=8).psnr
         name = f"weight {weight:g}"
         told = ", ".join(f"{100 * q:g} %: {np.quantile(values, q):.3f}" for q in QUANTILES)
