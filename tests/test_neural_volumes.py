@@ -18,6 +18,7 @@ from lumigraph.methods.neural_volumes.networks import (
     SHIFT_SCALE,
     TURN_SCALE,
     AffineMixture,
+    Decoded,
     divergence,
     lattice,
     opacity_prior,
@@ -51,9 +52,9 @@ def test_opacity_adds_up_along_a_ray_to_one_at_most():
     for layer in (method.decoder.whole.turn, method.decoder.whole.growth, method.decoder.whole.shift):
         layer[-1].weight.zero_()
     for density, expected in ((0.2, 0.4), (0.4, 0.8), (3.0, 1.0)):  # over two units
-        volume = torch.full((1, 4, 8, 8, 8), density)
-        volume[:, :3] = 0.25
-        light, opacity, depth = method.march(rays, (code, volume, None))
+        volume = torch.full((8, 8, 8, 4), density)
+        volume[..., :3] = 0.25
+        light, opacity, depth = method.march(rays, Decoded(code, volume, None))
         torch.testing.assert_close(opacity, torch.full((2,), expected), atol=5e-3, rtol=0)
         torch.testing.assert_close(light, 0.25 * opacity[:, None].expand(2, 3))
         reach = min(2.0, 1 / density)
@@ -89,7 +90,7 @@ def test_priors_are_those_of_their_distributions():
     sides = torch.tensor([0.0, 1.0]), torch.tensor([0.5]), torch.tensor([0.2])
     clear, half, fifth = (float(opacity_prior(x)) for x in sides)
     assert clear == pytest.approx(0, abs=1e-6) and 0 < fifth < half
-    flat, rough = torch.ones(1, 4, 4, 4, 4), torch.rand(1, 4, 4, 4, 4)
+    flat, rough = torch.ones(4, 4, 4, 4), torch.rand(4, 4, 4, 4)
     assert float(opacity_roughness(flat)) == pytest.approx(1e-5**0.5) and float(opacity_roughness(rough)) > 0.1
 
 
@@ -160,8 +161,24 @@ def test_colours_depend_on_the_camera_alone_where_views_count():
     method = begun(view_dependence=True)
     code = method.code_at(1.0)
     (a, _), (b, _) = (method.decoder(code, torch.tensor(d)) for d in ([1.0, 0, 0], [0.0, 1, 0]))
-    assert torch.equal(a[:, 3], b[:, 3]) and not torch.allclose(a[:, :3], b[:, :3])
+    assert torch.equal(a[..., 3], b[..., 3]) and not torch.allclose(a[..., :3], b[..., :3])
     terms = method.train().loss(method.batch(rig_scene(), torch.Generator().manual_seed(0)), 0)
     assert all(term.isfinite() for term in terms.values())
     torch.stack(list(terms.values())).sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in method.parameters())
+
+
+def test_what_cannot_be_seen_is_not_looked_up():
+    """A body in a corner, warped: what is looked up near it is what is looked up everywhere."""
+    method, places = begun(), lattice(21).view(-1, 3)
+    with torch.no_grad():
+        volume = torch.rand(16, 16, 16, 4)
+        volume[..., 3] = 0
+        volume[8:14, 8:14, 8:14, 3] = 20
+        everywhere = method.volume_at(1.0, torch.tensor([0.0, 0.0, 1.0]))._replace(volume=volume, rough=None)
+        there = method.decoder.with_rough(everywhere)
+        alpha, rgb = method.decoder.look_up(everywhere, places)
+        found, colour = method.decoder.look_up(there, places)
+    torch.testing.assert_close(found, alpha, atol=0.1, rtol=0)
+    torch.testing.assert_close(colour[found > 0], rgb[found > 0])
+    assert int((found == 0).sum()) > len(places) // 2

@@ -123,11 +123,11 @@ class NeuralVolumes(RayMethod):
         return torch.lerp(self.encoded(before)[0], self.encoded(after)[0], share)
 
     def volume_at(self, time: float, toward: Float[Tensor, " 3"]) -> Decoded:
-        """Code, volume and warp of a moment as pictures show it; the last one is kept."""
+        """A moment as pictures show it; the last one is kept."""
         key = time, toward.tolist() if self.config.view_dependence else None, self.encoder.mean.weight._version
         if self.decoded[0] != key:
             code = self.code_at(time)
-            self.decoded = key, (code, *self.decoder(code, toward))
+            self.decoded = key, self.decoder.with_rough(Decoded(code, *self.decoder(code, toward)))
         return self.decoded[1]
 
     @property
@@ -224,7 +224,7 @@ class NeuralVolumes(RayMethod):
             groups = self.by_camera(rays) if c.view_dependence else [torch.arange(len(rays), device=self.device)]
             for group in groups:
                 some, volume = rays[group], self.decoder(code, self.toward(rays.origins[group]))
-                light, opacity, _ = self.march(some, (code, *volume), generator)
+                light, opacity, _ = self.march(some, Decoded(code, *volume), generator)
                 seen = over(light, opacity, self.backgrounds.colours(some, self.background))
                 error = (seen - target[own][group]).square().mean() * (len(group) / len(target))
                 terms["image"] = terms["image"] + error

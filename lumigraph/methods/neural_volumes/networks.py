@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample, interpolate, softplus
 
+from ... import kernels
 from ...geometry import to_matrix
 
 SLOPE = 0.2  # of leaky ReLUs
@@ -17,11 +19,21 @@ COLOUR_SCALE, COLOUR_BIAS = 25.0, 100.0  # of the decoder's colours, which are t
 TURN_SCALE, SHIFT_SCALE, GROWTH_SCALE = 0.1, 0.1, 0.05  # of the affine maps' quaternions, shifts and log scales
 GLOBAL_SHIFT_SCALE = 0.025  # of the map of the whole volume
 MIN_WEIGHT = 1e-3  # of all affine maps together at a place
+CELLS, FAINT = 64, 0.01  # along each side of the rough lattice; opacity per unit that is not seen
 
 Code = Float[Tensor, "1 code"]
-Volume = Float[Tensor, "1 4 side side side"]  # colours and opacity per unit of coordinates; axes z, y, x
-Decoded = tuple[Tensor, Tensor, Tensor | None]  # a code, its volume and its warp
-Lattice = Float[Tensor, "1 cell cell cell 3"]  # places in the template; axes z, y, x
+Volume = Float[Tensor, "x y z 4"]  # colours and opacity per unit of coordinates, whose outermost voxels are at -1 and 1
+Lattice = Float[Tensor, "i j k 3"]  # places in the template
+CUBE = torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+class Decoded(NamedTuple):
+    """A moment. rough: opacity on a coarse lattice, and where it is faint nothing is looked up; None: all is"""
+
+    code: Code
+    volume: Volume
+    warp: Lattice | None
+    rough: Float[Tensor, "u v w 1"] | None = None
 
 
 def dense(*widths: int) -> nn.Sequential:
@@ -118,17 +130,16 @@ class AffineMixture(nn.Module):
         self.register_buffer("places", lattice(side), persistent=False)
 
     def forward(self, code: Code) -> Lattice:
-        moved = self.maps(code, self.places)  # (map, z, y, x, 3)
+        moved = self.maps(code, self.places)  # (map, x, y, z, 3)
         weights = self.weights(code).view(len(moved), 1, self.side, self.side, self.side).exp()
         there = grid_sample(weights, moved, padding_mode="border", align_corners=True)[:, 0, ..., None]
-        return ((there * moved).sum(0) / there.sum(0).clamp_min(MIN_WEIGHT))[None]
+        return (there * moved).sum(0) / there.sum(0).clamp_min(MIN_WEIGHT)
 
 
 def lattice(side: int) -> Float[Tensor, "side side side 3"]:
-    """Coordinates (x, y, z) in [-1, 1] of a cube's cells, whose axes are z, y, x."""
+    """Coordinates in [-1, 1] of a cube's cells."""
     line = torch.linspace(-1, 1, side)
-    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    return torch.stack([x, y, z], -1)
+    return torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)
 
 
 class VolumeDecoder(nn.Module):
@@ -158,27 +169,48 @@ class VolumeDecoder(nn.Module):
             raw = torch.cat([self.colour(torch.cat([code, toward[None]], 1)), raw], 1)
         if self.shared is not None:
             raw = self.shared + interpolate(raw, self.shared.shape[2:], mode="trilinear")
-        colour = softplus(COLOUR_BIAS + COLOUR_SCALE * raw[:, :3]) / 255
-        return torch.cat([colour, softplus(raw[:, 3:])], 1), None if self.warp is None else self.warp(code)
+        raw = raw[0].movedim(0, -1)
+        colour = softplus(COLOUR_BIAS + COLOUR_SCALE * raw[..., :3]) / 255
+        return torch.cat([colour, softplus(raw[..., 3:])], -1), None if self.warp is None else self.warp(code)
+
+    @torch.no_grad()
+    def with_rough(self, decoded: Decoded) -> Decoded:
+        """The same with opacity on a coarse lattice."""
+        opacity = decoded.volume[..., 3:]
+        if len(opacity) > CELLS:  # so that no voxel lies unseen between places of the lattice
+            opacity = interpolate(opacity.movedim(-1, 0)[None], (CELLS,) * 3, mode="area")[0].movedim(0, -1)
+        places = lattice(CELLS).to(opacity)
+        return decoded._replace(
+            rough=sampled(opacity, self.warped(decoded, places.view(-1, 3))).view(*places.shape[:3], 1)
+        )
 
     def look_up(
         self, decoded: Decoded, places: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Opacity per unit and colour at places: of the template where the whole's map and the warp lead; nothing
         outside of [-1, 1]^3."""
-        code, volume, warp = decoded
-        there = self.whole(code, places)[0][None, None, None]
-        if warp is not None:
-            there = grid_sample(warp.permute(0, 4, 1, 2, 3), there, padding_mode="border", align_corners=True)
-            there = there.permute(0, 2, 3, 4, 1)
-        found = grid_sample(volume, there, align_corners=True)[0, :, 0, 0].T
         inside = (places.abs() <= 1).all(-1)
-        return torch.where(inside, found[:, 3], 0.0), found[:, :3]
+        if decoded.rough is None:
+            found = sampled(decoded.volume, self.warped(decoded, places))
+            return torch.where(inside, found[:, 3], 0.0), found[:, :3]
+        seen = (inside & (sampled(decoded.rough, places)[:, 0] > FAINT)).nonzero()[:, 0]
+        found = places.new_zeros(len(places), 4)
+        found[seen] = sampled(decoded.volume, self.warped(decoded, places[seen]))
+        return found[:, 3], found[:, :3]
+
+    def warped(self, decoded: Decoded, places: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Where the whole's map and the warp lead."""
+        there = self.whole(decoded.code, places)[0]
+        return there if decoded.warp is None else sampled(decoded.warp, there)
+
+
+def sampled(grid: Float[Tensor, "x y z channel"], places: Float[Tensor, "point 3"]) -> Float[Tensor, "point channel"]:
+    return kernels.dense_grid(places, grid, CUBE.to(places))
 
 
 def opacity_roughness(volume: Volume) -> Float[Tensor, ""]:
     """Total variation of the logarithm of a volume's opacity (section 5.4)."""
-    log = (1e-5 + volume[0, 3]).log()
+    log = (1e-5 + volume[..., 3]).log()
     corner = log[:-1, :-1, :-1]
     steps = torch.stack([log[1:, :-1, :-1] - corner, log[:-1, 1:, :-1] - corner, log[:-1, :-1, 1:] - corner])
     return (1e-5 + steps.square().sum(0)).sqrt().mean()
