@@ -1,10 +1,12 @@
-"""Tables of methods in README.md and docs/, made of benchmarks/results/methods-cpu.json.
+"""Tables of methods in README.md and docs/, made of benchmarks/results/.
 
     python benchmarks/tables.py                                             write the tables anew
     python benchmarks/tables.py --collect OUTPUT OUTPUT --commit COMMIT     collect the figures first
+    python benchmarks/tables.py --gallery OUTPUT --commit COMMIT            the gallery's
 
-OUTPUT is a folder of `lumigraph bench methods`, COMMIT the one it ran. A table is between two comments of a page:
-`table: methods` has a row for each method, `table: cells` one for each training. Names of methods behind that word
+OUTPUT is a folder of `lumigraph bench methods` or of `lumigraph gallery`, COMMIT the one it ran. A table is between two
+comments of a page: `table: methods` has a row for each method, `table: cells` one for each training, `table: gallery`
+one for each method of the gallery, `table: sections` one for each of its sections. Names of methods behind that word
 choose rows; `<!-- end of table -->` ends it. Below it are the commit, the machine, and the commands of those rows.
 """
 
@@ -20,10 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from lumigraph import methods
+from lumigraph.benchmark.gallery import SECTIONS, SHOWPIECES
 from lumigraph.benchmark.table import protocol, published, size, trained_for
+from lumigraph.metrics import scores_of
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
+GALLERY = RESULTS.with_name("gallery-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
 Row = dict[str, Any]
@@ -32,17 +37,25 @@ Row = dict[str, Any]
 @dataclass(frozen=True)
 class Options:
     collect: tuple[Path, ...] = ()  # outputs of `lumigraph bench methods`
+    gallery: tuple[Path, ...] = ()  # output of `lumigraph gallery`
     commit: str = ""  # that they ran
 
     def run(self) -> None:
-        if self.collect:
-            RESULTS.write_text(json.dumps(collected(self.collect, self.commit), indent=1) + "\n", "utf-8")
-        results = json.loads(RESULTS.read_text("utf-8"))
+        for outputs, path in ((self.collect, RESULTS), (self.gallery, GALLERY)):
+            if outputs:
+                path.write_text(json.dumps(collected(outputs, self.commit), indent=1) + "\n", "utf-8")
+        results = read()
         for page in pages():
             text = page.read_text("utf-8")
             if (new := filled(text, page, results)) != text:
                 page.write_text(new, "utf-8")
                 print(page.relative_to(ROOT))
+
+
+def read() -> dict[str, Any]:
+    """Results of `lumigraph bench methods`, and the gallery's as a part of them."""
+    results: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
+    return results | {"gallery": json.loads(GALLERY.read_text("utf-8"))}
 
 
 def pages() -> list[Path]:
@@ -89,14 +102,18 @@ def filled(text: str, page: Path, results: dict[str, Any]) -> str:
 
     def table(match: re.Match[str]) -> str:
         names = match[3].split()
-        if match[2] not in KINDS or not {*names} <= {*methods.available()}:
+        kind = match[2]
+        if kind not in KINDS or not {*names} <= {*methods.available()}:
             raise SystemExit(f"{page.name}: `{match[0].splitlines()[0]}` names an unknown table or method")
-        cells = [row for row in results["cells"] if not names or row["method"] in names]
+        of = results["gallery"] if kind in OF_GALLERY else results
+        cells = [row for row in of["cells"] if not names or row["method"] in names]
         if not cells:
             return f"{match[1]}Not measured.\n"
-        rows = KINDS[match[2]](cells, page)
-        about = f"Commit `{results['commit']}`; {results['machine'].removeprefix('cpu, ')}, no GPU. {scenes_of(cells)}"
-        return "\n".join([match[1].rstrip(), *rows, "", about, "", "```", *commands(cells), "```", ""])
+        about = f"Commit `{of['commit']}`; {of['machine'].removeprefix('cpu, ')}, no GPU."
+        lines = [f"lumigraph gallery --seconds {cells[0]['budget']['seconds']:g}"]
+        if kind not in OF_GALLERY:
+            about, lines = f"{about} {scenes_of(cells)}", commands(cells)
+        return "\n".join([match[1].rstrip(), *KINDS[kind](cells, page), "", about, "", "```", *lines, "```", ""])
 
     return TABLE.sub(table, text)
 
@@ -141,7 +158,38 @@ def by_cell(cells: Sequence[Row], page: Path) -> list[str]:
     return markdown(rows)
 
 
-KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {"methods": by_method, "cells": by_cell}
+def by_section(cells: Sequence[Row], page: Path) -> list[str]:
+    """Methods of each section of the gallery, with their own scores."""
+    rows = [["", "methods, and their scores after a minute of training"]]
+    for title, section in SECTIONS.items():
+        found = [f"{link(row['method'], page)} {headline(row)}" for row in cells if row["method"] in section]
+        if found:
+            rows.append([title, ", ".join(found)])
+    return markdown(rows)
+
+
+def by_showpiece(cells: Sequence[Row], page: Path) -> list[str]:
+    """Each method of the gallery: data, score, time, and the published figure with its protocol."""
+    rows = [["method", "paper", "smallest data", "score", "training, s", "model", "published"]]
+    for row in cells:
+        told = [f"`{SHOWPIECES[row['method']].source}`", headline(row), f"{row['training_seconds']:.0f}"]
+        told += [size(row["model_bytes"]), SHOWPIECES[row["method"]].known]
+        rows.append([link(row["method"], page), paper(row["method"]), *told])
+    return markdown(rows)
+
+
+def headline(row: Row) -> str:
+    """The first score of a method, whatever it is measured by."""
+    return next((f"{score}" if score.unit == "dB" else f"{score.name} {score}" for score in scores_of(row)), "")
+
+
+KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
+    "methods": by_method,
+    "cells": by_cell,
+    "sections": by_section,
+    "gallery": by_showpiece,
+}
+OF_GALLERY = "sections", "gallery"
 
 
 def scenes_of(cells: Sequence[Row]) -> str:

@@ -61,7 +61,7 @@ def test_eval_writes_what_programs_read(trained, capsys):
     assert json.loads((trained / "eval-train.json").read_text())["protocol"]["views"] == 9
 
 
-@pytest.mark.parametrize("path", ["orbit", "sweep", "spiral", "interpolate", "held-out"])
+@pytest.mark.parametrize("path", ["orbit", "sweep", "spiral", "interpolate", "still", "held-out"])
 def test_render_needs_no_photographs(trained, tmp_path, monkeypatch, path):
     monkeypatch.setattr(Run, "scene", lambda self, source=None: pytest.fail("asked for photographs"))
     output = tmp_path / f"{path}.mp4"

@@ -15,7 +15,7 @@ from .compress import size as file_size
 from .options import Animate, DeviceOption, Overwrite, Set, animate, needed, open_method, option
 
 # As in `paths`, which help must not import.
-PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
+PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "still", "held-out")
 MAX_SIZE, MAX_RAYS_SIZE, AUTO = 1280, 640, "auto"  # pixels by default, of Gaussians and of methods that cast rays
 SIZES = f"that of the photographs, at most {MAX_SIZE}, and {MAX_RAYS_SIZE} for methods that cast rays"
 CHOSEN = {
@@ -30,8 +30,9 @@ class Render:
 
     Paths stay near the positions of the photographs. orbit goes round (or to and fro). sweep is an oval among cameras
     that look the same way, as from a drone. auto is one of these two. spiral goes twice round while rising, interpolate
-    passes smoothly through the photographs' cameras, held-out visits the test photographs' own cameras. A path of your
-    own is a JSON file: keyframes saved in the viewer, or the JSON beside a film of the same capture.
+    passes smoothly through the photographs' cameras, still stays at the one in their middle, held-out visits the test
+    photographs' own cameras. A path of your own is a JSON file: keyframes saved in the viewer, or the JSON beside a film
+    of the same capture.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]

@@ -16,7 +16,7 @@ from .keyframes import CameraPath
 
 DEFAULT_SIZE = 480  # pixels of a film by default
 DEFAULT_FRAMES = 120  # of a film along a path without a length
-PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
+PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "still", "held-out")
 
 
 def film_cameras(

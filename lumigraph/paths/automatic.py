@@ -229,6 +229,11 @@ def sweep(around: Surroundings, frames: int) -> Poses:
     return look_at(position, unit(near @ around.forward), up)
 
 
+def still(around: Surroundings, frames: int) -> Poses:
+    """The photograph's camera that is nearest to the middle of all, for what moves by itself."""
+    return around.cameras.pose[around.middle].double().cpu().expand(frames, 3, 4)
+
+
 def fitting(cameras: Camera, frame: Frame) -> str:
     """The path of `PATHS` that a capture supports: a sweep where cameras look the same way, else an orbit."""
     return "sweep" if Surroundings(cameras, frame).alike else "orbit"
@@ -239,6 +244,7 @@ PATHS: dict[str, Callable[[Surroundings, int], Poses]] = {
     "sweep": sweep,
     "spiral": spiral,
     "interpolate": interpolate,
+    "still": still,
 }
 
 
