@@ -102,6 +102,8 @@ def test_weights_begin_at_the_nearest_bone_and_sum_to_one():
     weights = volume(points)
     torch.testing.assert_close(weights.sum(1), torch.ones(3))
     assert weights[0, 0] > 0.95 and weights[1, 1] > 0.95 and 0.2 < weights[2, 0] < 0.8
+    far = volume(torch.tensor([[0.8, 0.0, -0.35], [0.8, 0.0, 0.35]]))  # twelve deviations away from all bones
+    assert far[0, 0] > 0.95 and far[1, 1] > 0.95
     coded = WeightVolume(frame(), replace(SHARP, weight_code=4))
     torch.testing.assert_close(coded.weights(), volume.weights(), atol=1e-3, rtol=1e-2)
     away = distance(torch.tensor([[1.0, 0, 0.5], [0, 0, 2.0]]), torch.zeros(1, 3), torch.tensor([[0, 0, 1.0]]))
@@ -220,3 +222,14 @@ def test_a_scene_of_two_bodies_can_show_contact():
     assert {control.name for control in method.controls} >= {"time", "pose", "show"}
     assert not torch.equal(method.given(show="contact").render(camera).rgb, method.render(camera).rgb)
     assert set(method.body_of(method.filtered()).tolist()) == {0, 1}
+
+
+def test_a_body_of_one_bone_begins_around_it():
+    """How far it reaches nothing tells; a share of the way to the next body is tried."""
+    alone = replace(skeleton(), parents=(-1, -1))
+    method = ArticulatedSplatting(replace(frame(), skeleton=alone), ArticulatedSplatting.smallest())
+    means = method.skin.first_means(2000, torch.Generator().manual_seed(0))
+    joints = alone.rest.matrices[:, :, 3].float()
+    nearest = torch.cdist(means, joints)
+    torch.testing.assert_close(means.std(0)[:2], torch.full((2,), 0.25 * 0.4), rtol=0.1, atol=0)
+    assert float((nearest[:, 0] < nearest[:, 1]).float().mean()) == pytest.approx(0.5, abs=0.05)

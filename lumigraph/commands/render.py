@@ -31,8 +31,8 @@ class Render:
     Paths stay near the positions of the photographs. orbit goes round (or to and fro). sweep is an oval among cameras
     that look the same way, as from a drone. auto is one of these two. spiral goes twice round while rising, interpolate
     passes smoothly through the photographs' cameras, still stays at the one in their middle, held-out visits the test
-    photographs' own cameras. A path of your own is a JSON file: keyframes saved in the viewer, or the JSON beside a film
-    of the same capture.
+    photographs' own cameras. A path of your own is a JSON file: keyframes saved in the viewer, or the JSON beside a
+    film of the same capture.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]

@@ -45,6 +45,7 @@ class CaptionNumbers:
     things_weight: NonNegative = 2.0  # weight of the loss that names each thing of a picture; 0: off
     perturbation: Share = 8 / 255  # largest change of a colour against the model; 0 is faster, its gradients are noise
     perturbed_from: Share = 0.8  # share of the steps after which pictures are perturbed
+    distorted: Share = 0.5  # pictures of other colours or in pieces, for each of the batch; captions learn to tell them
     seed: Seed = 0
 
 
@@ -107,8 +108,10 @@ def learn_captions(n: CaptionNumbers) -> Learned:
         if n.perturbation and step >= n.perturbed_from * n.steps:
             pictures = perturbed(network, pictures, said.detach(), n.perturbation, generator)
         optimizer.zero_grad()
-        seen = network.of_pictures(pictures)
-        loss = contrast(network, seen, said) + n.things_weight * thing_loss(network.scale * head(seen), there[own])
+        wrong = distorted(pictures[: round(n.distorted * len(pictures))], generator)
+        seen = network.of_pictures(torch.cat([pictures, wrong]))
+        things = thing_loss(network.scale * head(seen[: len(pictures)]), there[own])
+        loss = contrast(network, seen, said, len(pictures)) + n.things_weight * things
         loss.backward()
         optimizer.step()
         schedule.step()
@@ -130,13 +133,33 @@ def different(same: Int[Tensor, " picture"], count: int, generator: torch.Genera
 
 
 def contrast(
-    network: Clip, seen: Float[Tensor, "picture embedding"], said: Float[Tensor, "caption embedding"]
+    network: Clip, seen: Float[Tensor, "picture embedding"], said: Float[Tensor, "caption embedding"], count: int
 ) -> Tensor:
-    """The symmetric contrastive loss (Radford 2021, figure 3) of embeddings. said: of each picture's caption in turn,
-    then of captions of no picture here"""
+    """The symmetric contrastive loss (Radford 2021, figure 3) of embeddings.
+
+    seen: of pictures, then of pictures that no caption describes
+    said: of captions, then of captions of no picture here; the first `count` of both belong together
+    """
     logits = network.scale * seen @ said.T
-    own = torch.arange(len(seen), device=logits.device)
-    return 0.5 * (cross_entropy(logits, own) + cross_entropy(logits[:, : len(seen)].T, own))
+    own = torch.arange(count, device=logits.device)
+    return 0.5 * (cross_entropy(logits[:count], own) + cross_entropy(logits[:, :count].T, own))
+
+
+def distorted(
+    pictures: Float[Tensor, "picture 3 side side"], generator: torch.Generator
+) -> Float[Tensor, "picture 3 side side"]:
+    """Pictures in wrong colours, each channel another one and inverted or not, or cut into quarters that change places.
+
+    Without them a model may take a colour that no thing has, cyan, for any of them.
+    """
+    count, half = len(pictures), pictures.shape[-1] // 2
+    channels = torch.stack([torch.randperm(3, generator=generator) for _ in range(count)])
+    inverted = torch.rand(count, 3, 1, 1, generator=generator) < 0.5
+    inverted[(channels == torch.arange(3)).all(1)] = True
+    recoloured = pictures.gather(1, channels[:, :, None, None].expand_as(pictures))
+    recoloured = torch.where(inverted, 1 - recoloured, recoloured)
+    cut = torch.roll(pictures, (half, half), (2, 3))
+    return torch.where(torch.rand(count, 1, 1, 1, generator=generator) < 0.75, recoloured, cut)
 
 
 def thing_loss(logits: Float[Tensor, "picture thing"], there: Bool[Tensor, "picture thing"]) -> Tensor:
@@ -164,7 +187,7 @@ def perturbed(
     """Pictures changed against the model by one step from a random start (Wong 2020). most: change of a colour"""
     start = most * (2 * torch.rand(pictures.shape, generator=generator) - 1)
     changed = (pictures + start).requires_grad_()
-    (gradient,) = torch.autograd.grad(contrast(network, network.of_pictures(changed), said), changed)
+    (gradient,) = torch.autograd.grad(contrast(network, network.of_pictures(changed), said, len(changed)), changed)
     away = (changed.detach() + 1.25 * most * gradient.sign() - pictures).clamp(-most, most)
     return (pictures + away).clamp(0, 1)
 

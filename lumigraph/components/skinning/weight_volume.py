@@ -15,7 +15,7 @@ from ...files.ranges import LearningRate, PositiveShare, between
 from ...method import Part
 from .bone_motion import skeleton_of
 
-MIN_PRIOR = 1e-6  # of a bone's share at first, whose logarithm is learnt on from
+MIN_PRIOR = 1e-6  # of a bone's share at first among bones, and of all bones beside no body
 LEAF_LENGTH = 0.6  # of a bone without children, in lengths of its parent's
 FIRST_CELLS = 1  # along an axis, from which convolutions begin
 SLOPE = 0.2  # of leaky ReLUs
@@ -94,7 +94,7 @@ class WeightVolume(Part):
             self.weights()[None], self.coordinates(points)[None, None, None], padding_mode="border", align_corners=True
         )
         own = seen[0, :-1, 0, 0].T
-        return own / own.sum(-1, keepdim=True).clamp_min(MIN_PRIOR)
+        return own / own.sum(-1, keepdim=True).clamp_min(MIN_PRIOR**2)
 
     def of_each(
         self, points: Float[Tensor, "bone point 3"], weights: Float[Tensor, "channel z y x"]
@@ -141,7 +141,6 @@ def shares(away: Float[Tensor, "bone point"]) -> Float[Tensor, "channel point"]:
 
     Near the body it is Gaussians around bones, which share it where they overlap, and farther out the nearest bone's.
     """
-    dense = torch.exp(-0.5 * away.square())
-    body = dense.amax(0)
-    each = torch.softmax(-0.5 * away.square(), 0) * body
-    return torch.cat([each.clamp_min(MIN_PRIOR), (1 - body)[None].clamp_min(MIN_PRIOR)]).log()
+    body = torch.exp(-0.5 * away.square()).amax(0)
+    each = torch.softmax(-0.5 * away.square(), 0).clamp_min(MIN_PRIOR) * body.clamp_min(MIN_PRIOR)
+    return torch.cat([each, (1 - body)[None].clamp_min(MIN_PRIOR)]).log()

@@ -17,6 +17,8 @@ from ...datasets.scene import Frame
 from ...gaussians import Gaussians
 from ...geometry import multiply, to_quaternion
 
+LONE_REACH = 0.25  # deviation of places about a lone bone, in distances to the nearest other
+
 
 class SkinnedCloud(Addition):
     """The canonical cloud, posed to the moment of a photograph before it is rasterized.
@@ -30,15 +32,21 @@ class SkinnedCloud(Addition):
         self.bones, self.weights = BoneMotion(frame, bones), WeightVolume(frame, weights)
 
     def first_means(self, count: int, generator: torch.Generator) -> Float[Tensor, "gaussian 3"]:
-        """Random places about the bones at rest, evenly along them, as far from them as their first weights reach."""
+        """Random places about the bones at rest, evenly along them, as far from them as their first weights reach; of a
+        body of one bone, whose extent nothing tells, over a share of the way to the next body."""
         skeleton = self.bones.skeleton
         bones = segments(skeleton.parents, skeleton.rest.matrices[:, :, 3].float())
         starts, ends = (torch.cat(side) for side in zip(*bones, strict=True))
         size = float((torch.cat([starts, ends]).amax(0) - torch.cat([starts, ends]).amin(0)).max())
-        radius = self.weights.numbers.bone_radius * size
-        chosen = torch.multinomial((ends - starts).norm(dim=1) + radius, count, True, generator=generator)
+        radius = torch.full((len(starts), 1), self.weights.numbers.bone_radius * size)
+        lone = (starts == ends).all(1)
+        away = torch.cdist(starts[lone], torch.cat([starts[~lone], starts[lone]]))
+        widest = float((self.weights.box[1] - self.weights.box[0]).max())
+        radius[lone] = LONE_REACH * away.where(away > 0, widest).amin(1, keepdim=True)
+        chosen = torch.multinomial((ends - starts).norm(dim=1) + radius[:, 0], count, True, generator=generator)
         share = torch.rand(count, 1, generator=generator)
-        return torch.lerp(starts[chosen], ends[chosen], share) + radius * torch.randn(count, 3, generator=generator)
+        spread = radius[chosen] * torch.randn(count, 3, generator=generator)
+        return torch.lerp(starts[chosen], ends[chosen], share) + spread
 
     def before_raster(self, method: Any, step: Step) -> None:
         step.cloud = self.at(method, step.cloud, method.moment_of(step.camera))
