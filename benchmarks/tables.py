@@ -31,6 +31,13 @@ RESULTS = ROOT / "benchmarks" / "results" / "methods-cpu.json"
 GALLERY = RESULTS.with_name("gallery-cpu.json")
 TABLE = re.compile(r"(<!-- table: (\w+)((?: [\w-]+)*) -->\n).*?(?=<!-- end of table -->)", re.DOTALL)
 SOURCE = 3  # place of the scene in a cell's command: lumigraph train METHOD SCENE
+GUIDES = {  # pages about sections of the gallery, in docs/
+    "Pictures and light fields": "light-fields",
+    "Shape": "meshes",
+    "Depth cameras": "depth",
+    "What moves": "time",
+    "Across scenes": "collections",
+}
 Row = dict[str, Any]
 
 
@@ -164,7 +171,8 @@ def by_section(cells: Sequence[Row], page: Path) -> list[str]:
     for title, section in SECTIONS.items():
         found = [f"{link(row['method'], page)} {headline(row)}" for row in cells if row["method"] in section]
         if found:
-            rows.append([title, ", ".join(found)])
+            guide = ROOT / "docs" / f"{GUIDES[title]}.md" if title in GUIDES else None
+            rows.append([linked(title, guide, page) if guide else title, ", ".join(found)])
     return markdown(rows)
 
 
@@ -200,7 +208,11 @@ def scenes_of(cells: Sequence[Row]) -> str:
 def link(name: str, page: Path) -> str:
     """Name of a method, which leads to its page unless it is on that."""
     target = ROOT / "docs" / "methods" / f"{name.replace('-', '_')}.md"
-    return name if target == page else f"[{name}]({Path(os.path.relpath(target, page.parent)).as_posix()})"
+    return name if target == page else linked(name, target, page)
+
+
+def linked(name: str, target: Path, page: Path) -> str:
+    return f"[{name}]({Path(os.path.relpath(target, page.parent)).as_posix()})"
 
 
 def paper(name: str) -> str:

@@ -34,7 +34,16 @@ from lumigraph.datasets.words import Words
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
 from lumigraph.synthetic import captions
-from lumigraph.training.captions import CaptionNumbers, contrast, different, learn_captions, perturbed, thing_loss
+from lumigraph.training.captions import (
+    CaptionNumbers,
+    contrast,
+    different,
+    distorted,
+    learn_captions,
+    new_model,
+    perturbed,
+    thing_loss,
+)
 
 pytestmark = budget("methods", 20)
 CPU = torch.device("cpu")
@@ -312,8 +321,22 @@ def test_a_perturbation_stays_small_and_misleads():
     pictures, said = torch.rand(4, 3, 32, 32, generator=chance()), torch.eye(4, 8)
     changed = perturbed(learned.network, pictures, said, 0.05, chance())
     assert (changed - pictures).abs().max() <= 0.05 + 1e-6
-    before, after = (contrast(learned.network, learned.network.of_pictures(x), said) for x in (pictures, changed))
+    before, after = (contrast(learned.network, learned.network.of_pictures(x), said, 4) for x in (pictures, changed))
     assert after > before
+
+
+def test_captions_are_told_from_distorted_pictures():
+    """A distorted picture that looks like a caption costs what another's picture would."""
+    network, _ = new_model(CaptionNumbers(width=4, embedding=8))
+    seen = said = torch.eye(3, 8)
+    plain = contrast(network, seen, said, 3)
+    assert contrast(network, torch.cat([seen, torch.eye(4, 8)[3:]]), said, 3) > plain
+    assert contrast(network, torch.cat([seen, seen[:1]]), said, 3) > plain + 0.05
+    picture = torch.rand(1, 3, 8, 8, generator=chance())
+    wrong = distorted(picture.repeat(64, 1, 1, 1), chance())
+    assert ((wrong - picture).abs().amax((1, 2, 3)) > 0.1).all() and wrong.min() >= 0 and wrong.max() <= 1
+    whole = (wrong.flatten(2).sort(-1).values - picture.flatten(2).sort(-1).values).abs().amax((1, 2)) < 1e-6
+    assert 0.3 < whole.float().mean() < 0.7  # in pieces or on a side: each channel has its values still
 
 
 def test_batches_follow_the_pictures_and_repeat_no_group():

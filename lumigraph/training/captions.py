@@ -148,7 +148,8 @@ def contrast(
 def distorted(
     pictures: Float[Tensor, "picture 3 side side"], generator: torch.Generator
 ) -> Float[Tensor, "picture 3 side side"]:
-    """Pictures in wrong colours, each channel another one and inverted or not, or cut into quarters that change places.
+    """Pictures in wrong colours, each channel another one or inverted; a quarter of them cut into quarters that change
+    places instead, a quarter lying on a side.
 
     Without them a model may take a colour that no thing has, cyan, for any of them.
     """
@@ -158,8 +159,9 @@ def distorted(
     inverted[(channels == torch.arange(3)).all(1)] = True
     recoloured = pictures.gather(1, channels[:, :, None, None].expand_as(pictures))
     recoloured = torch.where(inverted, 1 - recoloured, recoloured)
-    cut = torch.roll(pictures, (half, half), (2, 3))
-    return torch.where(torch.rand(count, 1, 1, 1, generator=generator) < 0.75, recoloured, cut)
+    cut, lying = torch.roll(pictures, (half, half), (2, 3)), torch.rot90(pictures, 1, (2, 3))
+    kind = torch.randint(4, (count, 1, 1, 1), generator=generator)
+    return torch.where(kind == 0, cut, torch.where(kind == 1, lying, recoloured))
 
 
 def thing_loss(logits: Float[Tensor, "picture thing"], there: Bool[Tensor, "picture thing"]) -> Tensor:
