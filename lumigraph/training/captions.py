@@ -36,9 +36,9 @@ class CaptionNumbers:
     """Numbers of the model and of its training."""
 
     pictures: Count = 6000  # pictures that are traced to learn from; more generalise better, and take longer
-    steps: Steps = 4500  # steps of learning; more recognise more
+    steps: Steps = 6000  # steps of learning; more recognise more
     batch: BatchSize = 32  # pictures of a step, compared with their captions and as many others
-    width: Width = 16  # channels of the residual network's stem; wider recognises more, and costs time
+    width: Width = 24  # channels of the residual network's stem; wider recognises more, and costs time
     embedding: Width = 64  # of the shared space
     learning_rate: LearningRate = 2e-3  # AdamW's learning rate at its highest
     weight_decay: NonNegative = 0.05  # of AdamW

@@ -13,6 +13,7 @@ from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, instance_norm, 
 
 from .networks import Pictures, StyleEncoder, rectified
 
+Codes = Float[Tensor, "picture code"]
 LEVELS = (2, 3, 4)  # of the adversary's pyramid, at which it decides
 
 
@@ -28,31 +29,35 @@ def pooled(labels: Pictures, like: Pictures) -> Pictures:
 
 
 class Spade(nn.Module):
-    """Normalisation whose scale and shift are convolutions of the label map (Park 2019, eq. 1 to 3)."""
+    """Normalisation whose scale and shift are convolutions of the label map (Park 2019, eq. 1 to 3), and of the style.
 
-    def __init__(self, channels: int, labels: int, hidden: int):
+    The style has to come after the normalisation, which takes from each channel what is the same at all pixels.
+    """
+
+    def __init__(self, channels: int, labels: int, code: int, hidden: int):
         super().__init__()
-        self.shared = convolution(labels, hidden)
+        self.shared, self.style = convolution(labels, hidden), nn.Linear(code, hidden, bias=False)
         self.modulation = convolution(hidden, 2 * channels)
 
-    def forward(self, x: Pictures, labels: Pictures) -> Pictures:
-        scale, shift = self.modulation(rectified(self.shared(pooled(labels, x)))).chunk(2, 1)
+    def forward(self, x: Pictures, labels: Pictures, code: Codes) -> Pictures:
+        of_both = self.shared(pooled(labels, x)) + self.style(code)[..., None, None]
+        scale, shift = self.modulation(rectified(of_both)).chunk(2, 1)
         return instance_norm(x) * (1 + scale) + shift
 
 
 class SpadeBlock(nn.Module):
     """Residual block of two convolutions, each after a `Spade` (Park 2019, figure 4)."""
 
-    def __init__(self, inputs: int, outputs: int, labels: int, hidden: int):
+    def __init__(self, inputs: int, outputs: int, labels: int, code: int, hidden: int):
         super().__init__()
-        self.norms = nn.ModuleList([Spade(inputs, labels, hidden), Spade(outputs, labels, hidden)])
+        self.norms = nn.ModuleList(Spade(n, labels, code, hidden) for n in (inputs, outputs))
         self.convolutions = nn.ModuleList([convolution(inputs, outputs), convolution(outputs, outputs)])
         self.beside = nn.Conv2d(inputs, outputs, 1, bias=False) if inputs != outputs else nn.Identity()
 
-    def forward(self, x: Pictures, labels: Pictures) -> Pictures:
+    def forward(self, x: Pictures, labels: Pictures, code: Codes) -> Pictures:
         y = x
         for norm, convolution in zip(self.norms, self.convolutions, strict=True):
-            y = convolution(rectified(norm(y, labels)))
+            y = convolution(rectified(norm(y, labels, code)))
         return self.beside(x) + y
 
 
@@ -67,18 +72,17 @@ class LabelPainter(nn.Module):
     ):
         super().__init__()
         self.encoder = StyleEncoder(encoder_size, encoder_width, code)
-        self.style = nn.Linear(code, widths[0])
         self.first = convolution(labels, widths[0])
-        self.blocks = nn.ModuleList(SpadeBlock(a, b, labels, hidden) for a, b in pairwise([widths[0], *widths]))
+        self.blocks = nn.ModuleList(SpadeBlock(a, b, labels, code, hidden) for a, b in pairwise([widths[0], *widths]))
         self.out = convolution(widths[-1], 3)
 
-    def forward(self, labels: Pictures, code: Float[Tensor, "picture code"]) -> Pictures:
+    def forward(self, labels: Pictures, code: Codes) -> Pictures:
         """labels: one channel for each, 1 where it is"""
         steps = len(self.blocks) - 1
         height, width = (n >> steps for n in labels.shape[-2:])
-        x = self.first(adaptive_avg_pool2d(labels, (height, width))) + self.style(code)[..., None, None]
+        x = self.first(adaptive_avg_pool2d(labels, (height, width)))
         for k, block in enumerate(self.blocks):
-            x = block(interpolate(x, size=[n >> steps - k for n in labels.shape[-2:]]), labels)
+            x = block(interpolate(x, size=[n >> steps - k for n in labels.shape[-2:]]), labels, code)
         return self.out(rectified(x)).tanh()
 
 
