@@ -74,7 +74,7 @@ def collected(outputs: Iterable[Path], commit: str) -> dict[str, Any]:
     folder. Raises SystemExit where a cell failed, or machines differ."""
     cells: list[Row] = []
     for output in outputs:
-        found = json.loads((output / "results.json").read_text("utf-8"))
+        found = json.loads((output / "results.json").read_text("utf-8").replace(f"{output.resolve()}/", ""))
         for row in found["cells"]:
             words = shlex.split(row["command"])
             words[SOURCE] = Path(words[SOURCE]).name
@@ -188,7 +188,8 @@ def by_showpiece(cells: Sequence[Row], page: Path) -> list[str]:
 
 def headline(row: Row) -> str:
     """The first score of a method, whatever it is measured by."""
-    return next((f"{score}" if score.unit == "dB" else f"{score.name} {score}" for score in scores_of(row)), "")
+    score = next(iter(scores_of(row)))
+    return f"{score.value:.1f} dB" if score.unit == "dB" else f"{score.name} {score.value:.3g} {score.unit}".strip()
 
 
 KINDS: dict[str, Callable[[Sequence[Row], Path], list[str]]] = {
@@ -218,7 +219,7 @@ def linked(name: str, target: Path, page: Path) -> str:
 def paper(name: str) -> str:
     """Authors and year, as a method's file names them."""
     found = re.search(r"\(([^()]*\d{4}), arXiv", methods.summary(name))
-    return found[1] if found else ""
+    return found[1].split(", arXiv")[0] if found else ""
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> list[str]:

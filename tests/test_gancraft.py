@@ -165,3 +165,16 @@ def test_style_is_a_name_a_mixture_or_a_picture(tmp_path):
         method.given(style="nowhere.png").shown_code  # noqa: B018
     with pytest.raises(LumigraphError, match="summer"):
         method.given(style="midnight")
+
+
+def test_codes_of_pictures_differ_from_the_start_and_change_what_is_painted():
+    """Codes that are all noise are never used: the first steps teach a painter to leave them out."""
+    torch.manual_seed(0)
+    painter = LabelPainter(len(LABELS), 8, [48, 24, 12], 12, 64, 8)
+    colours = 2 * torch.rand(6, 3, 1, 1) - 1
+    pictures = (colours + 0.1 * torch.randn(6, 3, 64, 64)).clamp(-1, 1)
+    mean, log_variance = painter.encoder(pictures)
+    assert mean.std(0).mean() > 0.2 * (0.5 * log_variance).exp().mean()  # 0.3 to 0.8; with PyTorch's weights 0.05
+    labels = channels(torch.randint(len(LABELS), (1, 16, 16)), len(LABELS)).expand(6, -1, -1, -1)
+    painted = painter(labels, mean)
+    assert (painted.mean((2, 3)).std(0) > 0.01).all()

@@ -11,7 +11,7 @@ from budgets import budget
 
 pytestmark = budget("house")
 
-RESULTS = json.loads(tables.RESULTS.read_text("utf-8"))
+RESULTS = tables.read()
 WITH_TABLES = {"README.md", "benchmarks.md", "grids.md"}
 
 

@@ -38,7 +38,10 @@ class StyleEncoder(nn.Module):
         super().__init__()
         self.size = size
         widths = [3, *(min(width << k, 8 * width) for k in range(int(math.log2(size // MIN_ENCODER_SIDE))))]
-        self.layers = nn.ModuleList(nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths))
+        layers = [nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths)]
+        for layer in layers:  # so that codes of pictures are not all noise at first, and then never used
+            nn.init.kaiming_normal_(layer.weight, SLOPE)
+        self.layers = nn.ModuleList(layers)
         self.out = nn.Linear(widths[-1] * MIN_ENCODER_SIDE**2, 2 * code)
         nn.init.constant_(self.out.bias[code:], FIRST_LOG_VARIANCE)
 
