@@ -199,7 +199,7 @@ class VolumeDecoder(nn.Module):
         return found[:, 3], found[:, :3]
 
     def warped(self, decoded: Decoded, places: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Where the whole's map and the warp lead."""
+        """Places of the template to which the map of the whole and the warp lead."""
         there = self.whole(decoded.code, places)[0]
         return there if decoded.warp is None else sampled(decoded.warp, there)
 
