@@ -167,7 +167,7 @@ def by_cell(cells: Sequence[Row], page: Path) -> list[str]:
 
 def by_section(cells: Sequence[Row], page: Path) -> list[str]:
     """Methods of each section of the gallery, with their own scores."""
-    rows = [["", "methods, and their scores after a minute of training"]]
+    rows = [["section", "methods, and their scores after a minute of training"]]
     for title, section in SECTIONS.items():
         found = [f"{link(row['method'], page)} {headline(row)}" for row in cells if row["method"] in section]
         if found:
