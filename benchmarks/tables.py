@@ -38,6 +38,7 @@ GUIDES = {  # pages about sections of the gallery, in docs/
     "What moves": "time",
     "Across scenes": "collections",
 }
+OF_SHOWPIECE = "method", "command", "budget", "steps", "training_seconds", "model_bytes", "scores"  # what is kept
 Row = dict[str, Any]
 
 
@@ -50,7 +51,10 @@ class Options:
     def run(self) -> None:
         for outputs, path in ((self.collect, RESULTS), (self.gallery, GALLERY)):
             if outputs:
-                path.write_text(json.dumps(collected(outputs, self.commit), indent=1) + "\n", "utf-8")
+                found = collected(outputs, self.commit)
+                if path == GALLERY:
+                    found["cells"] = [{name: row[name] for name in OF_SHOWPIECE} for row in found["cells"]]
+                path.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
         results = read()
         for page in pages():
             text = page.read_text("utf-8")
