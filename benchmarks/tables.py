@@ -54,6 +54,7 @@ class Options:
                 found = collected(outputs, self.commit)
                 if path == GALLERY:
                     found["cells"] = [{name: row[name] for name in OF_SHOWPIECE} for row in found["cells"]]
+                    found["commands"] = [f"lumigraph gallery --seconds {found['cells'][0]['budget']['seconds']:g}"]
                 path.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
         results = read()
         for page in pages():
@@ -120,8 +121,7 @@ def filled(text: str, page: Path, results: dict[str, Any]) -> str:
         cells = [row for row in of["cells"] if not names or row["method"] in names]
         if not cells:
             return f"{match[1]}Not measured.\n"
-        about = f"Commit `{of['commit']}`; {of['machine'].removeprefix('cpu, ')}, no GPU."
-        lines = [f"lumigraph gallery --seconds {cells[0]['budget']['seconds']:g}"]
+        about, lines = f"Commit `{of['commit']}`; {of['machine'].removeprefix('cpu, ')}, no GPU.", of["commands"]
         if kind not in OF_GALLERY:
             about, lines = f"{about} {scenes_of(cells)}", commands(cells)
         return "\n".join([match[1].rstrip(), *KINDS[kind](cells, page), "", about, "", "```", *lines, "```", ""])
