@@ -34,13 +34,14 @@ class SkinnedCloud(Addition):
     def first_means(self, count: int, generator: torch.Generator) -> Float[Tensor, "gaussian 3"]:
         """Random places about the bones at rest, evenly along them, as far from them as their first weights reach; of a
         body of one bone, whose extent nothing tells, over a share of the way to the next body."""
-        skeleton = self.bones.skeleton
-        bones = segments(skeleton.parents, skeleton.rest.matrices[:, :, 3].float())
+        parents, rest = self.bones.skeleton.parents, self.bones.skeleton.rest
+        bones = segments(parents, rest.matrices[:, :, 3].float())
         starts, ends = (torch.cat(side) for side in zip(*bones, strict=True))
         size = float((torch.cat([starts, ends]).amax(0) - torch.cat([starts, ends]).amin(0)).max())
         radius = torch.full((len(starts), 1), self.weights.numbers.bone_radius * size)
-        lone = (starts == ends).all(1)
-        away = torch.cdist(starts[lone], torch.cat([starts[~lone], starts[lone]]))
+        number = torch.arange(len(parents)).repeat_interleave(torch.tensor([len(side) for side, _ in bones]))
+        lone = torch.tensor([parent < 0 and i not in parents for i, parent in enumerate(parents)])[number]
+        away = torch.cdist(starts[lone], starts)
         widest = float((self.weights.box[1] - self.weights.box[0]).max())
         radius[lone] = LONE_REACH * away.where(away > 0, widest).amin(1, keepdim=True)
         chosen = torch.multinomial((ends - starts).norm(dim=1) + radius[:, 0], count, True, generator=generator)
