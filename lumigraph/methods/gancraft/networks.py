@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int
@@ -28,15 +28,6 @@ def rectified(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return leaky_relu(x, SLOPE)
 
 
-def kept_in_size(layer: Any) -> nn.Module:
-    """The layer with weights that keep the size of what passes it and a rectifier (He 2015).
-
-    By PyTorch's weights codes of pictures are all noise at first, and then never used.
-    """
-    nn.init.kaiming_normal_(layer.weight, SLOPE)
-    return layer
-
-
 class StyleEncoder(nn.Module):
     """Mean and logarithm of the variance of the style code of a picture: strided convolutions (Park 2019, figure 14).
 
@@ -47,7 +38,10 @@ class StyleEncoder(nn.Module):
         super().__init__()
         self.size = size
         widths = [3, *(min(width << k, 8 * width) for k in range(int(math.log2(size // MIN_ENCODER_SIDE))))]
-        self.layers = nn.ModuleList(kept_in_size(nn.Conv2d(a, b, 3, 2, 1)) for a, b in pairwise(widths))
+        layers = [nn.Conv2d(a, b, 3, 2, 1) for a, b in pairwise(widths)]
+        for layer in layers:  # so that codes of pictures are not all noise at first, and then never used
+            nn.init.kaiming_normal_(layer.weight, SLOPE)
+        self.layers = nn.ModuleList(layers)
         self.out = nn.Linear(widths[-1] * MIN_ENCODER_SIDE**2, 2 * code)
         nn.init.constant_(self.out.bias[code:], FIRST_LOG_VARIANCE)
 
@@ -75,8 +69,7 @@ class StyleNetwork(nn.Module):
 
     def __init__(self, code: int, width: int, layers: int):
         super().__init__()
-        sizes = pairwise([code, *[width] * (layers + 1)])
-        self.layers = nn.ModuleList(kept_in_size(nn.Linear(a, b)) for a, b in sizes)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise([code, *[width] * (layers + 1)]))
 
     def forward(self, code: Float[Tensor, "1 code"]) -> Style:
         x = normalize(code, dim=-1)

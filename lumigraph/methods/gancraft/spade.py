@@ -78,7 +78,10 @@ class LabelPainter(nn.Module):
 
     def forward(self, labels: Pictures, code: Codes) -> Pictures:
         """labels: one channel for each, 1 where it is"""
-        steps = len(self.blocks) - 1
+        steps, code = (
+            len(self.blocks) - 1,
+            normalize(code, dim=-1),
+        )  # as the field's `StyleNetwork` does: none runs away
         height, width = (n >> steps for n in labels.shape[-2:])
         x = self.first(adaptive_avg_pool2d(labels, (height, width)))
         for k, block in enumerate(self.blocks):
