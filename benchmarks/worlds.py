@@ -45,7 +45,7 @@ class Options:
     frames: int = 60
     loop: float = 0.2  # share of the walk around the world that these frames cover
     size: int = 128  # pixels
-    styles: tuple[str, str] = ("summer", "autumn")
+    styles: tuple[str, str] = ("summer", "evening")
     scene: str | None = None  # where the world is, if not where it was
 
 
