@@ -225,7 +225,7 @@ def test_a_scene_of_two_bodies_can_show_contact():
 
 
 def test_a_body_of_one_bone_begins_around_it():
-    """How far it reaches nothing tells; a share of the way to the next body is tried."""
+    """First places reach a share of the way to the next body, for nothing tells the size of its own."""
     alone = replace(skeleton(), parents=(-1, -1))
     method = ArticulatedSplatting(replace(frame(), skeleton=alone), ArticulatedSplatting.smallest())
     means = method.skin.first_means(2000, torch.Generator().manual_seed(0))
