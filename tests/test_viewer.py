@@ -423,6 +423,7 @@ def test_pace_learns_what_a_picture_costs():
     assert width * height == pytest.approx(80_000, rel=0.02)
     assert width / height == pytest.approx(16 / 9, rel=0.02)
     assert pace.size((160, 90), 0.1) == (160, 90)
+    assert pace.size((480, 360), 0.1) == (480, 360)  # 0.19 s, less than two pictures take
 
 
 @pytest.mark.parametrize(

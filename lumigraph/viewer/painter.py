@@ -50,7 +50,10 @@ class Pace:
         return max(seconds - a, 0.5 * a) / max(b, 1e-12)
 
     def size(self, full: tuple[int, int], seconds: float) -> tuple[int, int]:
-        """(width, height) with the aspect of `full` that can be rendered in a time; small at first."""
+        """(width, height) with the aspect of `full` that can be rendered in a time; small at first. `full` itself if
+        that takes at most FULL_FACTOR times as long, because a smaller picture before it would only delay it."""
+        if self.pixels(FULL_FACTOR * seconds) >= full[0] * full[1]:
+            return full
         share = math.sqrt(self.pixels(seconds) / (full[0] * full[1]))
         share = min(1.0, max(share, MIN_RESOLUTION / max(full)))
         return max(1, round(full[0] * share)), max(1, round(full[1] * share))
@@ -58,6 +61,7 @@ class Pace:
 
 MOVING_SECONDS, RESTING_SECONDS = 0.1, 0.5  # for a picture while the camera moves, and for the first one at rest
 REST_SECONDS = 0.2  # seconds after the last request from which a client counts as resting
+FULL_FACTOR = 2.0  # on the time of a picture at rest, which one of full size may take instead
 FRAME_SECONDS = 1 / 30  # for a picture of full size while the camera moves
 MIN_FRAME_SECONDS = 1 / 60  # seconds between pictures
 NO_DEADLINE = float("inf")

@@ -61,7 +61,7 @@ class Visitor:
 
     def __init__(self, shared: Shared, client: Any):
         self._shared, self._client = shared, client
-        self._pace, self._bands, self._said = Pace(), Pace(), ""  # whole pictures, all waiting included; bands of them
+        self._pace, self._bands, self._said = Pace(), Pace(), ""  # pictures at rest, all waiting included; bands
         self._moving = MovingPace()
         self._sharp: SharpPicture | None = None  # the last picture at rest
         self._splats: Any = None
@@ -227,7 +227,8 @@ class Visitor:
         begin = time.perf_counter()
         rendering, camera = self._render(request, size, wanted)
         took = time.perf_counter() - begin
-        self._pace.note(size[0] * size[1], took)
+        if not moving or self._pace.costs is None:
+            self._pace.note(size[0] * size[1], took)
         self._show(rendering, camera, request, moving)
         if moving:
             self._moving.note(divisor, time.perf_counter() - begin)
