@@ -78,6 +78,18 @@ def test_resets_leave_time_to_recover(events):
     assert resets and max(resets) <= 45
 
 
+def test_only_large_photographs_are_reduced():
+    """Half of lego's 400 x 400 pixels would hardly be quicker. Poses are refined from coarse to fine at any size."""
+    plain, refining = new(), new(refine_cameras=True)
+    for size, at_first, later in [((400, 400), 1, 1), ((533, 800), 2, 2), ((720, 1280), 4, 2)]:
+        plain.progress = 0.1
+        assert plain.reduction(*size) == at_first
+        plain.progress = 0.5
+        assert plain.reduction(*size) == later
+    refining.progress = 0.1
+    assert refining.reduction(400, 400) == 4
+
+
 @pytest.mark.parametrize("budget, interval", [(PAPER, 100), (1000, 100), (600, 60), (60, 6)])
 def test_intervals_are_the_papers_or_a_share_of_the_budget(budget, interval):
     schedule = IntervalSchedule(100, 1 / 10)

@@ -37,7 +37,7 @@ from .moved_cloud import seen_from
 BLACK = 0.0, 0.0, 0.0
 SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
-MIN_PIXELS = 64  # along the shorter side of a photograph that is reduced
+LEAST_PIXELS = 4096  # of a photograph that is reduced
 COARSE_UNTIL = 0.5  # share of the budget with plain colours, and by default half size, where poses are refined
 PLACEHOLDER_COUNT = 1000  # random Gaussians before training at most
 MAX_TEACHER_SHARE = 0.5  # of the cap, with which a cloud begins on the surfaces of a teacher
@@ -143,18 +143,25 @@ class CloudMethod(Method, ABC):
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
         layers = depth_layers(self.config, data) + tuple(x for part in self.additions for x in part.layers(data))
         photograph = data.photograph(int(train[order[place]]), layers)
-        self.figures["reduction"] = times = self.reduction(min(photograph.rgb.shape[:2]))
+        self.figures["reduction"] = times = self.reduction(*photograph.rgb.shape[:2])
         return photograph.reduced(times).to(self.device)
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
         """Photographs that are learnt from now; all of training by default."""
         return data.splits["train"]
 
-    def reduction(self, shorter: int) -> int:
-        """Factor by which photographs are smaller now. shorter: pixels along the shorter side"""
+    @property
+    def least_pixels(self) -> int:
+        """Number of pixels of a photograph that is reduced, at least."""
+        return LEAST_PIXELS
+
+    def reduction(self, height: int, width: int) -> int:
+        """Factor by which photographs of a size, in pixels, are smaller now."""
         half = self.config.half_resolution_until or COARSE_UNTIL * self.moves_cameras
-        wanted = 4 if self.progress < half / 4 else 2 if self.progress < half else 1
-        return max(1, min(wanted, shorter // MIN_PIXELS))
+        times = 4 if self.progress < half / 4 else 2 if self.progress < half else 1
+        while times > 1 and height * width < self.least_pixels * times**2:
+            times //= 2
+        return times
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         """The absolute error and D-SSIM of a picture (eq. 7), and the terms of additions."""

@@ -27,6 +27,7 @@ from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
 from .robust_mask import RobustMask, RobustNumbers
 
+LEAST_PIXELS = 45_000  # of a reduced photograph; with fewer, Gaussians take most of a step's time anyway
 # Codes that one pass of the rasteriser composites, learnt once the geometry is there.
 CPU_GROUPS = InstanceNumbers(
     identity_code=8, identity_lr=0.05, classifier_lr=0.02, identity_interval=2, identity_start=0.4
@@ -84,6 +85,10 @@ class GaussianSplatting(CloudMethod):
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
         self.identities = Identities(c.groups, count) if c.groups.objects == "yes" else None
         self.poses = poses_for(frame, c.poses)
+
+    @property
+    def least_pixels(self) -> int:
+        return super().least_pixels if self.moves_cameras else LEAST_PIXELS
 
     def rasterized(self, camera: Camera) -> Rendering:
         if self.identities is None or edit_of(self) is None:
