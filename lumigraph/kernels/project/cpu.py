@@ -13,12 +13,12 @@ FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "
 ZERO, HALF, ONE, TWO, THREE, FOUR, SIX = (np.float32(x) for x in (0, 0.5, 1, 2, 3, 4, 6))
 MIN_DETERMINANT_RATIO = np.float32(1e-8)  # of a footprint's determinant to the blurred one's
 TINY = np.float32(1e-12)  # least length of a quaternion, and distance of the eye
-MAX_EXPONENT = np.float32(20)  # beyond it no opacity reaches; exp2 is exact there
+MAX_EXPONENT = np.float32(20)  # of 2: no opacity is so many times MIN_ALPHA
 LOG2_E = np.float32(np.log2(np.e))
 PARTS = 64  # of the Gaussians, which threads take one by one
-# Rows of sixteen numbers: what is taken of sixteen Gaussians, and what becomes of them on the way there and back.
+# Rows of lanes: what is read of sixteen Gaussians, of which gradients take the place, and their footprints.
 MEAN, QUATERNION, SCALE, OPACITY, TAKEN = 0, 3, 7, 10, 11
-CENTRE_, CONIC, DEPTH, COLOUR, SEEN, MADE = 0, 2, 5, 6, 9, 10
+PLACE, CONIC, DEPTH, COLOUR, VISIBLE, MADE = 0, 2, 5, 6, 9, 10
 MAX_NUMBERS = 48  # of a Gaussian's harmonics: 16 of each colour
 # Where a view's numbers begin.
 EYE, FOCAL, CENTRE, LENS, LIMITS, WIDTH, HEIGHT, NEAR = 9, 12, 14, 16, 24, 28, 29, 30
@@ -166,15 +166,15 @@ def _three(some, row):
 
 
 @njit(**FAST)
-def _turned_root(some, quaternion):
-    """_rotation of the quaternions that were taken."""
+def _rotations(some, quaternion):
+    """`_rotation` of the quaternions in four rows of lanes."""
     x, y, z = _three(some, quaternion + 1)
     return _rotation(fetch(some, LANES * quaternion), x, y, z)
 
 
 @njit(**FAST)
-def _place(number):
-    """Where a number of the harmonics of all lanes is, once the rows of `MAX_NUMBERS` of the lanes were turned."""
+def _row_of(number):
+    """Where the lanes of one number of the harmonics begin, once the lanes' rows of MAX_NUMBERS were turned."""
     return MAX_NUMBERS * (number % LANES) + LANES * (number // LANES)
 
 
@@ -218,15 +218,15 @@ def _forward(
             u = v[FOCAL] * (bent_x + xx * over + xy * under) + v[CENTRE]
             w = v[FOCAL + 1] * (bent_y + xy * over + yy * under) + v[CENTRE + 1]
             _, _, A, B = _slopes(where(z > v[NEAR], z, ONE), x, y, xx, xy, yy, v)
-            _, _, Q = _turned_root(some, QUATERNION)
+            _, _, Q = _rotations(some, QUATERNION)
             a, b, c, det, narrow = _footprint(_row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz), blur)
             if compensate:
                 opacity = opacity * root(highest(narrow / det, MIN_DETERMINANT_RATIO))
             visible = (z > v[NEAR]) & _reaches(opacity, _outside(u, v[WIDTH]), a)
             visible = visible & _reaches(opacity, _outside(w, v[HEIGHT]), c)
-            put(made, LANES * SEEN, where(visible, opacity, ZERO))
+            put(made, LANES * VISIBLE, where(visible, opacity, ZERO))
             for lane in range(count):
-                if made[LANES * SEEN + lane] > 0:
+                if made[LANES * VISIBLE + lane] > 0:
                     for n in range(numbers):
                         rows[MAX_NUMBERS * lane + n] = harmonics[first + lane, n]
             _turn_all(rows, numbers)
@@ -235,11 +235,11 @@ def _forward(
             red = green = blue = filled(HALF, SIXTEEN)
             for k in range(bands * bands):
                 value = fetch(Y, LANES * k)
-                red = red + value * fetch(rows, _place(3 * k))
-                green = green + value * fetch(rows, _place(3 * k + 1))
-                blue = blue + value * fetch(rows, _place(3 * k + 2))
-            put(made, LANES * CENTRE_, u)
-            put(made, LANES * (CENTRE_ + 1), w)
+                red = red + value * fetch(rows, _row_of(3 * k))
+                green = green + value * fetch(rows, _row_of(3 * k + 1))
+                blue = blue + value * fetch(rows, _row_of(3 * k + 2))
+            put(made, LANES * PLACE, u)
+            put(made, LANES * (PLACE + 1), w)
             put(made, LANES * CONIC, c / det)
             put(made, LANES * (CONIC + 1), ZERO - b / det)
             put(made, LANES * (CONIC + 2), a / det)
@@ -248,14 +248,14 @@ def _forward(
             put(made, LANES * (COLOUR + 1), highest(green, ZERO))
             put(made, LANES * (COLOUR + 2), highest(blue, ZERO))
             for lane in range(count):
-                i, kept = first + lane, made[LANES * SEEN + lane] > 0
-                centres[i, 0] = made[LANES * CENTRE_ + lane] if kept else ZERO
-                centres[i, 1] = made[LANES * (CENTRE_ + 1) + lane] if kept else ZERO
+                i, kept = first + lane, made[LANES * VISIBLE + lane] > 0
+                centres[i, 0] = made[LANES * PLACE + lane] if kept else ZERO
+                centres[i, 1] = made[LANES * (PLACE + 1) + lane] if kept else ZERO
                 for n in range(3):
                     conics[i, n] = made[LANES * (CONIC + n) + lane] if kept else ZERO
                     colours[i, n] = made[LANES * (COLOUR + n) + lane] if kept else ZERO
                 depths[i] = made[LANES * DEPTH + lane] if kept else ZERO
-                seen[i] = made[LANES * SEEN + lane] if kept else ZERO
+                seen[i] = made[LANES * VISIBLE + lane] if kept else ZERO
 
 
 @njit(parallel=True, **FAST)
@@ -297,21 +297,25 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
     for lane in range(count):
         i = which[lane]
         _take(some, lane, i, means, quaternions, scales, opacities)
-        given[LANES * CENTRE_ + lane], given[LANES * (CENTRE_ + 1) + lane] = g_centres[i, 0], g_centres[i, 1]
+        given[LANES * PLACE + lane], given[LANES * (PLACE + 1) + lane] = g_centres[i, 0], g_centres[i, 1]
         for n in range(3):
             given[LANES * (CONIC + n) + lane] = g_conics[i, n]
             given[LANES * (COLOUR + n) + lane] = g_colours[i, n] if colours[i, n] > 0 else ZERO
-        given[LANES * DEPTH + lane], given[LANES * SEEN + lane] = g_depths[i], g_seen[i]
+        given[LANES * DEPTH + lane], given[LANES * VISIBLE + lane] = g_depths[i], g_seen[i]
         for n in range(numbers):
             rows[MAX_NUMBERS * lane + n] = harmonics[i, n]
     mean, (sx, sy, sz), opacity = _three(some, MEAN), _three(some, SCALE), fetch(some, LANES * OPACITY)
-    g_u, g_w = fetch(given, LANES * CENTRE_), fetch(given, LANES * (CENTRE_ + 1))
-    (gxx, gxy, gyy), g_depth, g_opacity = _three(given, CONIC), fetch(given, LANES * DEPTH), fetch(given, LANES * SEEN)
+    g_u, g_w = fetch(given, LANES * PLACE), fetch(given, LANES * (PLACE + 1))
+    (gxx, gxy, gyy), g_depth, g_opacity = (
+        _three(given, CONIC),
+        fetch(given, LANES * DEPTH),
+        fetch(given, LANES * VISIBLE),
+    )
     gxy = HALF * gxy
     z, px, py, x, y = _onto_plane(mean, v)
     _, _, xx, xy, yy = _lens(x, y, v)
     j, k, A, B = _slopes(z, x, y, xx, xy, yy, v)
-    (qw, qx, qy, qz), length, Q = _turned_root(some, QUATERNION)
+    (qw, qx, qy, qz), length, Q = _rotations(some, QUATERNION)
     T, U = _row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz)
     a, b, c, det, narrow = _footprint(T, U, blur)
 
@@ -349,8 +353,8 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
     along = qw * hw + qx * hx + qy * hy + qz * hz  # a quaternion's length does not matter
 
     # The slopes: their rotation, then the perspective, then the lens.
-    g0, g1, g2 = _seen(gA, v)
-    h0, h1, h2 = _seen(gB, v)
+    g0, g1, g2 = _into_view(gA, v)
+    h0, h1, h2 = _into_view(gB, v)
     fx, fy = v[FOCAL] / z, v[FOCAL + 1] / z
     gu, gv = v[FOCAL] * g_u, v[FOCAL + 1] * g_w
     over, under = px - x, py - y
@@ -371,12 +375,12 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
     basis(dx, dy, dz, bands, Y)
     _turn_all(rows, numbers)
     for n in range(bands * bands):
-        h = fetch(rows, _place(3 * n)), fetch(rows, _place(3 * n + 1)), fetch(rows, _place(3 * n + 2))
+        h = fetch(rows, _row_of(3 * n)), fetch(rows, _row_of(3 * n + 1)), fetch(rows, _row_of(3 * n + 2))
         put(worth, LANES * n, red * h[0] + green * h[1] + blue * h[2])
         value = fetch(Y, LANES * n)
-        put(rows, _place(3 * n), value * red)
-        put(rows, _place(3 * n + 1), value * green)
-        put(rows, _place(3 * n + 2), value * blue)
+        put(rows, _row_of(3 * n), value * red)
+        put(rows, _row_of(3 * n + 1), value * green)
+        put(rows, _row_of(3 * n + 2), value * blue)
     _turn_all(rows, numbers)
     tx, ty, tz = slope(dx, dy, dz, bands, worth)
     inward = tx * dx + ty * dy + tz * dz
@@ -411,7 +415,7 @@ def _along(row, Q, n):
 
 
 @njit(**FAST)
-def _seen(g, v):
+def _into_view(g, v):
     """The camera's rotation times a gradient."""
     return (
         v[0] * g[0] + v[1] * g[1] + v[2] * g[2],
