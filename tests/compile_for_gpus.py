@@ -14,6 +14,7 @@ from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
 from lumigraph import kernels
+from lumigraph.kernels import _row_optimizers
 from lumigraph.kernels._operation import operations, tensors
 
 TARGETS = [GPUTarget("cuda", 90, 32), GPUTarget("hip", "gfx942", 64)]
@@ -56,3 +57,7 @@ for target in TARGETS:
             outputs = [x for x in tensors(getattr(operation, name)(*inputs)) if x.requires_grad]
         if outputs:
             torch.autograd.grad(sum(x.sum() for x in outputs), real)
+    rows, numbers = [torch.ones(5, 3) for _ in range(4)], (0.1, 0.9, 0.99, 1e-15)
+    for rates in (None, torch.ones(5)):
+        _row_optimizers.lazy_adam(*rows, rates, *numbers, 1.0)
+    _row_optimizers.cloud_adam(*rows, torch.zeros(5), torch.ones(3), 2.0, 0.1, (0.9, 0.99), 1e-15)

@@ -18,15 +18,17 @@ pytestmark = budget("kernels", 40)
 
 pytest.importorskip("triton")
 SCRIPT = Path(__file__).with_name("compile_for_gpus.py")
+ROW_OPTIMIZERS = PACKAGE / "kernels" / "_row_optimizers.py"
 
 
 def kernels_that_are_launched() -> set[tuple[str, str]]:
-    """Every function that some engine launches on a grid, as (operation, function)."""
+    """Every function that some engine or optimizer launches on a grid, as (folder, function)."""
     sources = {name: (folder(name) / "gpu.py").read_text(encoding="utf-8") for name in OPERATIONS}
+    sources["kernels"] = ROW_OPTIMIZERS.read_text(encoding="utf-8")
     return {(name, kernel) for name, text in sources.items() for kernel in re.findall(r"launch\(\s*(\w+)", text)}
 
 
-@kept(lambda: {SCRIPT}.union(*map(depends, OPERATIONS)))
+@kept(lambda: {SCRIPT, ROW_OPTIMIZERS}.union(*map(depends, OPERATIONS)))
 def test_every_kernel_compiles():
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True)
