@@ -7,10 +7,10 @@ FAULTS = {
     "a quaternion's length": ("gpu", "_matrix_backward", "along * y", "0 * y"),
     "a colour below zero": ("gpu", "_backward", "colour[1] > 0", "seen"),
     "the direction's length": ("gpu", "_backward", "-_dot(d, d_d)", "0.0"),
-    "a lens's second slope on the cpu": ("cpu", "_curve", "6 * p2", "2 * p2"),
-    "held, yet with gradient on the cpu": ("cpu", "_backward", "g_x if over == 0 else 0", "g_x"),
-    "the direction's length on the cpu": ("cpu", "_backward", "tx - dx * inward", "tx"),
-    "the cross product's order": ("cpu", "_pulled", "turn * nT[n]", "-turn * nT[n]"),
+    "a lens's second slope on the cpu": ("cpu", "_curve", "SIX * p2", "TWO * p2"),
+    "held, yet with gradient on the cpu": ("cpu", "_pull", "where(over != ZERO, ZERO, g_x)", "g_x"),
+    "the direction's length on the cpu": ("cpu", "_pull", "tx - dx * inward", "tx"),
+    "the cross product's order": ("cpu", "_pulled", "grow * nT[n]", "ZERO - grow * nT[n]"),
 }
 
-ASTRAY = {"a coefficient too few": ("cpu", "_forward", "np.empty(16,", "np.empty(15,")}
+ASTRAY = {"a coefficient too few": ("cpu", "_forward", "np.empty(16 *", "np.empty(15 *")}

@@ -9,7 +9,7 @@ FAULTS = {
         "(3 * Y33), x * y * (6 * Y33)",
     ),
     "never written": ("gpu", "_backward", "(dx, dy, dz), here", "(dx, dy, dz), r < R - 1"),
-    "term forgotten": ("cpu", "slope", " - zonal * g[13]", ""),
+    "term forgotten": ("cpu", "slope", " - zonal * g13", ""),
 }
 
-ASTRAY = {"a coefficient too many": ("cpu", "basis", "out[15] =", "out[16] =")}
+ASTRAY = {"a coefficient too many": ("cpu", "basis", "keep(out, 15,", "keep(out, 16,")}
