@@ -62,21 +62,30 @@ def _curve(x, y, v):
 
 
 @njit(**FAST)
+def _into_view(d, v):
+    """The camera's rotation times a vector."""
+    return (
+        v[0] * d[0] + v[1] * d[1] + v[2] * d[2],
+        v[3] * d[0] + v[4] * d[1] + v[5] * d[2],
+        v[6] * d[0] + v[7] * d[1] + v[8] * d[2],
+    )
+
+
+@njit(**FAST)
 def _onto_plane(mean, v):
     """Depth, point on the plane z = 1, and the same within the view's limits."""
-    dx, dy, dz = mean[0] - v[EYE], mean[1] - v[EYE + 1], mean[2] - v[EYE + 2]
-    z = v[6] * dx + v[7] * dy + v[8] * dz
+    x, y, z = _into_view((mean[0] - v[EYE], mean[1] - v[EYE + 1], mean[2] - v[EYE + 2]), v)
     safe = where(z > v[NEAR], z, ONE)
-    px = (v[0] * dx + v[1] * dy + v[2] * dz) / safe
-    py = (v[3] * dx + v[4] * dy + v[5] * dz) / safe
+    px, py = x / safe, y / safe
     x = lowest(highest(px, v[LIMITS]), v[LIMITS + 1])
     y = lowest(highest(py, v[LIMITS + 2]), v[LIMITS + 3])
     return z, px, py, x, y
 
 
 @njit(**FAST)
-def _rotation(w, x, y, z):
-    """The unit quaternion, the length it had, and its matrix row by row."""
+def _rotation(some):
+    """The unit quaternion of what was taken, the length it had, and its matrix row by row."""
+    w, (x, y, z) = fetch(some, LANES * QUATERNION), _three(some, QUATERNION + 1)
     length = highest(root(w * w + x * x + y * y + z * z), TINY)
     w, x, y, z = w / length, x / length, y / length, z / length
     rows = (
@@ -166,15 +175,8 @@ def _three(some, row):
 
 
 @njit(**FAST)
-def _rotations(some, quaternion):
-    """`_rotation` of the quaternions in four rows of lanes."""
-    x, y, z = _three(some, quaternion + 1)
-    return _rotation(fetch(some, LANES * quaternion), x, y, z)
-
-
-@njit(**FAST)
 def _row_of(number):
-    """Where the lanes of one number of the harmonics begin, once the lanes' rows of MAX_NUMBERS were turned."""
+    """Place of the lanes of one number of the harmonics, after the lanes' rows of MAX_NUMBERS were turned."""
     return MAX_NUMBERS * (number % LANES) + LANES * (number // LANES)
 
 
@@ -187,7 +189,7 @@ def _turn_all(rows, numbers):
 
 @njit(**FAST)
 def _outside(place, size):
-    """How far a coordinate is from the nearest pixel centre, in pixels; zero within the picture."""
+    """Distance of a coordinate from the nearest pixel centre, in pixels; zero within the picture."""
     return highest(highest(HALF - place, place - (size - HALF)), ZERO)
 
 
@@ -218,7 +220,7 @@ def _forward(
             u = v[FOCAL] * (bent_x + xx * over + xy * under) + v[CENTRE]
             w = v[FOCAL + 1] * (bent_y + xy * over + yy * under) + v[CENTRE + 1]
             _, _, A, B = _slopes(where(z > v[NEAR], z, ONE), x, y, xx, xy, yy, v)
-            _, _, Q = _rotations(some, QUATERNION)
+            _, _, Q = _rotation(some)
             a, b, c, det, narrow = _footprint(_row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz), blur)
             if compensate:
                 opacity = opacity * root(highest(narrow / det, MIN_DETERMINANT_RATIO))
@@ -315,7 +317,7 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
     z, px, py, x, y = _onto_plane(mean, v)
     _, _, xx, xy, yy = _lens(x, y, v)
     j, k, A, B = _slopes(z, x, y, xx, xy, yy, v)
-    (qw, qx, qy, qz), length, Q = _rotations(some, QUATERNION)
+    (qw, qx, qy, qz), length, Q = _rotation(some)
     T, U = _row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz)
     a, b, c, det, narrow = _footprint(T, U, blur)
 
@@ -412,16 +414,6 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
 def _along(row, Q, n):
     """A row times column n of the rotation."""
     return row[0] * Q[0][n] + row[1] * Q[1][n] + row[2] * Q[2][n]
-
-
-@njit(**FAST)
-def _into_view(g, v):
-    """The camera's rotation times a gradient."""
-    return (
-        v[0] * g[0] + v[1] * g[1] + v[2] * g[2],
-        v[3] * g[0] + v[4] * g[1] + v[5] * g[2],
-        v[6] * g[0] + v[7] * g[1] + v[8] * g[2],
-    )
 
 
 def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
