@@ -2,31 +2,51 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+import itertools
+import math
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from PIL import Image, ImageOps
 
 from ..capture.masks import MASKS
 from ..capture.motion.reconstruction import BLACK, MIN_VIEWS
+from ..capture.numbers import check_pixels
 from ..capture.photos.gather import PHOTOGRAPHS, walk
 from ..capture.photos.judge import Judgement, blurred, duplicates, exposure_jumps, judge
 from ..capture.photos.overlap import Descriptors, apart, details, shared
 from ..capture.photos.video import VIDEOS
-from ..capture.pictures import eight_bits, reads_heic
+from ..capture.pictures import reads_heic
+from ..capture.raw import is_raw
 from ..errors import LumigraphError
+from ..files import is_file
 from ..files.names import counted, natural
+from ..system.signals import start
+from . import reduce
+from .folders import Finder, Look
 from .projects import Item
+from .reduce import reduced
+from .uploads import MAX_FILES
 
 THUMBNAIL_SIDE = 320  # pixels
 DARK = -6.5  # mean log2 of the luminance, below which noise of a photograph has its detail
 USUAL_VIEWS = 20  # photographs of a scene that has no gaps
 MAX_NAMED = 3  # photographs that a piece of advice names
 MAX_KEPT = 4096  # thumbnails and judgements in memory
+LARGE_PIXELS = 24_000_000  # of a photograph, above which it is decoded in a process of its own
+REDUCED_SIDE, MAX_LARGE_KEPT = 1600, 64  # pixels of the copy of a large photograph, up to twice that; copies in memory
+BYTES_PER_PIXEL, REDUCE_SECONDS = 2, 120.0  # times DECODING_COPIES: memory of that process; its longest time
+
+_reducing = threading.Lock()  # one large photograph at a time
 MAX_COMPARED = 100  # photographs; more of them leave no gaps, and take long to compare
 
 
@@ -38,23 +58,70 @@ class Advice:
     names: list[str]
 
 
+def _listing(look: Look) -> dict[str, Path]:
+    films = (path for path in look.entries(look.folder) if is_film(path))
+    found = itertools.islice(itertools.chain(walk(look.folder, list_entries=look.entries), films), MAX_FILES + 1)
+    names = {path.relative_to(look.folder).as_posix(): path for path in found}
+    look.is_cut |= len(names) > MAX_FILES
+    return {name: names[name] for name in sorted(names, key=natural)[:MAX_FILES]}
+
+
+def _first(look: Look) -> Path | None:
+    films = (path for path in look.entries(look.folder) if is_film(path))
+    return next(itertools.chain(walk(look.folder, list_entries=look.entries), films), None)
+
+
+_listings, _firsts = Finder(_listing), Finder(_first)
+
+
 def files_of(folder: Path) -> dict[str, Path]:
-    """Photographs and videos of a folder by name, in natural order; of a file the file itself."""
+    """Photographs and videos of a folder by name, in natural order, as far as the bounds of a `Look`; of a file the
+    file itself."""
     if folder.is_file():
         return {folder.name: folder}
-    if not folder.is_dir():
-        return {}
-    films = [path for path in folder.iterdir() if is_film(path)]
-    found = {path.relative_to(folder).as_posix(): path for path in [*walk(folder), *films]}
-    return {name: found[name] for name in sorted(found, key=natural)}
+    found = _listings(folder)
+    return dict(found[1]) if found else {}
+
+
+def first_of(folder: Path, until: float) -> tuple[Path | None, str]:
+    """A photograph or video of a folder for its card, and a sentence where there is none to be had.
+
+    until: moment (time.monotonic) after which no folder is looked through
+    """
+    if folder.is_file():
+        return folder, ""
+    found = _firsts(folder, until)
+    return (None, "") if found is None else (found[1], "" if found[1] else found[0].sentence)
+
+
+def listing_fault(item: Item) -> str:
+    """A sentence where the photographs of an item are not all listed; empty otherwise."""
+    folder = folder_of(item)
+    found = None if item.kind == "run" or folder.is_file() else _listings(folder)
+    return found[0].sentence if found else ""
+
+
+def named_file(folder: Path, name: str) -> Path | None:
+    """Photograph or video below a folder by its name; None for any other name. Of a file the file itself."""
+    if folder.is_file():
+        return folder if name == folder.name else None
+    parts = PurePosixPath(name).parts
+    path = folder.joinpath(*parts)
+    if any(part.startswith(("/", ".")) for part in parts) or not is_file(path):
+        return None
+    is_inside = path.parent.resolve() == folder.resolve().joinpath(*parts[:-1])  # no link leads to its folder
+    return path if is_inside and (path.suffix.lower() in PHOTOGRAPHS or is_raw(path) or is_film(path)) else None
+
+
+def folder_of(item: Item) -> Path:
+    """Folder of an item's photographs, or its video; of a scene its folder of images."""
+    images = item.path / "images"
+    return images if item.kind == "scene" and images.is_dir() else item.photographs
 
 
 def photographs_of(item: Item) -> dict[str, Path]:
-    """Photographs or the video of an item by name; of a scene those in its folder of images."""
-    if item.kind == "run":
-        return {}
-    images = item.path / "images"
-    return files_of(images if item.kind == "scene" and images.is_dir() else item.photographs)
+    """Photographs or the video of an item by name."""
+    return {} if item.kind == "run" else files_of(folder_of(item))
 
 
 def is_film(path: Path) -> bool:
@@ -85,9 +152,12 @@ def thumbnail(path: Path, side: int = THUMBNAIL_SIDE) -> bytes:
 
 @lru_cache(MAX_KEPT)
 def _thumbnail(path: Path, modified: int, size: int, side: int) -> bytes:
-    reads_heic()
     try:
-        image = first_frame(path) if is_film(path) else opened(path, side)
+        if is_film(path):
+            image = first_frame(path)
+        else:
+            with opened(path) as whole:
+                image = ImageOps.exif_transpose(reduced(whole, side))
         image.thumbnail((side, side))
         out = io.BytesIO()
         image.save(out, "JPEG", quality=80)
@@ -98,12 +168,56 @@ def _thumbnail(path: Path, modified: int, size: int, side: int) -> bytes:
     return out.getvalue()
 
 
-def opened(path: Path, side: int) -> Image.Image:
-    if path.suffix.lower() not in PHOTOGRAPHS and path.suffix.lower() != ".png":
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Image.Image]:
+    """A photograph to be seen small; of a large one a copy of about REDUCED_SIDE pixels, as it is stored."""
+    if path.suffix.lower() not in PHOTOGRAPHS:
         raise LumigraphError(f"{path.name} is a raw file, which is developed when the scene is made")
+    reads_heic()
     with Image.open(path) as image:
-        image.draft("RGB", (2 * side, 2 * side))
-        return ImageOps.exif_transpose(eight_bits(image).convert("RGB"))
+        if not is_large(image):
+            yield image
+            return
+        size = image.size
+    about = path.stat()
+    with _reducing:
+        data = _reduced(path, about.st_mtime_ns, about.st_size, size)
+    with Image.open(io.BytesIO(data)) as image:
+        yield image
+
+
+def is_large(image: Image.Image) -> bool:
+    """True if decoding takes much memory. JPEG is reduced while it is decoded, but for progressive files."""
+    is_baseline = image.format in ("JPEG", "MPO") and not image.info.get("progressive")
+    return not is_baseline and math.prod(image.size) > LARGE_PIXELS
+
+
+def is_large_file(path: Path) -> bool:
+    """True if the thumbnail of a photograph takes much memory, by its header."""
+    with contextlib.suppress(Exception):  # image libraries raise anything for a damaged file
+        reads_heic()
+        with Image.open(path) as image:
+            return is_large(image)
+    return False
+
+
+@lru_cache(MAX_LARGE_KEPT)
+def _reduced(path: Path, modified: int, size: int, pixels: tuple[int, int]) -> bytes:
+    """JPEG of a large photograph, made in a process of its own; the caller holds `_reducing`."""
+    try:
+        check_pixels(pixels, BYTES_PER_PIXEL)
+    except ValueError as fault:
+        raise LumigraphError(f"{path.name} cannot be shown: {fault}; close programs, or leave it out") from fault
+    command = [sys.executable, "-P", reduce.__file__, str(path.absolute()), str(REDUCED_SIDE)]
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with start(command, signal.SIGKILL, **pipes) as child:
+        try:
+            made = child.communicate(timeout=REDUCE_SECONDS)[0]
+        finally:
+            child.kill()
+    if child.returncode:
+        raise LumigraphError(f"{path.name} cannot be shown; copy it again, or leave it out")
+    return bytes(made)
 
 
 def first_frame(path: Path) -> Image.Image:
@@ -114,14 +228,17 @@ def first_frame(path: Path) -> Image.Image:
 
 
 def version_of(path: Path) -> str:
-    """Short name of a file's present content, for addresses that browsers may keep."""
-    about = path.stat()
+    """Short name of a file's present content, for addresses that browsers may keep; empty if the file is gone."""
+    try:
+        about = path.stat()
+    except OSError:
+        return ""
     return hashlib.blake2b(f"{about.st_mtime_ns} {about.st_size}".encode(), digest_size=6).hexdigest()
 
 
 @lru_cache(MAX_COMPARED)
 def _details(path: Path, modified: int, size: int) -> Descriptors:
-    with Image.open(path) as image:
+    with opened(path) as image:
         return details(image)
 
 
@@ -140,11 +257,9 @@ def too_far(files: Mapping[str, Path]) -> list[str]:
 
 @lru_cache(MAX_KEPT)
 def _judged(path: Path, modified: int, size: int) -> tuple[Judgement, tuple[int, int]] | None:
-    reads_heic()
     try:
-        with Image.open(path) as image:
-            full = image.size
-            return judge(image), full
+        with opened(path) as image:
+            return judge(image), image.size
     except Exception:  # image libraries raise anything for a damaged file
         return None
 

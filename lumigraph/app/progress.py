@@ -6,9 +6,11 @@ import contextlib
 import re
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections import Counter
 from contextlib import closing
+from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +19,16 @@ from jaxtyping import Float
 
 from ..budget import Budget
 from ..capture.motion.reconstruction import SNAPSHOTS
+from ..capture.motion.stages import StageMark
 from ..errors import LumigraphError
 from ..files import read_json
 from ..files.names import natural
+from ..files.ranges import Tally
 from ..geometry import evenly
 from ..metrics.rows import last_psnr
 from .job_record import Making
 from .jobs import log_lines, run_folder
-from .projects import SCENE, Item, newest
+from .projects import SCENE, Item, changed_at, newest
 
 STAGES = {
     "features": "Finding details",
@@ -36,76 +40,100 @@ STAGES = {
 }
 WEIGHTS = {"features": 0.4, "matching": 0.3, "mapping": 0.15, "unfolding": 0.02, "completing": 0.11, "lenses": 0.02}
 MAX_FEATURES, MAX_POINTS, MAX_CAMERAS = 1500, 4000, 1000  # that a page draws
+MAX_ROWS, QUERY_STEPS, QUERY_SECONDS = 100_000, 10_000, 2.0  # rows of an answer of COLMAP's database; its longest time
+MAX_IMAGES = 2147483647  # of COLMAP: the number of a pair is one image's number times this, and the other's
+DATABASE = Path("work", "database.db")  # in the folder of a scene
+MAX_ENTRIES = 1000  # of a folder whose age is looked for
 CURVE_POINTS = 80
 PERCENT = re.compile(r"(\d+) of (\d+)")
+
+
+@dataclass(frozen=True)
+class CaptureRecord:
+    """Contents of capture.json, the fields in use; see `Diagnosis`."""
+
+    given: Tally = 0
+    used: Tally = 0
+    points: Tally = 0
+    error: float = 0.0
+    angle: float | None = None
+    registered: list[str] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+    blurred: dict[str, str] = field(default_factory=dict)
+    duplicates: dict[str, str] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    findings: list[dict[str, Any]] = field(default_factory=list)
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 def photographs_state(item: Item) -> dict[str, dict[str, Any]]:
     """State of each photograph by name: features, photographs that match, whether it is placed and why not."""
     found: dict[str, dict[str, Any]] = {}
-    database = item.path / SCENE / "work" / "database.db"
-    for name, features, matched in rows_of(database):
+    for name, features, matched in rows_of(item.path / SCENE / DATABASE):
         found[name] = {"features": features, "matched": matched}
-    if (result := capture_result(item)) is not None:
-        for name in result.get("registered", []):
+    result = None
+    with contextlib.suppress(LumigraphError):  # the page of the item says so
+        result = capture_result(item)
+    if result is not None:
+        for name in result.registered:
             found.setdefault(name, {})["placed"] = True
         for group in ("left_out", "blurred", "duplicates"):
-            for name, why in result.get(group, {}).items():
+            for name, why in getattr(result, group).items():
                 found.setdefault(name, {})[group] = why
     return {name: found[name] for name in sorted(found, key=natural)}
 
 
 def rows_of(database: Path) -> list[tuple[str, int | None, int]]:
     """Photographs of COLMAP's database: name, number of features, number of photographs that show the same."""
-    with read_only(database) as connection:
-        if connection is None:
-            return []
-        images = connection.execute(
-            "SELECT images.image_id, name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
-        ).fetchall()
-        pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows >= 15").fetchall()
-    matched: dict[int, int] = {}
-    for (pair,) in pairs:
-        for image in divmod(pair, 2147483647):
-            matched[image] = matched.get(image, 0) + 1
-    return [(name, features, matched.get(number, 0)) for number, name, features in images]
+    images = query(
+        database, "SELECT images.image_id, name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
+    )
+    pairs = query(database, "SELECT pair_id FROM two_view_geometries WHERE rows >= 15")
+    matched = Counter(image for (pair,) in pairs if isinstance(pair, int) for image in divmod(pair, MAX_IMAGES))
+    return [
+        (name, features if isinstance(features, int) else None, matched[number])
+        for number, name, features in images
+        if isinstance(name, str)
+    ]
 
 
-@contextlib.contextmanager
-def read_only(database: Path) -> Iterator[sqlite3.Connection | None]:
-    """COLMAP's database while COLMAP writes it; None where there is none yet, or it is being written just now."""
+def query(database: Path, question: str, *values: Any) -> list[tuple[Any, ...]]:
+    """Rows of COLMAP's database while COLMAP writes it. None where there is no database yet, or it is locked, has other
+    tables or is damaged, and none of a question that takes long."""
     if not database.is_file():
-        yield None
-        return
+        return []
+    end = time.monotonic() + QUERY_SECONDS
     try:
         with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.2)) as connection:
-            connection.execute("SELECT 1 FROM images LIMIT 1")
-            yield connection
+            connection.set_progress_handler(lambda: time.monotonic() > end, QUERY_STEPS)
+            return connection.execute(f"{question} LIMIT {MAX_ROWS}", values).fetchall()
     except sqlite3.Error:
-        yield None
+        return []
 
 
 def features(item: Item, name: str) -> list[list[float]]:
-    """Some features of a photograph, x and y as shares of its width and height."""
-    with read_only(item.path / SCENE / "work" / "database.db") as connection:
-        if connection is None:
+    """Some features of a photograph, x and y as shares of its width and height; none of a damaged table."""
+    rows = query(
+        item.path / SCENE / DATABASE,
+        "SELECT cols, data, width, height FROM images JOIN keypoints USING (image_id) "
+        "JOIN cameras USING (camera_id) WHERE name = ?",
+        name,
+    )
+    for columns, data, width, height in rows[:1]:
+        if not all(isinstance(number, int) and number > 0 for number in (columns, width, height)) or columns < 2:
             return []
-        row = connection.execute(
-            "SELECT keypoints.rows, cols, data, width, height FROM images JOIN keypoints USING (image_id) "
-            "JOIN cameras USING (camera_id) WHERE name = ?",
-            (name,),
-        ).fetchone()
-    if row is None:
-        return []
-    count, columns, data, width, height = row
-    table = np.frombuffer(data, np.float32).reshape(count, columns)[:, :2] / (width, height)
-    return np.round(table[:: max(1, len(table) // MAX_FEATURES)], 4).tolist()
+        if not isinstance(data, bytes) or len(data) % (4 * columns):
+            return []
+        table = np.frombuffer(data, np.float32).reshape(-1, columns)[:, :2] / (width, height)
+        table = table[np.isfinite(table).all(1)]
+        return np.round(table[:: max(1, len(table) // MAX_FEATURES)], 4).tolist()
+    return []
 
 
-def capture_result(item: Item) -> dict[str, Any] | None:
-    """Contents of capture.json; None before the capture is done."""
+def capture_result(item: Item) -> CaptureRecord | None:
+    """Contents of capture.json; None before the capture is done. Raises LumigraphError for a damaged file."""
     path = item.path / SCENE / "capture.json"
-    return read_json(path) if path.is_file() else None
+    return read_json(path, CaptureRecord) if path.is_file() else None
 
 
 def progress_of(item: Item, job: Making) -> dict[str, Any]:
@@ -116,13 +144,16 @@ def progress_of(item: Item, job: Making) -> dict[str, Any]:
 def capture_progress(item: Item) -> dict[str, Any]:
     """Stage of a capture under way: its name, the share of the whole that is over, seconds that are left if known."""
     marks = item.path / SCENE / "work" / "stages.json"
-    done = read_json(marks) if marks.is_file() else {}
+    try:
+        done = read_json(marks, dict[str, StageMark]) if marks.is_file() else {}
+    except LumigraphError as fault:
+        return {"stage": str(fault), "share": 0.0, "said": ""}
     said = next((line for line in reversed(log_lines(item)) if ": " in line and PERCENT.search(line)), "")
     share, stage = 0.03, "Looking at photographs"
     for name, title in STAGES.items():
         if name not in done:
             break
-        if done[name]["done"]:
+        if done[name].done:
             share += 0.95 * WEIGHTS[name]
         else:
             stage, (count, total) = title, within_stage(item, name, said)
@@ -136,7 +167,7 @@ def capture_progress(item: Item) -> dict[str, Any]:
 def within_stage(item: Item, stage: str, said: str) -> tuple[int, int]:
     """Count and total of a stage: of photographs with features, else by the last line of the log."""
     if stage == "features":  # those of an earlier start count too, unlike in the log
-        rows = rows_of(item.path / SCENE / "work" / "database.db")
+        rows = rows_of(item.path / SCENE / DATABASE)
         return sum(features is not None for _, features, _ in rows), len(rows)
     found = PERCENT.search(said)
     return (int(found[1]), int(found[2])) if found else (0, 0)
@@ -154,13 +185,10 @@ def model_folder(item: Item) -> Path | None:
 
 def model(item: Item) -> dict[str, Any]:
     """Cameras and sparse points for the page: up is +z, about the middle of the points and one unit wide."""
-    place = model_folder(item)
-    if place is None:
-        return {"version": "", "cameras": [], "points": []}
-    try:
-        return {"version": place.name, **_model(place, (place / "points3D.bin").stat().st_mtime_ns)}
-    except Exception:  # a snapshot that is being written, or deleted
-        return {"version": "", "cameras": [], "points": []}
+    with contextlib.suppress(Exception):  # a snapshot that is being written, or deleted, or a damaged one
+        if (place := model_folder(item)) is not None:
+            return {"version": place.name, **_model(place, (place / "points3D.bin").stat().st_mtime_ns)}
+    return {"version": "", "cameras": [], "points": []}
 
 
 @lru_cache(4)
@@ -214,8 +242,8 @@ def training_progress(item: Item, job: Making) -> dict[str, Any]:
     try:
         run = Run(folder)
         rows, budget = run.metrics(), Budget.from_json(run.settings.budget)
-    except LumigraphError as fault:
-        return {"stage": str(fault), "share": 0.0}
+    except Exception as fault:  # a received run may hold anything
+        return {"stage": sentence_of(folder, fault), "share": 0.0}
     if not rows:
         return {"stage": "Compiling kernels", "share": 0.0, "method": run.method_name}
     last = rows[-1]
@@ -244,9 +272,16 @@ def seconds_left(budget: Budget, step: int, seconds: float) -> float | None:
     return max(budget.total - step, 0) * seconds / step if step else None
 
 
+def sentence_of(path: Path, fault: Exception) -> str:
+    """A sentence for a fault in the files of an item or run."""
+    if isinstance(fault, LumigraphError):
+        return str(fault)
+    return f"{path} has files that cannot be understood ({type(fault).__name__}); restore them from a copy"
+
+
 def card_of_run(folder: Path) -> dict[str, Any]:
     """Method, PSNR, and previews of a run, for its card; empty for what cannot be read."""
-    with contextlib.suppress(LumigraphError):
+    with contextlib.suppress(Exception):  # a received run may hold anything
         return _card(folder, newest(folder))
     return {"method": "", "psnr": None}
 
@@ -276,8 +311,7 @@ def picture_of_run(folder: Path) -> Path | None:
 
 def age(path: Path) -> float:
     """Seconds since a folder, or something just inside it, changed."""
-    times = [path.stat().st_mtime]
-    for one in path.iterdir() if path.is_dir() else ():
-        with contextlib.suppress(OSError):  # a file that is being replaced
-            times.append(one.stat().st_mtime)
-    return max(0.0, time.time() - max(times))
+    inner: list[Path] = []
+    with contextlib.suppress(OSError):  # it is a file, or has gone
+        inner = list(islice(path.iterdir(), MAX_ENTRIES))
+    return max(0.0, time.time() - max(map(changed_at, [path, *inner])))

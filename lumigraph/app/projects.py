@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import LumigraphError
-from ..exchange import size_of
-from ..files import explained, read_json, remove, write_json
+from ..files import exists, explained, is_file, read_json, remove, write_json
 from ..files.names import natural
+from .folders import size_within
 
 PROJECT_FILE, JOB_FILE, LOG_FILE = "project.json", "job.json", "app.log"
 PHOTOS, SCENE, RUNS, SHARED = "photos", "scene", "runs", "shared"
@@ -85,7 +85,7 @@ class Item:
         """Contents of project.json; of another item its name and date."""
         if self.kind == "project":
             return read_json(self.path / PROJECT_FILE, ProjectRecord)
-        return ProjectRecord(self.path.name, self.path.stat().st_mtime)
+        return ProjectRecord(self.path.name, changed_at(self.path))
 
     def keep(self, record: ProjectRecord) -> None:
         write_json(self.path / PROJECT_FILE, asdict(record), ours=True)
@@ -104,7 +104,7 @@ class Item:
             return [self.path] if self.kind == "run" else []
         folder = self.path / RUNS
         found = [path for path in folder.iterdir() if is_run(path) or is_splats(path)] if folder.is_dir() else []
-        return sorted(found, key=lambda path: (path.stat().st_mtime, natural(path.name)))
+        return sorted(found, key=lambda path: (changed_at(path), natural(path.name)))
 
     def run(self, name: str) -> Path:
         """One of its runs by name. Raises LumigraphError if there is none."""
@@ -115,7 +115,7 @@ class Item:
 
 
 def is_run(path: Path) -> bool:
-    return (path / "config.json").is_file() or (path / "blocks.json").is_file()
+    return is_file(path / "config.json") or is_file(path / "blocks.json")
 
 
 def is_splats(path: Path) -> bool:
@@ -132,7 +132,15 @@ def newest(folder: Path) -> tuple[int, ...]:
 def items(root: Path) -> list[Item]:
     """Projects, runs and scenes of a folder, the latest first."""
     found = [Item(root, path) for shelf in SHELVES for path in candidates(root / shelf)]
-    return sorted(found, key=lambda item: item.path.stat().st_mtime, reverse=True)
+    return sorted(found, key=lambda item: changed_at(item.path), reverse=True)
+
+
+def changed_at(path: Path) -> float:
+    """Time of change in seconds; 0 for a file or folder that is gone or cannot be read."""
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def candidates(folder: Path) -> Iterator[Path]:
@@ -140,11 +148,14 @@ def candidates(folder: Path) -> Iterator[Path]:
         return
     with explained(folder):
         paths = list(folder.iterdir())
-    for path in paths:
-        if path.name.startswith(".") or SEPARATOR in path.name or not path.is_dir():
-            continue
-        if any((path / name).exists() for name in (PROJECT_FILE, *SCENE_FILES)) or is_run(path):
-            yield path
+    yield from filter(is_item, paths)
+
+
+def is_item(path: Path) -> bool:
+    """True for the folder of a project, run or scene."""
+    if path.name.startswith(".") or SEPARATOR in path.name or not os.path.isdir(path):
+        return False
+    return any(exists(path / name) for name in (PROJECT_FILE, *SCENE_FILES)) or is_run(path)
 
 
 def find_item(root: Path, key: str) -> Item:
@@ -152,7 +163,7 @@ def find_item(root: Path, key: str) -> Item:
     parts = key.split(SEPARATOR)
     path = root.joinpath(*parts) if all(map(is_plain_name, parts)) else None
     shelves = {root / shelf for shelf in SHELVES}
-    if path is None or path.parent not in shelves or path not in set(candidates(path.parent)):
+    if path is None or path.parent not in shelves or not is_item(path):
         raise LumigraphError(f"There is no scene {key[:80]!r} here; load the page again")
     return Item(root, path)
 
@@ -283,15 +294,19 @@ def restore(root: Path, name: str) -> Item:
     return item
 
 
-def trash(root: Path) -> list[dict[str, Any]]:
-    """Deleted items, the latest first."""
+def trash(root: Path, until: float) -> list[dict[str, Any]]:
+    """Deleted items, the latest first. until: moment (time.monotonic) after which no sizes are counted"""
     folder = trash_folder(root)
     found: list[dict[str, Any]] = []
     for about in folder.glob("*.json") if folder.is_dir() else ():
         place = about.with_suffix("")
-        if place.is_dir():
+        if not place.is_dir():
+            continue
+        try:
             record = read_json(about, TrashRecord)
-            found.append({"name": place.name, "bytes": size_of(place)} | asdict(record))
+        except LumigraphError:  # such an item can still be moved back by hand, or deleted with the others
+            record = TrashRecord(place.name, place.name, 0.0)
+        found.append({"name": place.name, "bytes": size_within(place, until)} | asdict(record))
     return sorted(found, key=lambda one: one["deleted"], reverse=True)
 
 

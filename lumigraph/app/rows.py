@@ -7,9 +7,9 @@ from typing import Any
 
 from ..budget import QUALITIES
 from ..errors import LumigraphError
-from ..exchange import size_of
 from . import pictures, progress
 from .comparison import comparison, rendering
+from .folders import size_within
 from .job_record import Making, ShareJob, read_job
 from .jobs import log_lines
 from .projects import SCENE, SHARED, Item
@@ -18,39 +18,45 @@ MIN_PLACED_SHARE = 0.9  # of the photographs, below which the other mapper is of
 MAX_MESSAGES = 30  # lines of a log on the page
 
 
-def card(item: Item) -> dict[str, Any]:
-    """Card of an item on the home page."""
+def card(item: Item, until: float) -> dict[str, Any]:
+    """Card of an item on the home page. until: moment (time.monotonic) after which no folder is looked through"""
+    row = {"key": item.key, "kind": item.kind, "title": item.path.name, "age": progress.age(item.path), "bytes": None}
     try:
         record = item.record
         runs = [path for path in item.runs if path.is_dir()]
         about = progress.card_of_run(runs[-1]) if runs else {"method": "", "psnr": None}
         job = read_job(item).make
-        size = size_of(item.path)
-    except LumigraphError as fault:
-        return {"key": item.key, "kind": item.kind, "title": item.path.name, "fault": str(fault), "age": 0, "bytes": 0}
+        share = progress.progress_of(item, job)["share"] if job and job.state == "running" else None
+    except Exception as fault:  # a received folder may hold anything
+        return row | {"fault": progress.sentence_of(item.path, fault)}
     picture = next((path for run in reversed(runs) if (path := progress.picture_of_run(run))), None)
-    picture = picture or next(iter(pictures.photographs_of(item).values()), None)
-    return {
-        "key": item.key,
-        "kind": item.kind,
+    found, missing = (picture, "") if picture or item.kind == "run" else first_photograph(item, until)
+    return row | {
         "title": record.title,
-        "picture": pictures.version_of(picture) if picture else "",
-        "age": progress.age(item.path),
-        "bytes": size,
+        "picture": pictures.version_of(found) if found else "",
+        "bytes": size_within(item.path, until),
         "state": job.state if job else "",
-        "share": progress.progress_of(item, job)["share"] if job and job.state == "running" else None,
-        "fault": job.fault if job else "",
+        "share": share,
+        "fault": job.fault if job and job.fault else missing,
         "runs": len(runs),
         **about,
     }
 
 
+def first_photograph(item: Item, until: float) -> tuple[Path | None, str]:
+    return pictures.first_of(pictures.folder_of(item), until)
+
+
 def run_row(path: Path) -> dict[str, Any]:
-    about = progress.card_of_run(path) if path.is_dir() else {"method": path.suffix, "psnr": None, "trained": True}
+    row = {"name": path.name, "bytes": size_within(path), "age": progress.age(path), "compared": None, "picture": ""}
+    if not path.is_dir():
+        return row | {"method": path.suffix, "psnr": None, "trained": True}
     picture = progress.picture_of_run(path)
-    row = {"name": path.name, "bytes": size_of(path), "age": progress.age(path), **about}
-    row["compared"] = comparison(path)
-    return row | {"picture": pictures.version_of(picture) if picture else ""}
+    row |= progress.card_of_run(path) | {"picture": pictures.version_of(picture) if picture else ""}
+    try:
+        return row | {"compared": comparison(path)}
+    except Exception as fault:  # a received run may hold anything
+        return row | {"fault": progress.sentence_of(path, fault)}
 
 
 def making_row(item: Item, job: Making) -> dict[str, Any]:
@@ -75,17 +81,17 @@ def share_row(item: Item, share: ShareJob) -> dict[str, Any]:
 
 
 def result_of(item: Item) -> dict[str, Any] | None:
-    """Findings of the capture: photographs placed and left out, warnings, and what to do."""
+    """Findings of the capture: photographs placed and left out, warnings, and what to do. Raises LumigraphError for a
+    damaged capture.json."""
     result = progress.capture_result(item)
     if result is None:
         return None
     names = ("given", "left_out", "blurred", "duplicates", "warnings", "error", "points", "angle", "findings")
-    kept = {name: result.get(name) for name in names} | {"placed": len(result.get("registered", []))}
-    mapper = result.get("options", {}).get("mapper", "incremental")
-    folded = any("folded" in one or "far apart" in one or "leap" in one for one in result.get("warnings", []))
-    few = len(result.get("registered", [])) < MIN_PLACED_SHARE * (result.get("used") or 0)
+    placed, mapper = len(result.registered), result.options.get("mapper", "incremental")
+    folded = any("folded" in one or "far apart" in one or "leap" in one for one in result.warnings)
     other = "global" if mapper == "incremental" else "incremental"
-    return kept | {"mapper": mapper, "try": other if folded or few else ""}
+    tried = other if folded or placed < MIN_PLACED_SHARE * result.used else ""
+    return {name: getattr(result, name) for name in names} | {"placed": placed, "mapper": mapper, "try": tried}
 
 
 def picture(item: Item, name: str, run: str) -> Path:
@@ -96,15 +102,15 @@ def picture(item: Item, name: str, run: str) -> Path:
     found: Path | None = None
     if name and run:
         found = rendering(item.run(run), name)
-    elif name:
-        made = pictures.files_of(item.path / SCENE / "images")
-        plain = name.removeprefix("images/")  # as a scene names it
-        found = pictures.photographs_of(item).get(plain) or made.get(plain)
+    elif name and item.kind != "run":
+        found = pictures.named_file(pictures.folder_of(item), name)
+        made = item.path / SCENE / "images"
+        found = found or pictures.named_file(made, name.removeprefix("images/"))  # as a scene names it
     elif run:
         found = progress.picture_of_run(item.run(run))
     else:
         found = next(filter(None, map(progress.picture_of_run, reversed(item.runs))), None)
-        found = found or next(iter(pictures.photographs_of(item).values()), None)
+        found = found or (None if item.kind == "run" else first_photograph(item, float("inf"))[0])
     if found is None:
         raise LumigraphError("There is no such picture; load the page again")
     return found

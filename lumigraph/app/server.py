@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
+import json
+import math
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import quote
@@ -27,7 +30,7 @@ from websockets.http11 import Request as PlainRequest
 from .. import methods
 from ..budget import Quality
 from ..errors import LumigraphError
-from ..files import expanded
+from ..files import expanded, refusal
 from ..files.locks import held
 from ..files.ranges import Count, Downscale, Pixels
 from ..viewer.address import Address
@@ -41,7 +44,8 @@ from .scene_views import SceneViews, answers, forward, forward_messages
 PAGE = Path(__file__).parent / "page"
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_BODY_BYTES = 1 << 16  # of a request that is no upload
-SLOW_THREADS = 2  # that decode photographs
+SLOW_THREADS = 2  # that decode photographs; large ones have a thread of their own
+HOME_SECONDS = 0.3  # that an answer for the home page may look through folders
 SWEEP_SECONDS = 15.0  # between looks for viewers without clients
 CONTENT_SECURITY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -99,6 +103,29 @@ class RunBody(msgspec.Struct, forbid_unknown_fields=True):
     run: ShortName = ""
 
 
+class Answer(JSONResponse):
+    """JSON that any browser reads, also of received files: numbers that are not finite become null, and letters that
+    are no Unicode, as names of files may have, escapes."""
+
+    def render(self, content: Any) -> bytes:
+        try:
+            return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+        except ValueError:
+            return json.dumps(finite(content), separators=(",", ":")).encode()
+
+
+def finite(value: Any) -> Any:
+    """JSON with null for numbers that are not finite."""
+    match value:
+        case dict():
+            return {key: finite(one) for key, one in value.items()}
+        case list() | tuple():
+            return [finite(one) for one in value]
+        case float() if not math.isfinite(value):
+            return None
+    return value
+
+
 class Gate:
     """The viewer's guard as ASGI middleware: requests and websockets that it refuses get 403 and reach no route."""
 
@@ -148,10 +175,13 @@ class App:
         self.runner = Runner(self.root, program)
         self.views = SceneViews(self.root / APP_FOLDER, program)
         self._slow = ThreadPoolExecutor(SLOW_THREADS, "slow")
+        self._large = ThreadPoolExecutor(1, "large")
 
-    async def later(self, answer: Callable[..., Any], *arguments: Any) -> Any:
-        """Result of work that takes long, in threads of its own, so that uploads need not wait for it."""
-        return await asyncio.get_running_loop().run_in_executor(self._slow, answer, *arguments)
+    async def later(self, answer: Callable[..., Any], *arguments: Any, is_large: bool = False) -> Any:
+        """Result of work that takes long, in threads of its own, so that uploads need not wait for it. is_large: it
+        decodes a large photograph, for which others need not wait"""
+        pool = self._large if is_large else self._slow
+        return await asyncio.get_running_loop().run_in_executor(pool, answer, *arguments)
 
     @property
     def is_local(self) -> bool:
@@ -166,14 +196,15 @@ class App:
     # Home
 
     def home(self) -> dict[str, Any]:
-        found = [rows.card(item) for item in projects.items(self.root)]
+        until = time.monotonic() + HOME_SECONDS
+        found = [rows.card(item, until) for item in projects.items(self.root)]
         waiting = [{"key": task.item.key, "share": task.share} for task in self.runner.queue()]
         return {
             "folder": str(self.root),
             "local": self.is_local,
             "phone": self.phone_url,
             "cards": found,
-            "trash": projects.trash(self.root),
+            "trash": projects.trash(self.root, until),
             "queue": waiting,
         }
 
@@ -199,6 +230,12 @@ class App:
         files = pictures.photographs_of(item)
         runs = [rows.run_row(path) for path in item.runs]
         current = self.runner.current
+        faults = [pictures.listing_fault(item), *(run.get("fault", "") for run in runs)]
+        result = None
+        try:
+            result = rows.result_of(item)
+        except LumigraphError as fault:
+            faults.append(str(fault))
         return {
             "key": item.key,
             "kind": item.kind,
@@ -215,7 +252,8 @@ class App:
             "make": rows.making_row(item, job.make) if job.make else None,
             "live": current is not None and current.item == item and current.port is not None,
             "shares": [rows.share_row(item, share) for share in reversed(job.shares)],
-            "result": rows.result_of(item),
+            "result": result,
+            "faults": list(filter(None, faults)),
             "queue": [task.item.key for task in self.runner.queue()],
         }
 
@@ -270,13 +308,17 @@ class App:
 
     def leave_out(self, item: Item, name: str) -> dict[str, Any]:
         """Move an uploaded photograph out of the scene, into a folder beside the photographs."""
-        files = pictures.files_of(item.photographs)
-        if name not in files or item.record.source or item.kind != "project":
+        is_own = item.kind == "project" and not item.record.source
+        if not is_own or pictures.named_file(item.photographs, name) is None:
             raise LumigraphError(f"{name[:80]!r} is not among the uploaded photographs; load the page again")
-        place = item.path / "left-out" / name
-        place.parent.mkdir(parents=True, exist_ok=True)
-        files[name].rename(place)
+        uploads.album(item.photographs).leave_out(name, item.path / "left-out")
         return self.detail(item)
+
+    def upload(self, key: str, name: str, size: str, crc: str) -> uploads.Upload:
+        item = self.item(key)
+        if item.kind != "project" or item.record.source:
+            raise LumigraphError("Photographs can be added to scenes that were made by uploads; make a new one")
+        return uploads.upload(item.photographs, name, whole(size), crc)
 
     def share(self, item: Item, body: ShareBody) -> dict[str, Any]:
         job = sharing.share_job(item, body.kind, item.run(body.run), time.time(), body.size)
@@ -335,7 +377,7 @@ def build(app: App) -> ASGIApp:
                 arguments.append(await asyncio.to_thread(app.item, request.path_params["key"]))
             if kind is not None:
                 arguments.append(await body_of(request, kind))
-            return JSONResponse(await asyncio.to_thread(answer, *arguments))
+            return Answer(await asyncio.to_thread(answer, *arguments))
 
         return route
 
@@ -346,34 +388,36 @@ def build(app: App) -> ASGIApp:
         about = {"Cache-Control": "no-cache", "Content-Security-Policy": CONTENT_SECURITY}
         return FileResponse(PAGE / name, media_type=MEDIA_TYPES[Path(name).suffix], headers=about)
 
+    async def opened(request: Request) -> uploads.Upload:
+        about = (request.query_params.get(name, "") for name in ("name", "size", "crc"))
+        return await asyncio.to_thread(app.upload, request.path_params["key"], *about)
+
     async def take(request: Request) -> Response:
-        item = await asyncio.to_thread(app.item, request.path_params["key"])
-        if item.kind != "project" or item.record.source:
-            raise LumigraphError("Photographs can be added to scenes that were made by uploads; make a new one")
-        query = request.query_params
-        file = uploads.upload(item.path / projects.PHOTOS, query.get("name", ""), whole(query.get("size", "")))
-        have = await file.take(whole(query.get("offset", "0")), request.stream())
-        return JSONResponse({"have": have, "name": file.name, "done": have == file.size})
+        offset = whole(request.query_params.get("offset", "0"))
+        return Answer(asdict(await (await opened(request)).take(offset, request.stream())))
 
     async def have(request: Request) -> Response:
-        item = await asyncio.to_thread(app.item, request.path_params["key"])
-        query = request.query_params
-        file = uploads.upload(item.path / projects.PHOTOS, query.get("name", ""), whole(query.get("size", "")))
-        return JSONResponse({"have": file.have(), "name": file.name})
+        return Answer(asdict(await asyncio.to_thread((await opened(request)).arrived)))
 
     async def leave_out(request: Request) -> Response:
         item = await asyncio.to_thread(app.item, request.path_params["key"])
-        return JSONResponse(await asyncio.to_thread(app.leave_out, item, request.query_params.get("name", "")))
+        return Answer(await asyncio.to_thread(app.leave_out, item, request.query_params.get("name", "")))
 
     async def picture(request: Request) -> Response:
-        return await app.later(picture_of, app.item(request.path_params["key"]), request)
+        item, query = await asyncio.to_thread(app.item, request.path_params["key"]), request.query_params
+        found = await asyncio.to_thread(rows.picture, item, query.get("name", ""), query.get("run", ""))
+        side = min(max(whole(query.get("side", "320")), 16), 2048)
+        is_large = await asyncio.to_thread(pictures.is_large_file, found)
+        small = await app.later(pictures.thumbnail, found, side, is_large=is_large)
+        kept = "max-age=86400" if "v" in query else "no-cache"
+        return Response(small, media_type="image/jpeg", headers={"Cache-Control": kept})
 
     async def advice(request: Request) -> Response:
-        return JSONResponse(await app.later(app.advice, app.item(request.path_params["key"])))
+        return Answer(await app.later(app.advice, app.item(request.path_params["key"])))
 
     async def marks(request: Request) -> Response:
         item, name = app.item(request.path_params["key"]), request.query_params.get("name", "")
-        return JSONResponse(await asyncio.to_thread(progress.features, item, name))
+        return Answer(await asyncio.to_thread(progress.features, item, name))
 
     async def code(request: Request) -> Response:
         if not app.phone_url:
@@ -393,11 +437,11 @@ def build(app: App) -> ASGIApp:
     async def forget(request: Request) -> Response:
         item = await asyncio.to_thread(app.item, request.path_params["key"])
         await asyncio.to_thread(jobs.forget_share, item, request.path_params["name"])
-        return JSONResponse(await asyncio.to_thread(app.detail, item))
+        return Answer(await asyncio.to_thread(app.detail, item))
 
     async def restore(request: Request) -> Response:
         item = await asyncio.to_thread(projects.restore, app.root, request.path_params["name"])
-        return JSONResponse({"key": item.key})
+        return Answer({"key": item.key})
 
     async def scene(request: Request) -> Response:
         port, _ = app.port_of(request.path_params["key"], request.path_params["run"])
@@ -468,15 +512,6 @@ SANDBOX = "sandbox allow-scripts; frame-ancestors 'self'"
 SHOWN_HEADERS = {"Content-Security-Policy": SANDBOX, "Cache-Control": "no-cache"}
 
 
-def picture_of(item: Item, request: Request) -> Response:
-    """A photograph by name, the preview of a run, or the picture of a card, small."""
-    query = request.query_params
-    side = min(max(whole(query.get("side", "320")), 16), 2048)
-    found = rows.picture(item, query.get("name", ""), query.get("run", ""))
-    kept = "max-age=86400" if "v" in query else "no-cache"
-    return Response(pictures.thumbnail(found, side), media_type="image/jpeg", headers={"Cache-Control": kept})
-
-
 def qr_code(text: str) -> bytes:
     """SVG of a QR code."""
     import segno
@@ -505,17 +540,17 @@ def whole(text: str) -> int:
 def refused(request: Request, fault: Exception) -> Response:
     """One sentence for a fault of a request."""
     if isinstance(fault, uploads.MisplacedError):
-        return JSONResponse({"fault": str(fault), "have": fault.have}, 409)
+        return Answer({"fault": str(fault), "have": fault.have}, 409)
     if isinstance(fault, uploads.DiskFullError):
-        return JSONResponse({"fault": str(fault)}, 507)
+        return Answer({"fault": str(fault)}, 507)
     if isinstance(fault, LumigraphError):
-        return JSONResponse({"fault": str(fault)}, 400)
+        return Answer({"fault": str(fault)}, 400)
     if isinstance(fault, msgspec.MsgspecError):
-        return JSONResponse({"fault": f"The page and the app do not fit ({fault}); load the page again"}, 400)
+        return Answer({"fault": f"The page and the app do not fit ({fault}); load the page again"}, 400)
     if isinstance(fault, ClientDisconnect):
-        return JSONResponse({"fault": "The connection ended"}, 400)
-    said = getattr(fault, "strerror", None) or str(fault)
-    return JSONResponse({"fault": f"{getattr(fault, 'filename', None) or 'A file'} could not be used ({said})"}, 500)
+        return Answer({"fault": "The connection ended"}, 400)
+    assert isinstance(fault, OSError)
+    return Answer({"fault": refusal(Path(os.fsdecode(fault.filename or "A file")), fault)}, 400)
 
 
 @contextlib.asynccontextmanager

@@ -1,12 +1,22 @@
 """Uploads: photographs and videos that a browser sends in pieces. Names, types, sizes and room are checked, and a file
-takes its name once it is whole and is what it says."""
+takes its name once it is whole and is what it says. Nothing that was given is replaced: a file of the same name with
+other content gets a number behind its name, and one with the same content is there once."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import errno
+import filecmp
+import itertools
+import os
 import re
 import shutil
-from collections.abc import AsyncIterator
+import threading
+import time
+import zlib
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -17,10 +27,15 @@ from ..files.names import counted
 MAX_PIECE_BYTES = 16 << 20  # bytes of one request
 MAX_FILE_BYTES = {"photograph": 1 << 30, "video": 32 << 30}
 MAX_FILES = 5000  # of one project
-MAX_NAME_BYTES, MAX_FOLDERS = 180, 4
+MAX_NAME_BYTES, MAX_FOLDER_BYTES, MAX_FOLDERS = 180, 40, 4  # of a whole name; of a folder in a name that is too long
 RESERVED_BYTES = 256 << 20  # of the disk, which stay free
-PARTIAL = ".{}.part"  # name of a file that is not whole yet
+CRC_BYTES = 1 << 20  # of a file that are read at a time
+PART = re.compile(r"\..+\.part")  # name of a file that is not whole yet
+PART_SECONDS = 7 * 86_400.0  # that part of an upload waits for the rest
+RELIST_SECONDS = 5.0  # between listings of a full folder
 DEVICE_NAME = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")  # of Windows, in any folder
+FORBIDDEN = re.compile(r'[\\/:*?"<>|]')  # in a name on some system
+NUMBERED = re.compile(r"(.+)-([1-9]\d{0,3})(\.[^./]+)")
 # The first bytes of containers. FFmpeg would also open lists of other files (HLS, concat) by their content.
 CONTAINERS = (
     (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"),  # MP4, MOV, 3GP
@@ -41,93 +56,223 @@ class MisplacedError(LumigraphError):
         self.have = have
 
 
+class Album:
+    """Uploaded photographs of a project, listed once: their number and names. lock: held to add or move one"""
+
+    def __init__(self, folder: Path):
+        self.folder, self.lock = folder, threading.RLock()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """List the folder, and delete parts of uploads that nobody continues."""
+        self._count, self._listed = 0, time.monotonic()
+        self._alike: dict[tuple[str, int], list[str]] = defaultdict(list)  # names by wanted name and size
+        self._numbers: dict[str, int] = {}  # the last number behind a name
+        for path in self.folder.rglob("*"):
+            with contextlib.suppress(OSError):
+                about = path.stat()
+                if PART.fullmatch(path.name) and time.time() - about.st_mtime > PART_SECONDS:
+                    path.unlink()
+        for name in listed(self.folder):
+            with contextlib.suppress(OSError):
+                self._note(name, (self.folder / name).stat().st_size)
+
+    def _note(self, name: str, size: int) -> None:
+        self._count += 1
+        self._alike[name, size].append(name)
+        if found := NUMBERED.fullmatch(name):
+            wanted, number = found[1] + found[3], int(found[2])
+            self._alike[wanted, size].append(name)
+            self._numbers[wanted] = max(number, self._numbers.get(wanted, 1))
+
+    def is_full(self) -> bool:
+        if self._count >= MAX_FILES and time.monotonic() - self._listed > RELIST_SECONDS:
+            self.refresh()  # some may have been deleted by hand
+        return self._count >= MAX_FILES
+
+    def find(self, name: str, size: int, is_same: Callable[[Path], bool]) -> str | None:
+        """Name of the file with this content among those of a wanted name."""
+        for one in dict.fromkeys([name, *self._alike.get((name, size), ())]):
+            place = self.folder / one
+            if place.is_file() and place.stat().st_size == size and is_same(place):
+                return one
+        return None
+
+    def add(self, file: Path, name: str) -> str:
+        """Move a whole file to a wanted name, or to one with a number behind it. Returns the name."""
+        name = free_name(self.folder, name, self._numbers.get(name, 1) + 1)
+        size = file.stat().st_size
+        file.rename(self.folder / name)
+        self._note(name, size)
+        return name
+
+    def leave_out(self, name: str, folder: Path) -> None:
+        """Move a photograph into another folder, where nothing is replaced either."""
+        with self.lock, explained(self.folder / name):
+            target = folder / free_name(folder, name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (self.folder / name).rename(target)
+            self._count -= 1
+
+
+_albums: dict[tuple[Path, int], Album] = {}  # by folder and its number on the disk
+_opening = threading.Lock()
+
+
+def album(folder: Path) -> Album:
+    """The album of a folder, which all requests share."""
+    with _opening, explained(folder):
+        folder.mkdir(exist_ok=True)
+        key = folder, folder.stat().st_ino
+        if key not in _albums:
+            _albums[key] = Album(folder)
+        return _albums[key]
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """State of an upload: bytes that have arrived, and once it is done, the name that the file has."""
+
+    have: int
+    name: str
+    done: bool = False
+
+
 @dataclass(frozen=True)
 class Upload:
-    """A file on its way into a folder.
+    """A file on its way into an album.
 
-    folder: photographs of a project; name: below it, with "/"; size: bytes of the whole file
+    name: wanted, with "/"; size: bytes of the whole file; crc: CRC-32 of its content in eight hexadecimal digits, by
+    which it goes on and is known to be there; empty if the sender has not computed it
     """
 
-    folder: Path
+    album: Album
     name: str
     size: int
-
-    @property
-    def place(self) -> Path:
-        return self.folder / self.name
+    crc: str = ""
 
     @property
     def partial(self) -> Path:
-        return self.place.with_name(PARTIAL.format(self.place.name))
+        place = self.album.folder / self.name
+        return place.with_name(f".{place.name}.{self.size}-{self.crc}.part")
 
-    def have(self) -> int:
-        """Bytes that have arrived."""
-        if self.place.is_file() and self.place.stat().st_size == self.size:
-            return self.size
-        return self.partial.stat().st_size if self.partial.is_file() else 0
+    def arrived(self) -> Arrived:
+        """State of this upload. Raises LumigraphError if it is new and the project has all the files that it may."""
+        have = self.partial.stat().st_size if self.partial.is_file() else 0
+        if 0 < have < self.size:
+            return Arrived(have, self.name)
+        if self.crc and (name := self.album.find(self.name, self.size, lambda place: crc_of(place) == self.crc)):
+            return Arrived(self.size, name, True)
+        self.check_number()
+        return Arrived(0, self.name)
 
-    async def take(self, offset: int, pieces: AsyncIterator[bytes]) -> int:
-        """Add a piece that begins at an offset. Returns the bytes that have arrived; at `size` the file has its name.
+    async def take(self, offset: int, pieces: AsyncIterator[bytes]) -> Arrived:
+        """Add a piece that begins at an offset: all of it, or nothing.
 
         Raises MisplacedError, DiskFullError, or LumigraphError with one sentence for a file that is refused.
         """
-        if self.have() == self.size and self.place.is_file():
-            return self.size
-        if offset != self.have():
-            raise MisplacedError(self.have())
-        check_room(self.folder, self.size - offset)
-        with explained(self.place):
-            self.place.parent.mkdir(parents=True, exist_ok=True)
-        arrived = 0
+        data = bytearray()
+        async for piece in pieces:
+            data += piece
+            if len(data) > MAX_PIECE_BYTES or offset + len(data) > self.size:
+                with self.album.lock:
+                    remove(self.partial)
+                raise LumigraphError(f"{self.name} is larger than announced; drop it again")
+        return await asyncio.to_thread(self.add, offset, data)
+
+    def add(self, offset: int, data: bytes | bytearray) -> Arrived:
+        with self.album.lock:
+            before = self.arrived()
+            if before.done:
+                return before
+            if offset != before.have:
+                raise MisplacedError(before.have)
+            check_room(self.album.folder, self.size - offset)
+            self._write(offset, data)
+            if (have := offset + len(data)) < self.size:
+                return Arrived(have, self.name)
+            return Arrived(have, self._finish(), True)
+
+    def _write(self, offset: int, data: bytes | bytearray) -> None:
         try:
-            with open(self.partial, "ab") as file:
-                async for piece in pieces:
-                    arrived += len(piece)
-                    if arrived > MAX_PIECE_BYTES or offset + arrived > self.size:
-                        raise LumigraphError(f"{self.name} is larger than announced; drop it again")
-                    file.write(piece)
+            self.partial.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.partial, "ab" if offset else "wb") as file:
+                file.write(data)
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise full(self.folder) from error
+                raise full(self.album.folder) from error
             raise LumigraphError(f"{self.name} could not be written ({error.strerror}); drop it again") from error
-        if (have := offset + arrived) == self.size:
-            self.finish()
-        return have
 
-    def finish(self) -> None:
+    def _finish(self) -> str:
         """Give a whole file its name. Raises LumigraphError, and deletes it, if it is not what it says."""
-        if fault := fault_of(self.partial, self.name):
+        try:
+            if fault := fault_of(self.partial, self.name):
+                raise LumigraphError(fault)
+            same = self.album.find(self.name, self.size, lambda place: filecmp.cmp(place, self.partial, shallow=False))
+            if same is not None:
+                return same
+            self.check_number()
+            with explained(self.album.folder / self.name):
+                return self.album.add(self.partial, self.name)
+        finally:
             remove(self.partial)
-            raise LumigraphError(fault)
-        with explained(self.place):
-            self.partial.replace(self.place)
+
+    def check_number(self) -> None:
+        if self.album.is_full():
+            raise LumigraphError(
+                f"{counted(MAX_FILES, 'file')} are the most of one scene; make another one of the rest"
+            )
 
 
-def upload(folder: Path, name: str, size: int) -> Upload:
+def upload(folder: Path, name: str, size: int, crc: str = "") -> Upload:
     """An upload into a project's photographs. Raises LumigraphError for names and sizes that are refused."""
-    name = checked_name(name)
+    name = safe_name(name)
     kind = kind_of_file(name)
     if kind is None:
         raise LumigraphError(f"{name} is no photograph and no video; drop JPEG, PNG, HEIC, raw files or a video")
     if not 0 < size <= MAX_FILE_BYTES[kind]:
         much = f"{MAX_FILE_BYTES[kind] >> 30} GB are the most for a {kind}"
         raise LumigraphError(f"{name} {'is empty' if size < 1 else f'has {size:,} bytes, and {much}'}; leave it out")
-    place = free_name(folder, name, size)
-    there = listed(folder)
-    if place not in there and len(there) >= MAX_FILES:
-        raise LumigraphError(f"{counted(MAX_FILES, 'file')} are the most of one scene; make another one of the rest")
-    return Upload(folder, place, size)
+    if crc and not re.fullmatch("[0-9a-f]{8}", crc):
+        raise LumigraphError(f"{crc[:20]!r} is no checksum; load the page again")
+    return Upload(album(folder), name, size, crc)
 
 
-def checked_name(name: str) -> str:
-    """A file's name below a folder of photographs. Raises LumigraphError for one that leads out of it, or that a system
-    would read in another way."""
-    parts = PurePosixPath(name).parts
-    unsafe = any(part in ("..", ".", "/") or part.startswith(".") or DEVICE_NAME.fullmatch(part) for part in parts)
-    unsafe = unsafe or not parts or bool(re.search(r'[\\:*?"<>|\x00-\x1f\x7f]', name)) or not name.isprintable()
-    if unsafe or len(name.encode()) > MAX_NAME_BYTES or len(parts) > MAX_FOLDERS or any(p.endswith(" ") for p in parts):
-        raise LumigraphError(f"{ascii(name[:60])} cannot be the name of a photograph here; rename it and drop it again")
-    return "/".join(parts)
+def safe_name(name: str) -> str:
+    """A file's name that every system takes, below a folder of photographs: without characters that cannot be read or
+    mean something else, and not too long. Raises LumigraphError for one that leads out of the folder."""
+    if ".." in re.split(r"[\\/]", name) or name.startswith(("/", "\\")):
+        raise LumigraphError(f"{readable(name)} leads out of the folder of photographs; rename it and drop it again")
+    *above, last = PurePosixPath(name).parts or [""]
+    folders = [safe_part(part) for part in map(readable, above) if part]
+    folders = [*folders[: MAX_FOLDERS - 2], *filter(None, ["-".join(folders[MAX_FOLDERS - 2 :])])]
+    last = visible(last).rstrip(". ")
+    if len("/".join([*folders, last]).encode()) > MAX_NAME_BYTES:
+        folders = [shortened(part, MAX_FOLDER_BYTES) for part in folders]
+    stem, dot, ending = last.rpartition(".")
+    room = MAX_NAME_BYTES - len("/".join([*folders, dot + ending]).encode())
+    stem = shortened(stem.strip(". "), room) or "photograph"
+    return "/".join([*folders, safe_part(stem + dot + ending)])
+
+
+def visible(text: str) -> str:
+    """Text without invisible characters, and with "-" for those that mean something else on some system."""
+    spaced = "".join(" " if letter.isspace() else letter for letter in text)
+    return FORBIDDEN.sub("-", "".join(filter(str.isprintable, spaced)))
+
+
+def readable(text: str) -> str:
+    """Visible text without spaces and dots around it."""
+    return visible(text).strip(". ")
+
+
+def shortened(text: str, size: int) -> str:
+    """The first letters of a text, as many as fit into so many bytes."""
+    return text.encode()[: max(size, 0)].decode(errors="ignore").rstrip(". ")
+
+
+def safe_part(part: str) -> str:
+    return f"_{part}" if DEVICE_NAME.fullmatch(part) else part
 
 
 def kind_of_file(name: str) -> str | None:
@@ -142,19 +287,26 @@ def kind_of_file(name: str) -> str | None:
     return "photograph" if ending in PHOTOGRAPHS or ending in RAW_SUFFIXES else None
 
 
-def free_name(folder: Path, name: str, size: int) -> str:
-    """The name itself; for another file of that name one with a number behind it."""
-    place, number = PurePosixPath(name), 1
-    while (there := folder / name).exists() and there.stat().st_size != size:
-        number += 1
-        name = place.with_stem(f"{place.stem}-{number}").as_posix()
-    return name
+def free_name(folder: Path, name: str, number: int = 2) -> str:
+    """The name itself; where it is taken, one with a number behind it. number: the first to try"""
+    place = PurePosixPath(name)
+    others = (place.with_stem(f"{place.stem}-{n}").as_posix() for n in itertools.count(number))
+    return next(one for one in itertools.chain([name], others) if not os.path.lexists(folder / one))
 
 
-def listed(folder: Path) -> list[str]:
+def listed(folder: Path) -> Iterator[str]:
     """Names of the whole files in a project's photographs, without hidden ones."""
     found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-    return [path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts)]
+    return (path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
+
+
+def crc_of(path: Path) -> str:
+    """CRC-32 of a file's content, as the page computes it."""
+    crc = 0
+    with open(path, "rb") as file:
+        while piece := file.read(CRC_BYTES):
+            crc = zlib.crc32(piece, crc)
+    return f"{crc:08x}"
 
 
 def check_room(folder: Path, size: int) -> None:

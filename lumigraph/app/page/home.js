@@ -61,7 +61,7 @@ export function Home({ say, choose, go }) {
       ${home && html`<footer class="faint">
         <span title=${home.folder}>${home.folder}</span>
         ${home.trash.length > 0 && html`<details class="menu"><summary>Trash: ${home.trash.length}</summary><div class="sheet up">
-          ${home.trash.map((one) => html`<div class="line" key=${one.name}><span>${one.title} · ${bytes(one.bytes)}</span>
+          ${home.trash.map((one) => html`<div class="line" key=${one.name}><span>${[one.title, one.bytes !== null && bytes(one.bytes)].filter(Boolean).join(" · ")}</span>
             <button onClick=${() => act(() => api("POST", `trash/${encodeURIComponent(one.name)}`))}>Put back</button></div>`)}
           <button class="danger" onClick=${() => act(() => api("DELETE", "trash"))}>Delete for good</button>
         </div></details>`}
@@ -107,7 +107,7 @@ function Card({ card, act, say, load, queue }) {
   const share = card.share ? ` · ${Math.round(100 * card.share)} %` : "";
   const state = STATES[card.state] ? STATES[card.state] + share : "";
   const score = card.psnr ? `${card.psnr.toFixed(1)} dB` : "";
-  const facts = [card.method, score, bytes(card.bytes), ago(card.age)].filter(Boolean);
+  const facts = [card.method, score, card.bytes !== null && bytes(card.bytes), ago(card.age)].filter(Boolean);
   const rename = (event) => {
     event.preventDefault();
     act(() => api("PATCH", of(card.key), { title }));

@@ -106,6 +106,7 @@ export function Project({ item, say, choose, go }) {
       <h1 title=${detail.folder}>${detail.title}</h1>
     </header>
     ${fault && html`<p class="fault" role="alert">${fault}</p>`}
+    ${detail.faults.map((text) => html`<p class="fault">${text}</p>`)}
     <main class="project">
       <section class="stage" aria-label="Scene">
         <div class="tabs" role="tablist" onKeyDown=${keys}>

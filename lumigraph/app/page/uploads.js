@@ -57,14 +57,16 @@ async function work(key, state) {
 }
 
 async function send(key, { name, file }, count, state) {
+  const crc = await crcOf(file);
   let offset = null;
   for (let tries = 0; ; ) {
     try {
-      const about = new URLSearchParams({ name, size: file.size });
+      const about = new URLSearchParams({ name, size: file.size, crc });
       if (offset === null) {
-        offset = (await api("GET", `${of(key)}/photographs?${about}`)).have;
+        const found = await api("GET", `${of(key)}/photographs?${about}`);
+        offset = found.have;
         count(offset);
-        if (offset === file.size && offset > 0) return;
+        if (found.done) return;
       }
       about.set("offset", offset);
       const response = await fetch(`/api/${of(key)}/photographs?${about}`, {
@@ -74,7 +76,7 @@ async function send(key, { name, file }, count, state) {
       });
       const said = await response.json();
       if (response.status === 409) {
-        offset = said.have;
+        offset = null;
         continue;
       }
       if (response.status === 507) throw Object.assign(new Error(said.fault), { wait: true });
@@ -93,6 +95,21 @@ async function send(key, { name, file }, count, state) {
       offset = null;
     }
   }
+}
+
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
+  for (let bit = 0; bit < 8; bit += 1) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
+  return n;
+});
+
+// CRC-32 of a file, by which the app knows whether it has that very content. The browser's own hashes need https.
+async function crcOf(file) {
+  let crc = -1;
+  for (let at = 0; at < file.size; at += PIECE_BYTES) {
+    const bytes = new Uint8Array(await file.slice(at, at + PIECE_BYTES).arrayBuffer());
+    for (let i = 0; i < bytes.length; i += 1) crc = (crc >>> 8) ^ CRC_TABLE[(crc ^ bytes[i]) & 255];
+  }
+  return (~crc >>> 0).toString(16).padStart(8, "0");
 }
 
 // Files of a drop, with those in folders: { title, files: [{ name, file }] }
@@ -124,9 +141,11 @@ export const chosen = (list) => named([...list].map((file) => ({ name: file.webk
 const PHOTOGRAPH = /\.(jpe?g|png|webp|tiff?|bmp|avif|hei[cf]|hif|dng|nef|cr[23]|arw|raf|orf|rw2|pef|srw)$/i;
 const VIDEO = /\.(mp4|mov|m4v|mkv|webm|avi|mpe?g|m2?ts|3gp|wmv|ogv|flv)$/i;
 
-// The common folder of all becomes the title. Files of other types are left aside.
+const hidden = (name) => name.split("/").some((part) => part.startsWith("."));
+
+// The common folder of all becomes the title. Files of other types and hidden ones are left aside.
 function named(files) {
-  const good = files.filter(({ name }) => PHOTOGRAPH.test(name) || VIDEO.test(name));
+  const good = files.filter(({ name }) => !hidden(name) && (PHOTOGRAPH.test(name) || VIDEO.test(name)));
   const aside = files.length - good.length;
   const top = good.length ? good[0].name.split("/")[0] : "";
   const shared = good.length && good.every(({ name }) => name.includes("/") && name.split("/")[0] === top);

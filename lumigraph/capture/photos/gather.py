@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +15,11 @@ import numpy as np
 from PIL import Image
 
 from ...errors import LumigraphError
-from ...files import explained
+from ...files import exists, explained
 from ...files.names import counted, natural
 from ...system.memory import threads_for
 from ..masks import MASKS, OBJECT_MASKS, find_mask
-from ..pictures import HEIC_SUFFIXES, NO_HEIC, describe, reads_heic, reductions
+from ..pictures import HEIC_SUFFIXES, NO_HEIC, describe, reads_heic
 from ..raw import Developed, is_raw
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
 from .exif import read_facts
@@ -29,6 +30,7 @@ from .video import extract, is_video
 PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", *HEIC_SUFFIXES}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
 LOOKING_BYTES = 400_000_000  # of a photograph of 24 megapixels, decoded and turned
+REDUCED_FOLDER = re.compile(r"(.+)_(?!0*1?$)[0-9]+")  # images_4 beside images: the same photographs, reduced
 PROGRAM_FILES = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # in folders of programs
 
 
@@ -144,20 +146,25 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
     return list(files.values())
 
 
-def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
-    """Photographs below a folder, sorted: no hidden ones, no masks, none that a program reduced or rendered."""
+def walk(
+    folder: Path, work: Path | None = None, list_entries: Callable[[Path], Iterable[Path]] = Path.iterdir
+) -> Iterator[Path]:
+    """Photographs below a folder, sorted: no hidden ones, no masks, none that a program reduced or rendered.
+
+    work: a folder to leave out; list_entries: lists the entries of a folder
+    """
     with explained(folder):
-        entries = sorted(folder.iterdir(), key=lambda path: natural(path.name))
-    folders = [entry for entry in entries if entry.is_dir()]
-    reduced = {path for folder in folders for times, path in reductions(folder).items() if times > 1}
+        entries = sorted(list_entries(folder), key=lambda path: natural(path.name))
+    folders = {entry.name for entry in entries if os.path.isdir(entry)}
     for entry in entries:
-        if entry.name.startswith(".") or entry in reduced or entry.resolve() == work:
+        if entry.name.startswith(".") or (work is not None and entry.resolve() == work):
             continue
-        if entry.name in (MASKS, OBJECT_MASKS) and entry.is_dir():
-            continue
-        if entry.is_dir():
-            if not entry.is_symlink() and not any((entry / name).exists() for name in PROGRAM_FILES):
-                yield from walk(entry, work)
+        if entry.name in folders:
+            reduced = REDUCED_FOLDER.fullmatch(entry.name)
+            if entry.name in (MASKS, OBJECT_MASKS) or (reduced and reduced[1] in folders):
+                continue
+            if not entry.is_symlink() and not any(exists(entry / name) for name in PROGRAM_FILES):
+                yield from walk(entry, work, list_entries)
         elif entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry):
             yield entry
 

@@ -1,0 +1,121 @@
+"""Folders, looked through within bounds of entries and seconds, so that no answer of the app waits for a huge one."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from ..files.atomic import refusal
+
+MAX_ENTRIES, MAX_DEPTH = 20_000, 64  # of one look
+LOOK_SECONDS = 0.5  # of one look
+CUT_SECONDS = 60.0  # until a folder that was not looked through is tried again
+SETTLED_SECONDS = 0.1  # after which a further change gives a folder another time of change
+MAX_KEPT = 4096  # folders whose findings are kept
+
+T = TypeVar("T")
+
+
+class Look:
+    """One look through a folder.
+
+    changed: times of change (content, permissions) of each folder that was read
+    fault:   a sentence on what could not be read; is_cut: whether the look ended at a bound
+    """
+
+    def __init__(self, folder: Path):
+        self.folder, self.begun = folder, time.monotonic()
+        self.changed: dict[str, tuple[int, int]] = {}
+        self.fault, self.is_cut, self._count = "", False, 0
+
+    def entries(self, folder: Path) -> Iterator[Path]:
+        """Entries of a folder; none of one that cannot be read."""
+        if len(folder.parts) - len(self.folder.parts) > MAX_DEPTH:
+            self.is_cut = True
+            return
+        try:
+            self.changed[str(folder)] = times_of(folder)
+            with os.scandir(folder) as found:
+                for entry in found:
+                    self._count += 1
+                    if self._count > MAX_ENTRIES or time.monotonic() - self.begun > LOOK_SECONDS:
+                        self.is_cut = True
+                    if self.is_cut:
+                        return
+                    yield Path(entry.path)
+        except OSError as error:
+            self.fault = self.fault or refusal(folder, error)
+
+    @property
+    def sentence(self) -> str:
+        """A sentence on what was not found; empty if everything was looked through."""
+        if self.is_cut:
+            return f"{self.folder} has more in it than a page shows; name a folder of photographs alone"
+        return self.fault
+
+    def is_current(self) -> bool:
+        """True until one of the folders changes; for a look that was cut, for a while."""
+        if self.is_cut:
+            return time.monotonic() - self.begun < CUT_SECONDS
+        try:
+            return bool(self.changed) and all(times_of(one) == times for one, times in self.changed.items())
+        except OSError:
+            return False
+
+    def is_settled(self) -> bool:
+        """True if every later change of a folder will be seen by its times of change."""
+        latest = max((max(times) for times in self.changed.values()), default=0)
+        return time.time() - latest / 1e9 > SETTLED_SECONDS
+
+
+def times_of(folder: Path | str) -> tuple[int, int]:
+    about = os.stat(folder)
+    return about.st_mtime_ns, about.st_ctime_ns
+
+
+class Finder(Generic[T]):
+    """Finding about a folder that is kept while the folder stays as it is. find: looks through the folder"""
+
+    def __init__(self, find: Callable[[Look], T]):
+        self._find = find
+        self._kept: dict[Path, tuple[Look, T]] = {}
+
+    def __call__(self, folder: Path, until: float = float("inf")) -> tuple[Look, T] | None:
+        """A look and its finding. until: moment (time.monotonic) after which an earlier finding is returned, if any"""
+        known = self._kept.get(folder)
+        if time.monotonic() > until or (known and known[0].is_current()):
+            return known
+        look = Look(folder)
+        found = look, self._find(look)
+        if len(self._kept) > MAX_KEPT:
+            self._kept.clear()
+        if look.is_settled() or look.is_cut:
+            self._kept[folder] = found
+        return found
+
+
+def _size(look: Look) -> int | None:
+    total, ahead = 0, [look.folder]
+    while ahead:
+        for path in look.entries(ahead.pop()):
+            with suppress(OSError):
+                if path.is_dir() and not path.is_symlink():
+                    ahead.append(path)
+                elif path.is_file():
+                    total += path.stat().st_size
+    return None if look.is_cut else total
+
+
+_sizes = Finder(_size)
+
+
+def size_within(path: Path, until: float = float("inf")) -> int | None:
+    """Bytes of a file, or of all files of a folder; None if they have not been counted within the bounds."""
+    if path.is_file():
+        return path.stat().st_size
+    found = _sizes(path, until)
+    return found[1] if found else None
