@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import shutil
 import signal
 import sqlite3
 import sys
 import threading
+import zlib
 from collections import namedtuple
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,7 +27,7 @@ from starlette.websockets import WebSocketDisconnect
 from waiting import until
 from websockets.sync.server import serve as serve_websockets
 
-from lumigraph.app import jobs, progress, projects, sharing, uploads
+from lumigraph.app import folders, jobs, pictures, progress, projects, sharing, uploads
 from lumigraph.app.job_record import read_job
 from lumigraph.app.projects import find_item, new_project
 from lumigraph.app.scene_views import SceneView
@@ -100,8 +103,8 @@ def project(app) -> str:
     return new_project(app.root, "Garden").key
 
 
-def put(client, key: str, name: str, data: bytes, offset: int = 0, size: int | None = None):
-    about = {"name": name, "offset": offset, "size": len(data) if size is None else size}
+def put(client, key: str, name: str, data: bytes, offset: int = 0, size: int | None = None, **more):
+    about = {"name": name, "offset": offset, "size": len(data) if size is None else size, **more}
     return client.put(f"/api/items/{key}/photographs", params=about, content=data)
 
 
@@ -181,24 +184,148 @@ def test_a_photograph_arrives_in_pieces(app, client, project):
     astray = put(client, project, "a b/één.JPG", data[half + 5 :], half + 5, len(data))
     assert astray.status_code == 409 and astray.json()["have"] == half
     about = {"name": "a b/één.JPG", "size": len(data)}
-    assert client.get(f"/api/items/{project}/photographs", params=about).json()["have"] == half
+    assert client.get(f"/api/items/{project}/photographs", params=about).json() == {
+        "have": half,
+        "name": "a b/één.JPG",
+        "done": False,
+    }
     assert put(client, project, "a b/één.JPG", data[half:], half, len(data)).json()["done"] is True
     assert (find_item(app.root, project).path / "photos/a b/één.JPG").read_bytes() == data
-    assert client.get(f"/api/items/{project}/photographs", params=about).json()["have"] == len(data)
     other = jpeg(2, (80, 60))
     assert put(client, project, "a b/één.JPG", other).json()["name"] == "a b/één-2.JPG"
     assert names(app, project) == ["a b/één-2.JPG", "a b/één.JPG"]
 
 
+def contents(app, key: str, folder: str = "photos") -> list[bytes]:
+    return sorted(path.read_bytes() for path in (app.root / key / folder).rglob("*") if path.is_file())
+
+
+def bitmap(seed: int) -> bytes:
+    """A small picture of always the same number of bytes."""
+    Image.fromarray(np.full((4, 5), seed, np.uint8)).save(out := io.BytesIO(), "BMP")
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("crc", [True, False], ids=["with a checksum", "without"])
+def test_photographs_of_one_name_and_size_both_stay_and_repeats_do_not(app, client, project, crc):
+    both = [bitmap(1), bitmap(2)]
+    about = [{"crc": f"{zlib.crc32(data):08x}"} if crc else {} for data in both]
+    half = len(both[0]) // 2
+    for _ in range(2):  # the second time they are there already
+        for data, more, name in zip(both, about, ["image.bmp", "image-2.bmp"], strict=True):
+            if not put(client, project, "image.bmp", data[:half], 0, len(data), **more).json()["done"]:
+                put(client, project, "image.bmp", data[half:], half, len(data), **more)
+            asked = {"name": "image.bmp", "size": len(data), **more}
+            found = client.get(f"/api/items/{project}/photographs", params=asked).json()
+            assert found == ({"have": len(data), "name": name, "done": True} if crc else found | {"have": 0})
+    assert names(app, project) == ["image-2.bmp", "image.bmp"] and contents(app, project) == sorted(both)
+
+
+def test_uploads_of_one_name_and_size_do_not_mix_on_their_way(app, client, project):
+    both = [bitmap(1), bitmap(2)]
+    for part in (slice(0, 9), slice(9, None)):
+        for data in both:
+            more = {"crc": f"{zlib.crc32(data):08x}"}
+            assert put(client, project, "a.bmp", data[part], part.start, len(data), **more).status_code == 200
+    assert contents(app, project) == sorted(both)
+
+
+def test_left_out_photographs_of_one_name_both_stay(app, client, project):
+    both = [bitmap(1), bitmap(2)]
+    for data in both:
+        put(client, project, "walk/a.bmp", data)
+        client.delete(f"/api/items/{project}/photographs", params={"name": "walk/a.bmp"})
+    assert contents(app, project, "left-out") == sorted(both) and names(app, project) == []
+    assert client.delete(f"/api/items/{project}/photographs", params={"name": "../project.json"}).status_code == 400
+
+
+def test_a_piece_that_comes_several_times_at_once_is_added_once(app, project):
+    data, barrier = jpeg(1), threading.Barrier(6)
+    file = uploads.upload(app.root / project / "photos", "a.jpg", len(data))
+    for offset, piece in ((0, data[:900]), (900, data[900:])):
+
+        def add(offset=offset, piece=piece) -> str:
+            barrier.wait()
+            try:
+                return str(file.add(offset, piece).have)
+            except uploads.MisplacedError:
+                return "misplaced"
+
+        with ThreadPoolExecutor(6) as pool:
+            said = [one.result() for one in [pool.submit(add) for _ in range(6)]]
+        assert sorted(said) == [str(offset + len(piece)), *["misplaced"] * 5]
+    assert contents(app, project) == [data]
+
+
+def test_uploads_list_the_folder_once(app, client, project, monkeypatch):
+    asked = []
+    monkeypatch.setattr(uploads, "listed", lambda folder, real=uploads.listed: asked.append(folder) or real(folder))
+    monkeypatch.setattr(uploads, "MAX_FILES", 8)
+    for i in range(8):
+        assert put(client, project, "image.bmp", bitmap(i)).status_code == 200
+    assert len(asked) == 1 and len(names(app, project)) == 8
+    refused = put(client, project, "one-more.bmp", bitmap(9))
+    assert refused.status_code == 400 and "8 files are the most" in refused.json()["fault"]
+    assert put(client, project, "image.bmp", bitmap(3), crc=f"{zlib.crc32(bitmap(3)):08x}").json()["done"]
+    (app.root / project / "photos" / "image.bmp").unlink()
+    monkeypatch.setattr(uploads, "RELIST_SECONDS", 0.0)
+    assert put(client, project, "one-more.bmp", bitmap(9)).status_code == 200
+
+
+def test_parts_of_uploads_that_nobody_continues_go(app, client, project):
+    photos, data = app.root / project / "photos", jpeg(1)
+    put(client, project, "new.jpg", data[:100], 0, len(data))
+    put(client, project, "old.jpg", data[:100], 0, len(data))
+    put(client, project, "refused.jpg", data[:100], 0, 120)
+    assert put(client, project, "refused.jpg", data[100:], 100, 120).status_code == 400
+    os.utime(next(photos.glob(".old*")), (1e9, 1e9))
+    uploads.Album(photos)
+    assert [path.name[:4] for path in photos.iterdir()] == [".new"]
+    assert put(client, project, "new.jpg", data[100:], 100, len(data)).json()["done"]
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["../a.jpg", "a/../../b.jpg", "/etc/a.jpg", "..\\a.jpg", "C:a.jpg", ".hidden.jpg", "a/.b/c.jpg",
-     "a\x00.jpg", "a\n.jpg", "con.jpg", "a/b/c/d/e.jpg", "x" * 300 + ".jpg", "", ".", "a*.jpg", "\u202egpj.a.jpg"],
-)  # fmt: skip
+    ("name", "safe"),
+    [
+        ('the "best" one?.jpg', "the -best- one-.jpg"),
+        ("it's.jpg", "it's.jpg"),
+        ("C:a.jpg", "C-a.jpg"),
+        ("a*.jpg", "a-.jpg"),
+        ("a\\b.jpg", "a-b.jpg"),
+        ("a\x00.jpg", "a.jpg"),
+        ("a\nb.jpg", "a b.jpg"),
+        ("Screenshot 1.02\u202fPM.PNG", "Screenshot 1.02 PM.PNG"),
+        ("\u202egpj.a.jpg", "gpj.a.jpg"),
+        (".hidden.jpg", "hidden.jpg"),
+        ("\x01.jpg", "photograph.jpg"),
+        ("a/.b/c .jpg", "a/b/c.jpg"),
+        ("a /b./c.jpg. ", "a/b/c.jpg"),
+        ("con.jpg", "_con.jpg"),
+        ("a/b/c/d/e.jpg", "a/b/c-d/e.jpg"),
+        ("x" * 300 + ".jpg", "x" * 176 + ".jpg"),
+        ("ж" * 300 + ".jpeg", "ж" * 87 + ".jpeg"),
+        ("f" * 200 + "/" + "g" * 200 + "/" + "x" * 200 + ".jpg", "f" * 40 + "/" + "g" * 40 + "/" + "x" * 94 + ".jpg"),
+        ("фото/été 日本.JPG", "фото/été 日本.JPG"),
+    ],
+)
+def test_names_that_are_not_safe_are_changed(app, client, project, name, safe):
+    data = jpeg()
+    assert put(client, project, name, data).json() == {"have": len(data), "name": safe, "done": True}
+    assert names(app, project) == [safe] and len(safe.encode()) <= uploads.MAX_NAME_BYTES
+    assert client.get(f"/api/items/{project}/picture", params={"name": safe}).status_code == 200
+    assert put(client, project, name, jpeg(1)).json()["name"].rpartition(".")[0] == f"{safe.rpartition('.')[0]}-2"
+
+
+@pytest.mark.parametrize(
+    "name", ["../a.jpg", "a/../../b.jpg", "/etc/a.jpg", "..\\a.jpg", "\\\\host\\a.jpg", "", ".", "jpg"]
+)
 def test_names_that_lead_elsewhere_are_refused(app, client, project, name):
     before = sorted(app.root.parent.rglob("*"))
     refused = put(client, project, name, jpeg())
     assert refused.status_code == 400 and refused.json()["fault"].count(". ") == 0
+    assert (
+        "'" not in refused.json()["fault"] and "\\\\" not in refused.json()["fault"][2:]
+    )  # names are shown as they read, not as Python writes them
     assert sorted(app.root.parent.rglob("*")) == before
 
 
@@ -225,8 +352,6 @@ def test_a_bomb_of_pixels_is_refused(client, project):
     header = (
         b"\x89PNG\r\n\x1a\n" + (13).to_bytes(4, "big") + b"IHDR" + (60_000).to_bytes(4, "big") * 2 + b"\x08\x02\0\0\0"
     )
-    import zlib
-
     header += zlib.crc32(header[12:]).to_bytes(4, "big") + b"\0\0\0\0IEND\xaeB`\x82"
     refused = put(client, project, "bomb.png", header)
     assert refused.status_code == 400 and "3600000000 pixels" in refused.json()["fault"]
@@ -273,7 +398,6 @@ def test_a_full_disk_is_told_and_the_upload_goes_on(app, client, project, monkey
     if full.exists():  # the system's own refusal, in the middle of a piece
         with monkeypatch.context() as patch:
             patch.setattr(uploads.Upload, "partial", property(lambda upload: full))
-            patch.setattr(uploads.Upload, "have", lambda upload: 0)
             assert put(client, project, "b.jpg", data).status_code == 507
     assert names(app, project) == ["a.jpg"]
 
@@ -294,6 +418,68 @@ def test_advice_comes_while_photographs_arrive(client, project):
     assert "soft.jpg" not in [one["name"] for one in left["photographs"]]
     shown = client.get(f"/api/items/{project}/picture", params={"name": "0.jpg", "side": 99})
     assert Image.open(io.BytesIO(shown.content)).size == (99, 74)
+
+
+PICTURES = {
+    "rgb.png": ("RGB", {}),
+    "alpha.png": ("RGBA", {}),
+    "palette.png": ("P", {}),
+    "grey16.png": ("I;16", {}),
+    "baseline.jpg": ("RGB", {"quality": 95}),
+    "progressive.jpg": ("RGB", {"quality": 95, "progressive": True}),
+    "print.jpg": ("CMYK", {"quality": 95}),
+    "turned.tif": ("RGB", {"exif": {0x0112: 6}}),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize("is_large", [False, True], ids=["", "in a process"])
+def test_thumbnails_show_pictures_of_all_kinds(tmp_path, monkeypatch, name, is_large):
+    mode, options = PICTURES[name]
+    ramp = np.linspace(20, 235, 900)[None].repeat(600, 0)
+    grey = Image.fromarray(ramp.astype(np.uint8))
+    image = Image.fromarray((ramp * 257).astype(np.uint16)) if mode == "I;16" else grey.convert("RGB").convert(mode)
+    if tags := options.get("exif"):
+        options = {"exif": (exif := Image.Exif())}
+        exif.update(tags)
+    image.save(tmp_path / name, **options)
+    if is_large:
+        monkeypatch.setattr(pictures, "LARGE_PIXELS", 1000)
+        monkeypatch.setattr(pictures, "REDUCED_SIDE", 200)
+    small = Image.open(io.BytesIO(pictures.thumbnail(tmp_path / name, 120)))
+    assert small.size == ((80, 120) if tags else (120, 80))
+    wanted = grey.convert("RGB").transpose(Image.Transpose.ROTATE_270) if tags else grey.convert("RGB")
+    difference = np.asarray(small, float) - np.asarray(wanted.resize(small.size, Image.Resampling.BOX), float)
+    assert np.abs(difference).mean() < 4
+
+
+def test_large_pictures_are_decoded_one_at_a_time_elsewhere_and_once(app, client, project, monkeypatch):
+    monkeypatch.setattr(pictures, "LARGE_PIXELS", 1000)
+    children, alive = [], []
+    real = pictures.start
+
+    def start(command, *options, **more):
+        alive.append(sum(child.poll() is None for child in children))
+        children.append(real(command, *options, **more))
+        return children[-1]
+
+    monkeypatch.setattr(pictures, "start", start)
+    for i in range(3):
+        Image.fromarray(np.full((60, 80, 3), 40 * i, np.uint8)).save(app.root / project / "photos" / f"{i}.png")
+    asked = [{"name": f"{i}.png", "side": side} for i in range(3) for side in (320, 512)]
+    with ThreadPoolExecutor(4) as pool:
+        advised = pool.submit(client.get, f"/api/items/{project}/advice")
+        shown = list(pool.map(lambda one: client.get(f"/api/items/{project}/picture", params=one).status_code, asked))
+    assert shown == [200] * 6 and advised.result().status_code == 200
+    assert alive == [0, 0, 0] and all(child.poll() == 0 for child in children)
+
+
+def test_a_large_picture_that_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
+    Image.new("RGB", (80, 60)).save(tmp_path / "a.png")
+    monkeypatch.setattr(pictures, "LARGE_PIXELS", 1000)
+    monkeypatch.setattr("lumigraph.capture.numbers.free_memory", lambda: 100)
+    with pytest.raises(LumigraphError, match="a.png cannot be shown: its 80x60 pixels take .* GB are free"):
+        pictures.thumbnail(tmp_path / "a.png")
 
 
 # Projects
@@ -577,6 +763,158 @@ def test_features_and_matches_are_read_while_colmap_writes(app, project):
     assert progress.capture_progress(item)["stage"] == "Finding details"
     assert progress.capture_progress(item)["share"] == pytest.approx(0.03 + 0.95 * 0.4 * 2 / 3)
     assert progress.model(item)["cameras"] == []
+
+
+@pytest.fixture
+def database(app, project):
+    """An empty database of COLMAP's, open for writing."""
+    work = app.root / project / "scene" / "work"
+    work.mkdir(parents=True)
+    (work / "stages.json").write_text(json.dumps({"features": {"key": "k", "done": False, "seconds": 1}}))
+    make_running(app, project, "capture")
+    with contextlib.closing(sqlite3.connect(work / "database.db", timeout=0)) as rows:
+        yield rows
+
+
+def make_running(app, key: str, stage: str) -> None:
+    making = {"state": "running", "asked": 1.0, "stage": stage, "run": "a"}
+    (app.root / key / "job.json").write_text(json.dumps({"make": making}))
+
+
+PAGES = "", "/states", "/features?name=a.jpg", "/model", "/advice"
+TABLES = [
+    "CREATE TABLE cameras (camera_id INTEGER, width INTEGER, height INTEGER)",
+    "CREATE TABLE images (image_id INTEGER, name TEXT, camera_id INTEGER)",
+    "CREATE TABLE keypoints (image_id INTEGER, rows INTEGER, cols INTEGER, data BLOB)",
+    "CREATE TABLE two_view_geometries (pair_id INTEGER, rows INTEGER)",
+]
+DAMAGE = {
+    "no tables": [],
+    "no keypoints": TABLES[:2],
+    "other columns": ["CREATE TABLE images (a)", "CREATE TABLE keypoints (b)"],
+    "empty": TABLES,
+    "short blob": [*TABLES, "INSERT INTO cameras VALUES (1, 9, 9)", "INSERT INTO images VALUES (1, 'a.jpg', 1)",
+                   "INSERT INTO keypoints VALUES (1, 5, 4, x'00112233')"],
+    "no width": [*TABLES, "INSERT INTO cameras VALUES (1, 0, NULL)", "INSERT INTO images VALUES (1, 'a.jpg', 1)",
+                 "INSERT INTO keypoints VALUES (1, 1, 2, x'0011223300112233')"],
+    "NaN": [*TABLES, "INSERT INTO cameras VALUES (1, 9, 9)", "INSERT INTO images VALUES (1, 'a.jpg', 1)",
+            "INSERT INTO keypoints VALUES (1, 1, 2, x'0000c07f0000c07f')"],
+    "nulls": [*TABLES, "INSERT INTO images VALUES (NULL, NULL, NULL)", "INSERT INTO images VALUES (1, x'ff', 1)",
+              "INSERT INTO images VALUES ('x', 'a.jpg', 'y')", "INSERT INTO keypoints VALUES ('x', 'y', 'z', 3)",
+              "INSERT INTO two_view_geometries VALUES (NULL, 90)", "INSERT INTO two_view_geometries VALUES ('x', 90)"],
+    "no letters": [*TABLES, "INSERT INTO images VALUES (1, CAST(x'ff' AS TEXT), 1)"],
+    "no end": [*TABLES[:1], *TABLES[2:], "CREATE VIEW images AS WITH RECURSIVE n(image_id, name, camera_id) AS "
+               "(VALUES (1, 'a', 1) UNION ALL SELECT image_id + 1, 'a', 1 FROM n) SELECT * FROM n WHERE image_id < 0"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_database_gives_a_page(client, project, database, damage, monkeypatch):
+    monkeypatch.setattr(progress, "QUERY_SECONDS", 0.1)
+    for line in DAMAGE[damage]:
+        database.execute(line)
+    database.commit()
+    found = [client.get(f"/api/items/{project}{page}") for page in PAGES]
+    assert [one.status_code for one in found] == [200] * 5 and found[2].json() == []
+
+
+def test_a_locked_database_gives_a_page(app, client, project, database):
+    for line in [*TABLES, "INSERT INTO images VALUES (1, 'a.jpg', 1)"]:
+        database.execute(line)
+    database.commit()
+    database.execute("BEGIN EXCLUSIVE")
+    found = [client.get(f"/api/items/{project}{page}") for page in PAGES]
+    assert [one.status_code for one in found] == [200] * 5 and found[1].json() == {}
+    database.rollback()
+    assert client.get(f"/api/items/{project}/states").json() == {"a.jpg": {"features": None, "matched": 0}}
+    (app.root / project / "scene/work/database.db").write_bytes(b"no database at all" * 99)
+    assert [client.get(f"/api/items/{project}{page}").status_code for page in PAGES] == [200] * 5
+
+
+WRONG = "null", "[]", "3", '"x"', "{", '{"a": 1}', "[[1]]"
+WRONG_PARTS = {
+    "scene/capture.json": ['{"registered": 3}', '{"left_out": [1]}', '{"warnings": [null]}', '{"points": "x"}'],
+    "scene/work/stages.json": ['{"features": {}}', '{"features": {"key": 1, "done": "x", "seconds": []}}'],
+    "runs/a/metrics.jsonl": ['{"step": "x"}', '{"step": 1, "seconds": 1, "psnr": 1e308}\n' * 3],
+    "runs/a/eval.json": ['{"views": 3}', '{"protocol": {"split": "test", "views": 1}, "steps": 1, "views": [{}]}'],
+    "runs/a/config.json": ['{"method": 3}', '{"budget": []}'],
+    "runs/a/cameras.json": ['{"names": 3}'],
+    "project.json": ['{"title": 3, "made": 0}', '{"title": "x", "made": 0, "source": "\\u0000"}'],
+}
+
+
+@pytest.mark.parametrize("name", WRONG_PARTS)
+def test_a_received_project_of_any_content_gives_pages(app, client, project, ball_run, name):
+    item = find_item(app.root, project)
+    shutil.copytree(ball_run.path, item.path / "runs" / "a")
+    (item.path / "scene" / "work").mkdir(parents=True)
+    other = new_project(app.root, "other").key
+    for stage in ("capture", "train"):
+        make_running(app, project, stage)
+        for text in [*WRONG, *WRONG_PARTS[name]]:
+            (item.path / name).write_text(text)
+            home = client.get("/api/home")
+            assert home.status_code == 200 and {card["key"] for card in home.json()["cards"]} == {project, other}
+            for page in ["", "/states", "/model"]:
+                found = client.get(f"/api/items/{project}{page}")
+                assert found.status_code == 200 or (found.status_code == 400 and found.json()["fault"])
+
+
+def test_damage_is_named_and_the_rest_is_shown(app, client, project):
+    put(client, project, "a.jpg", jpeg())
+    (app.root / project / "scene").mkdir()
+    (app.root / project / "scene/capture.json").write_text('{"registered": 3}')
+    found = client.get(f"/api/items/{project}").json()
+    assert [one["name"] for one in found["photographs"]] == ["a.jpg"] and found["result"] is None
+    assert len(found["faults"]) == 1 and "capture.json does not hold what it should" in found["faults"][0]
+
+
+def test_a_home_page_waits_for_no_folder(app, client, project, tmp_path, monkeypatch):
+    monkeypatch.setattr(folders, "MAX_ENTRIES", 50)
+    (huge := tmp_path / "huge").mkdir()
+    for i in range(60):
+        (huge / f"{i}.txt").touch()
+    places = {"huge": huge, "gone": tmp_path / "gone", "root": Path("/"), "proc": Path("/proc"), "null": "/dev/null"}
+    keys = {}
+    for name, place in places.items():
+        record = projects.ProjectRecord(name, 0.0, str(place))
+        keys[name] = (item := new_project(app.root, name)).key
+        item.keep(record)
+    shutil.copytree(huge, app.root / project / "photos", dirs_exist_ok=True)
+    client.delete(f"/api/items/{keys['null']}")
+    home = client.get("/api/home").json()
+    cards = {card["title"]: card for card in home["cards"]}
+    assert "has more in it than a page shows" in cards["huge"]["fault"] and cards["Garden"]["bytes"] is None
+    assert cards["gone"]["fault"] == f"{tmp_path / 'gone'} does not exist; check the path"
+    assert home["trash"][0]["title"] == "null"
+    for key in list(keys.values())[:-1]:
+        assert client.get(f"/api/items/{key}").status_code == 200
+    looked = []
+    monkeypatch.setattr(folders.os, "scandir", lambda path, real=os.scandir: looked.append(str(path)) or real(path))
+    assert client.get("/api/home").json()["cards"] and not {str(huge), "/", "/proc"} & set(looked)
+    refused = client.post("/api/projects", json={"title": "x", "path": str(huge)})
+    assert refused.status_code == 400 and "no photographs" in refused.json()["fault"]
+
+
+def test_a_listing_follows_its_folders(tmp_path):
+    inner = tmp_path / "a" / "b"
+    inner.mkdir(parents=True)
+    (inner / "1.jpg").touch()
+    os.utime(inner, (1e9, 1e9))
+    for wanted in (["a/b/1.jpg"], ["a/b/1.jpg", "a/b/2.jpg"], ["a/b/2.jpg"]):
+        (inner / "2.jpg").touch() if len(wanted) == 2 else (
+            inner / "1.jpg"
+        ).unlink() if "a/b/1.jpg" not in wanted else 0
+        assert list(pictures.files_of(tmp_path)) == wanted == list(pictures.files_of(tmp_path))
+
+
+def test_names_that_are_no_unicode_are_shown(app, client, tmp_path):
+    (tmp_path / "pictures").mkdir()
+    for name in (b"caf\xe9.jpg", b"plain.jpg"):
+        (tmp_path / "pictures" / os.fsdecode(name)).write_bytes(jpeg())
+    key = client.post("/api/projects", json={"title": "", "path": str(tmp_path / "pictures")}).json()["key"]
+    found = client.get(f"/api/items/{key}")
+    assert found.status_code == 200 and len(found.json()["photographs"]) == 2
 
 
 # The viewer behind the app's address

@@ -6,15 +6,21 @@ import re
 import shutil
 import sys
 import threading
-from collections import namedtuple
+from collections import Counter, namedtuple
+from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import pytest
 import uvicorn
 from app_uploads import UPLOAD_NAMED
 from app_walk import drop
 from budgets import budget
+from PIL import Image
 from test_app import PROGRAM, jpeg
 
+from lumigraph.app import uploads
+from lumigraph.app.projects import new_project
 from lumigraph.app.server import Announcing, App, build
 from lumigraph.viewer.address import Address, free_port
 
@@ -83,8 +89,8 @@ def test_refused_uploads_are_sentences_on_the_page(served, page, faults, tmp_pat
     page.get_by_role("alert").get_by_text("text.jpg is no photograph that can be read").wait_for()
     page.get_by_role("button", name="good.jpg").wait_for()
     page.evaluate(UPLOAD_NAMED, ["garden", ["../up.jpg", "/etc/up.jpg"]])
-    page.get_by_role("alert").get_by_text("'../up.jpg' cannot be the name of a photograph here").wait_for()
-    assert not list(tmp_path.rglob("up.jpg"))
+    page.get_by_role("alert").get_by_text("../up.jpg leads out of the folder of photographs").wait_for()
+    assert not list(tmp_path.rglob("up.jpg")) and not list(served.root.rglob("*.part"))
 
     usage = namedtuple("Usage", "total used free")
     with monkeypatch.context() as patch:
@@ -94,6 +100,95 @@ def test_refused_uploads_are_sentences_on_the_page(served, page, faults, tmp_pat
         page.get_by_text("is full; free some space, and the upload goes on").wait_for()
     page.get_by_role("button", name="late.jpg").wait_for()
     assert all("status of 40" in one or "status of 507" in one for one in faults)
+
+
+def photographs(folder: Path, names: Sequence[str], seed: int = 0) -> list[Path]:
+    """Small pictures, all different and of one size in bytes."""
+    folder.mkdir()
+    for i, name in enumerate(names):
+        Image.fromarray(np.full((30, 40), seed + i, np.uint8)).save(folder / name, "BMP")
+    return [folder / name for name in names]
+
+
+def contents(*places: Path) -> Counter[bytes]:
+    """Files, and all files below folders, hidden ones too, by content."""
+    files = [path for place in places for path in ([place] if place.is_file() else place.rglob("*")) if path.is_file()]
+    return Counter(path.read_bytes() for path in files)
+
+
+@pytest.fixture
+def garden(served, page) -> Path:
+    """Folder of uploads of a new project, whose page is open."""
+    item = new_project(served.root, "Garden")
+    page.goto(f"{served.address.url}/#{item.key}")
+    page.get_by_text("Drop photographs, a folder").wait_for()
+    return item.photographs
+
+
+def sent(page, count: int = 1) -> None:
+    """Wait until so many files of a drop are sent or refused."""
+    page.wait_for_function(
+        "async (count) => {"
+        " const state = (await import('/static/uploads.js')).stateOf('Garden');"
+        " return state.done >= count && ((state.done = 0), true); }",
+        arg=count,
+    )
+
+
+def test_photographs_of_one_name_and_size_all_stay(garden, page, faults, tmp_path):
+    given = [photographs(tmp_path / str(i), ["image.bmp"], i)[0] for i in range(3)]
+    for file in [*given, *given]:  # the second time they are there already
+        drop(page, [file])
+        sent(page)
+    assert contents(garden) == contents(*given)
+    page.get_by_role("button", name="image-3.bmp").wait_for()
+    assert faults == []
+
+
+def test_photographs_of_one_name_are_left_out_apart(garden, page, faults, tmp_path):
+    given = [photographs(tmp_path / str(i), ["image.bmp"], i)[0] for i in range(2)]
+    for file in given:
+        drop(page, [file])
+        page.get_by_role("button", name="image.bmp").click()
+        page.get_by_role("button", name="Leave it out").click()
+        page.get_by_role("button", name="image.bmp").wait_for(state="detached")
+    assert contents(garden.parent / "left-out") == contents(*given) and faults == []
+
+
+def test_two_tabs_that_send_the_same_photographs_give_each_once(garden, served, page, tmp_path):
+    given = photographs(tmp_path / "given", [f"{i}.bmp" for i in range(20)])
+    other = page.context.new_page()
+    other.goto(page.url)
+    other.get_by_text("Drop photographs, a folder").wait_for()
+    for tab in (page, other):
+        drop(tab, given)
+    for tab in (page, other):
+        sent(tab, len(given))
+    assert contents(garden) == contents(*given)
+
+
+def test_many_small_photographs_need_one_listing(garden, page, faults, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(uploads, "listed", lambda folder, real=uploads.listed: asked.append(folder) or real(folder))
+    given = photographs(tmp_path / "given", [f"{i}.bmp" for i in range(120)])
+    drop(page, given)
+    sent(page, len(given))
+    assert contents(garden) == contents(*given) and len(asked) == 1 and faults == []
+
+
+def test_names_that_cannot_be_read_become_safe_ones(garden, page, faults):
+    names = ['say "cheese".bmp', "tab\there.bmp", "x" * 250 + ".bmp", "con.bmp", "ångström/né.bmp"]
+    size = len(photographs(garden.parent / "given", ["a.bmp"])[0].read_bytes())
+    data = list((garden.parent / "given" / "a.bmp").read_bytes())
+    page.evaluate(
+        "async ([names, data]) => (await import('/static/uploads.js')).upload('Garden',"
+        " names.map((name) => ({ name, file: new File([new Uint8Array(data)], 'x') })))",
+        [names, data],
+    )
+    sent(page, len(names))
+    there = {path.relative_to(garden).as_posix() for path in garden.rglob("*.bmp")}
+    assert there == {"say -cheese-.bmp", "tab here.bmp", "x" * 176 + ".bmp", "_con.bmp", "ångström/né.bmp"}
+    assert all((garden / name).stat().st_size == size for name in there) and faults == []
 
 
 def test_the_page_is_labelled_and_fits_a_phone(served, page, faults):

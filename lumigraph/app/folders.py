@@ -49,6 +49,8 @@ class Look:
                     yield Path(entry.path)
         except OSError as error:
             self.fault = self.fault or refusal(folder, error)
+        except ValueError:  # NUL, which no path has
+            self.fault = f"{str(folder)!r} is no path; name another folder of photographs"
 
     @property
     def sentence(self) -> str:

@@ -242,11 +242,11 @@ def safe_name(name: str) -> str:
     """A file's name that every system takes, below a folder of photographs: without characters that cannot be read or
     mean something else, and not too long. Raises LumigraphError for one that leads out of the folder."""
     if ".." in re.split(r"[\\/]", name) or name.startswith(("/", "\\")):
-        raise LumigraphError(f"{readable(name)} leads out of the folder of photographs; rename it and drop it again")
+        raise LumigraphError(f"{visible(name)} leads out of the folder of photographs; rename it and drop it again")
     *above, last = PurePosixPath(name).parts or [""]
-    folders = [safe_part(part) for part in map(readable, above) if part]
+    folders = [safe_part(part) for one in above if (part := readable(one).strip(". "))]
     folders = [*folders[: MAX_FOLDERS - 2], *filter(None, ["-".join(folders[MAX_FOLDERS - 2 :])])]
-    last = visible(last).rstrip(". ")
+    last = readable(last).rstrip(". ")
     if len("/".join([*folders, last]).encode()) > MAX_NAME_BYTES:
         folders = [shortened(part, MAX_FOLDER_BYTES) for part in folders]
     stem, dot, ending = last.rpartition(".")
@@ -256,14 +256,14 @@ def safe_name(name: str) -> str:
 
 
 def visible(text: str) -> str:
-    """Text without invisible characters, and with "-" for those that mean something else on some system."""
+    """Text without control characters and other invisible ones."""
     spaced = "".join(" " if letter.isspace() else letter for letter in text)
-    return FORBIDDEN.sub("-", "".join(filter(str.isprintable, spaced)))
+    return "".join(filter(str.isprintable, spaced))
 
 
 def readable(text: str) -> str:
-    """Visible text without spaces and dots around it."""
-    return visible(text).strip(". ")
+    """Visible text, with "-" for characters that mean something else on some system."""
+    return FORBIDDEN.sub("-", visible(text))
 
 
 def shortened(text: str, size: int) -> str:
