@@ -1,11 +1,15 @@
 """Uploads that a browser sends to the app: many, malformed, with names that lead elsewhere, beyond the disk, foreign.
 
     python benchmarks/app_uploads.py --output FOLDER [--photographs 500] [--malformed 100]
+    python benchmarks/app_uploads.py --output FOLDER --only tiny large home [--tiny 5000] [--large 40] [--scenes 200]
 
 Photographs of 4 MB each are made in FOLDER and dropped onto the page in headless Chromium; malformed ones are made by
 the fuzzer. The disk that fills is a tmpfs, which only root may mount; others pass over it. Prints seconds, memory of
-the app's process, and the sentences on the page. Everything but the pictures of the page is deleted at the end. Exit
-code 1 if something that should be refused was taken, or the app ended.
+the app's process, and the sentences on the page. --only does without a browser: `tiny` sends tiny files by requests,
+`large` asks for thumbnails of photographs of 13000 x 13000 pixels, six at a time, and for advice about them, `home`
+asks for the home page of many scenes, two of which have a huge folder and a lost one as their source. Everything but
+the pictures of the page is deleted at the end. Exit code 1 if something that should be refused was taken, or the app
+ended.
 """
 
 from __future__ import annotations
@@ -13,7 +17,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import hashlib
 import http.server
+import io
 import json
 import os
 import random
@@ -26,13 +32,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import urlencode
-from urllib.request import urlopen
+from urllib.request import Request, urlopen
 
 import numpy as np
+import psutil
 from app_walk import Walk, drop, until, windows
 from fuzzing import templates
 from fuzzing.bend import bend
@@ -48,6 +56,8 @@ NAMES = (
     ".hidden.jpg",
     "a\nb.jpg",
 )
+LARGE_SIDE = 13_000  # pixels
+HUGE_FOLDERS, HUGE_FILES, PHOTOGRAPHS_EACH = 200, 1000, 50  # of the home page
 DISK = "300m", "700m"  # of the disk that fills: before and after it gets room
 ELSEWHERE = "evil.example"  # a name that leads to this machine, as after DNS rebinding
 UPLOAD_NAMED = """async ([key, names]) => {
@@ -101,6 +111,16 @@ class Uploads(Walk):
         text = Path(f"/proc/{self.app.pid}/status").read_text()
         return int(re.search(r"VmHWM:\s+(\d+)", text)[1]) / 1000  # type: ignore[index]
 
+    def resident(self) -> tuple[int, int]:
+        """Memory of the app's process now, and of its children, in MB."""
+        assert self.app
+        app = psutil.Process(self.app.pid)
+        children = 0
+        for child in app.children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                children += child.memory_info().rss
+        return round(app.memory_info().rss / 1e6), round(children / 1e6)
+
     def project(self, page: Any, title: str) -> str:
         """Key of a new project, whose page is opened."""
         key = page.evaluate(
@@ -130,6 +150,147 @@ def make_photographs(folder: Path, count: int) -> list[Path]:
         smooth = np.asarray(Image.fromarray(wave.astype(np.uint8)).resize(SIZE, Image.Resampling.BILINEAR))
         Image.fromarray(smooth[..., None] + np.roll(noise, 97 * i, 1)).save(made[-1], quality=QUALITY)
     return made
+
+
+def put(url: str, key: str, name: str, data: bytes) -> str:
+    """Send a file as the page does. Returns the name that it has."""
+    about = urlencode({"name": name, "size": len(data), "hash": hashlib.blake2s(data, digest_size=16).hexdigest()})
+    place = f"{url}/api/items/{key}/photographs?{about}"
+    found = json.load(urlopen(place, timeout=600))
+    if not found["done"]:
+        found = json.load(urlopen(Request(f"{place}&offset={found['have']}", data, method="PUT"), timeout=600))
+    assert found["done"], found
+    return str(found["name"])
+
+
+def new(url: str, **about: str) -> str:
+    """Key of a new project."""
+    headers = {"Content-Type": "application/json"}
+    asked = Request(f"{url}/api/projects", json.dumps(about).encode(), headers, method="POST")
+    return str(json.load(urlopen(asked))["key"])
+
+
+def tiny(walk: Uploads, count: int) -> None:
+    """Tiny files by requests, three at a time; all of one name; all again."""
+    pictures = []
+    for i in range(count):
+        Image.fromarray(np.array([[i & 255, i >> 8]], np.uint8)).save(out := io.BytesIO(), "PNG")
+        pictures.append(out.getvalue())
+    key, found = new(walk.url, title="tiny"), {}
+    ways = {
+        "own_names": lambda i: f"IMG_{i:04}.png",
+        "again": lambda i: f"IMG_{i:04}.png",
+        "one_name": lambda i: "image.png",
+    }
+    with ThreadPoolExecutor(3) as pool:
+        for way, name in ways.items():
+            key = new(walk.url, title=way) if way == "one_name" else key
+            begun, halves = time.monotonic(), []
+            for part in (range(count // 2), range(count // 2, count)):
+                list(pool.map(lambda i, name=name, key=key: put(walk.url, key, name(i), pictures[i]), part))
+                halves.append(round(time.monotonic() - begun, 1))
+            there = len(walk.detail(key)["photographs"])
+            walk.expect(there == count, f"{way}: {there} of {count} are there")
+            found[f"{way}_half_and_all_seconds"] = halves
+    walk.note("tiny", files=count, **found)
+
+
+def large(walk: Uploads, count: int) -> None:
+    """Thumbnails and advice of huge photographs, half of them PNG, a quarter each baseline and progressive JPEG."""
+    key = new(walk.url, title="large")
+    photos = walk.output / "scenes" / key / "photos"
+    y, x = np.ogrid[:LARGE_SIDE, :LARGE_SIDE]
+    image = Image.fromarray(np.stack([(x * k // 50 + y // (k + 1)).astype(np.uint8) for k in range(3)], -1))
+    kinds = ["a.png", {}], ["b.jpg", {"quality": 85}], ["c.jpg", {"quality": 85, "progressive": True}]
+    for name, options in kinds:
+        image.save(photos / name, **({"compress_level": 1} if name == "a.png" else options))
+    del image
+    for i in range(count):
+        os.link(
+            photos / ("a.png" if i % 2 else "bc"[i // 2 % 2] + ".jpg"), photos / f"{i:02}{'.png' if i % 2 else '.jpg'}"
+        )
+    for name, _ in kinds:
+        (photos / name).unlink()
+    names, peak, ended = sorted(path.name for path in photos.iterdir()), Counter[str](), threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.05):
+            of_app, of_children = walk.resident()
+            peak["app"] = max(peak["app"], of_app)
+            peak["with_children"] = max(peak["with_children"], of_app + of_children)
+
+    before, begun = walk.resident()[0], time.monotonic()
+    (watching := threading.Thread(target=watch)).start()
+    place = f"{walk.url}/api/items/{key}/picture?"
+    with ThreadPoolExecutor(6) as pool:
+        codes = Counter(pool.map(lambda name: urlopen(place + urlencode({"name": name}), timeout=1800).status, names))
+    thumbnails = time.monotonic() - begun
+    advice = json.load(urlopen(f"{walk.url}/api/items/{key}/advice", timeout=1800))
+    seconds = time.monotonic() - begun
+    time.sleep(2)
+    ended.set()
+    watching.join()
+    walk.expect(codes == {200: len(names)} and advice, f"thumbnails: {codes}")
+    walk.note(
+        "large",
+        files=len(names),
+        thumbnails_seconds=round(thumbnails, 1),
+        with_advice_seconds=round(seconds, 1),
+        app_before_megabytes=before,
+        app_peak_megabytes=peak["app"],
+        peak_with_children_megabytes=peak["with_children"],
+        app_after_megabytes=walk.resident()[0],
+    )
+
+
+def home(walk: Uploads, count: int, files: Path) -> None:
+    """Home page of many scenes, with a source that is huge, one that is lost, and the whole disk."""
+    folder = files / "huge"
+    for i in range(HUGE_FOLDERS):
+        (inner := folder / f"{i:03}").mkdir(parents=True)
+        for j in range(HUGE_FILES):
+            (inner / f"{j}.txt").touch()
+    lost = files / "lost"
+    lost.mkdir()
+    Image.new("RGB", (40, 30)).save(folder / "a.jpg")
+    Image.new("RGB", (40, 30)).save(lost / "a.jpg")
+    for source in (folder, lost):
+        new(walk.url, title=source.name, path=str(source))
+    (folder / "a.jpg").unlink()
+    shutil.rmtree(lost)
+    key = new(walk.url, title="disk")
+    record = walk.output / "scenes" / key / "project.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"source": "/"}))
+    Image.new("RGB", (40, 30)).save(out := io.BytesIO(), "JPEG")
+    for i in range(count - 3):
+        photos = walk.output / "scenes" / new(walk.url, title=f"scene {i}") / "photos"
+        for j in range(PHOTOGRAPHS_EACH):
+            (photos / f"{j:03}.jpg").write_bytes(out.getvalue())
+    times = []
+    for _ in range(40):
+        begun = time.monotonic()
+        found = json.load(urlopen(f"{walk.url}/api/home", timeout=600))
+        times.append(round(1000 * (time.monotonic() - begun)))
+    cards = {card["title"]: card for card in found["cards"]}
+    for title in ("huge", "lost"):
+        walk.expect(cards[title]["fault"], f"the card of {title} has no sentence")
+    pages = {}
+    for title in ("huge", "lost", "disk"):
+        begun = time.monotonic()
+        walk.detail(cards[title]["key"])
+        pages[f"page_of_{title}_ms"] = round(1000 * (time.monotonic() - begun))
+    missing = sum(card["bytes"] is None or not card["picture"] for card in found["cards"])
+    rest = sorted(times[20:])
+    walk.note(
+        "home",
+        scenes=len(found["cards"]),
+        first_ms=times[:3],
+        later_median_ms=rest[len(rest) // 2],
+        slowest_ms=max(times),
+        without_size_or_picture=missing,
+        sentences=[cards[title]["fault"] for title in ("huge", "lost")],
+        **pages,
+    )
 
 
 def make_malformed(folder: Path, count: int) -> list[Path]:
@@ -300,6 +461,10 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--photographs", type=int, default=500)
     parser.add_argument("--malformed", type=int, default=100)
+    parser.add_argument("--only", nargs="+", choices=("tiny", "large", "home"), default=[], help="without a browser")
+    parser.add_argument("--tiny", type=int, default=5000)
+    parser.add_argument("--large", type=int, default=40)
+    parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--port", type=int, default=8941)
     parser.add_argument("--patience", type=float, default=1800.0, help="seconds for each step")
     given = parser.parse_args()
@@ -308,6 +473,16 @@ def main() -> None:
     files, scenes = given.output / "files", given.output / "scenes"
     mounted = False
     try:
+        if given.only:
+            with running(walk):
+                for name, measure in {
+                    "tiny": lambda: tiny(walk, given.tiny),
+                    "large": lambda: large(walk, given.large),
+                    "home": lambda: home(walk, given.scenes, files),
+                }.items():
+                    if name in given.only:
+                        measure()
+            return
         photographs = make_photographs(files / "many", given.photographs)
         bent = make_malformed(files / "malformed", given.malformed)
         with windows(walk, [f"--host-resolver-rules=MAP {ELSEWHERE} 127.0.0.1"]) as (page, _):
@@ -335,7 +510,8 @@ def main() -> None:
         for folder in (files, scenes):
             shutil.rmtree(folder, ignore_errors=True)
         (given.output / "uploads.json").write_text(json.dumps(walk.found | {"bad": walk.bad}, indent=2) + "\n")
-    sys.exit(1 if walk.bad or walk.faults else 0)
+        if walk.bad or walk.faults:
+            sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from app_walk import drop
 from budgets import budget
 from PIL import Image
 from test_app import PROGRAM, jpeg
+from waiting import until
 
 from lumigraph.app import uploads
 from lumigraph.app.projects import new_project
@@ -125,14 +126,35 @@ def garden(served, page) -> Path:
     return item.photographs
 
 
+DONE = """async () => {
+  const state = (await import("/static/uploads.js")).stateOf("Garden");
+  const { done } = state;
+  state.done = 0;
+  return done;
+}"""
+
+
 def sent(page, count: int = 1) -> None:
     """Wait until so many files of a drop are sent or refused."""
-    page.wait_for_function(
-        "async (count) => {"
-        " const state = (await import('/static/uploads.js')).stateOf('Garden');"
-        " return state.done >= count && ((state.done = 0), true); }",
-        arg=count,
+    left = [count]
+
+    def is_done() -> bool:
+        left[0] -= page.evaluate(DONE)
+        return left[0] <= 0
+
+    until(is_done)
+
+
+@pytest.mark.parametrize("size", [1, 63, 64, 65, 128, (4 << 20) - 1, 4 << 20, (4 << 20) + 7])
+def test_the_page_and_the_app_hash_alike(garden, page, tmp_path, size):
+    step = 1 + size % 251
+    (tmp_path / "file").write_bytes(bytes(i * step % 256 for i in range(size)))
+    hashed = page.evaluate(
+        "async ([size, step]) => (await import('/static/hash.js'))"
+        ".hashOf(new File([Uint8Array.from({ length: size }, (_, i) => (i * step) % 256)], 'x'))",
+        [size, step],
     )
+    assert hashed == uploads.hash_of(tmp_path / "file")
 
 
 def test_photographs_of_one_name_and_size_all_stay(garden, page, faults, tmp_path):
@@ -170,7 +192,7 @@ def test_two_tabs_that_send_the_same_photographs_give_each_once(garden, served, 
 def test_many_small_photographs_need_one_listing(garden, page, faults, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(uploads, "listed", lambda folder, real=uploads.listed: asked.append(folder) or real(folder))
-    given = photographs(tmp_path / "given", [f"{i}.bmp" for i in range(120)])
+    given = photographs(tmp_path / "given", [f"{i}.bmp" for i in range(40)])
     drop(page, given)
     sent(page, len(given))
     assert contents(garden) == contents(*given) and len(asked) == 1 and faults == []

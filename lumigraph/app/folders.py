@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 from ..files.atomic import refusal
 
 MAX_ENTRIES, MAX_DEPTH = 20_000, 64  # of one look
-LOOK_SECONDS = 0.5  # of one look
+CARD_SECONDS, PAGE_SECONDS = 0.25, 3.0  # of one look for a card of many, and for the page of one item
 CUT_SECONDS = 60.0  # until a folder that was not looked through is tried again
 SETTLED_SECONDS = 0.1  # after which a further change gives a folder another time of change
 MAX_KEPT = 4096  # folders whose findings are kept
@@ -27,8 +27,8 @@ class Look:
     fault:   a sentence on what could not be read; is_cut: whether the look ended at a bound
     """
 
-    def __init__(self, folder: Path):
-        self.folder, self.begun = folder, time.monotonic()
+    def __init__(self, folder: Path, seconds: float):
+        self.folder, self.begun, self._seconds = folder, time.monotonic(), seconds
         self.changed: dict[str, tuple[int, int]] = {}
         self.fault, self.is_cut, self._count = "", False, 0
 
@@ -42,7 +42,7 @@ class Look:
             with os.scandir(folder) as found:
                 for entry in found:
                     self._count += 1
-                    if self._count > MAX_ENTRIES or time.monotonic() - self.begun > LOOK_SECONDS:
+                    if self._count > MAX_ENTRIES or time.monotonic() - self.begun > self._seconds:
                         self.is_cut = True
                     if self.is_cut:
                         return
@@ -80,10 +80,13 @@ def times_of(folder: Path | str) -> tuple[int, int]:
 
 
 class Finder(Generic[T]):
-    """Finding about a folder that is kept while the folder stays as it is. find: looks through the folder"""
+    """Finding about a folder that is kept while the folder stays as it is.
 
-    def __init__(self, find: Callable[[Look], T]):
-        self._find = find
+    find: looks through the folder, for so many seconds
+    """
+
+    def __init__(self, find: Callable[[Look], T], seconds: float = CARD_SECONDS):
+        self._find, self._seconds = find, seconds
         self._kept: dict[Path, tuple[Look, T]] = {}
 
     def __call__(self, folder: Path, until: float = float("inf")) -> tuple[Look, T] | None:
@@ -91,7 +94,7 @@ class Finder(Generic[T]):
         known = self._kept.get(folder)
         if time.monotonic() > until or (known and known[0].is_current()):
             return known
-        look = Look(folder)
+        look = Look(folder, self._seconds)
         found = look, self._find(look)
         if len(self._kept) > MAX_KEPT:
             self._kept.clear()

@@ -32,7 +32,7 @@ from ..files import is_file
 from ..files.names import counted, natural
 from ..system.signals import start
 from . import reduce
-from .folders import Finder, Look
+from .folders import PAGE_SECONDS, Finder, Look
 from .projects import Item
 from .reduce import reduced
 from .uploads import MAX_FILES
@@ -71,7 +71,7 @@ def _first(look: Look) -> Path | None:
     return next(itertools.chain(walk(look.folder, list_entries=look.entries), films), None)
 
 
-_listings, _firsts = Finder(_listing), Finder(_first)
+_listings, _firsts = Finder(_listing, PAGE_SECONDS), Finder(_first)
 
 
 def files_of(folder: Path) -> dict[str, Path]:

@@ -314,11 +314,11 @@ class App:
         uploads.album(item.photographs).leave_out(name, item.path / "left-out")
         return self.detail(item)
 
-    def upload(self, key: str, name: str, size: str, crc: str) -> uploads.Upload:
+    def upload(self, key: str, name: str, size: str, content: str) -> uploads.Upload:
         item = self.item(key)
         if item.kind != "project" or item.record.source:
             raise LumigraphError("Photographs can be added to scenes that were made by uploads; make a new one")
-        return uploads.upload(item.photographs, name, whole(size), crc)
+        return uploads.upload(item.photographs, name, whole(size), content)
 
     def share(self, item: Item, body: ShareBody) -> dict[str, Any]:
         job = sharing.share_job(item, body.kind, item.run(body.run), time.time(), body.size)
@@ -389,7 +389,7 @@ def build(app: App) -> ASGIApp:
         return FileResponse(PAGE / name, media_type=MEDIA_TYPES[Path(name).suffix], headers=about)
 
     async def opened(request: Request) -> uploads.Upload:
-        about = (request.query_params.get(name, "") for name in ("name", "size", "crc"))
+        about = (request.query_params.get(name, "") for name in ("name", "size", "hash"))
         return await asyncio.to_thread(app.upload, request.path_params["key"], *about)
 
     async def take(request: Request) -> Response:

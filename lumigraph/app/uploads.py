@@ -7,16 +7,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import filecmp
+import hashlib
 import itertools
 import os
 import re
 import shutil
 import threading
 import time
-import zlib
 from collections import defaultdict
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -29,7 +28,7 @@ MAX_FILE_BYTES = {"photograph": 1 << 30, "video": 32 << 30}
 MAX_FILES = 5000  # of one project
 MAX_NAME_BYTES, MAX_FOLDER_BYTES, MAX_FOLDERS = 180, 40, 4  # of a whole name; of a folder in a name that is too long
 RESERVED_BYTES = 256 << 20  # of the disk, which stay free
-CRC_BYTES = 1 << 20  # of a file that are read at a time
+HASH_BYTES, READ_BYTES = 16, 1 << 20  # of a hash; of a file that are read at a time
 PART = re.compile(r"\..+\.part")  # name of a file that is not whole yet
 PART_SECONDS = 7 * 86_400.0  # that part of an upload waits for the rest
 RELIST_SECONDS = 5.0  # between listings of a full folder
@@ -66,7 +65,8 @@ class Album:
     def refresh(self) -> None:
         """List the folder, and delete parts of uploads that nobody continues."""
         self._count, self._listed = 0, time.monotonic()
-        self._alike: dict[tuple[str, int], list[str]] = defaultdict(list)  # names by wanted name and size
+        self._unread: dict[tuple[str, int], list[str]] = defaultdict(list)  # names by wanted name and size
+        self._known: dict[tuple[str, int], dict[str, str]] = defaultdict(dict)  # those that were read, by content
         self._numbers: dict[str, int] = {}  # the last number behind a name
         for path in self.folder.rglob("*"):
             with contextlib.suppress(OSError):
@@ -79,10 +79,10 @@ class Album:
 
     def _note(self, name: str, size: int) -> None:
         self._count += 1
-        self._alike[name, size].append(name)
+        self._unread[name, size].append(name)
         if found := NUMBERED.fullmatch(name):
             wanted, number = found[1] + found[3], int(found[2])
-            self._alike[wanted, size].append(name)
+            self._unread[wanted, size].append(name)
             self._numbers[wanted] = max(number, self._numbers.get(wanted, 1))
 
     def is_full(self) -> bool:
@@ -90,13 +90,19 @@ class Album:
             self.refresh()  # some may have been deleted by hand
         return self._count >= MAX_FILES
 
-    def find(self, name: str, size: int, is_same: Callable[[Path], bool]) -> str | None:
-        """Name of the file with this content among those of a wanted name."""
-        for one in dict.fromkeys([name, *self._alike.get((name, size), ())]):
-            place = self.folder / one
-            if place.is_file() and place.stat().st_size == size and is_same(place):
-                return one
-        return None
+    def find(self, name: str, size: int, content: str | Path) -> str | None:
+        """Name of the file with this content among those of a wanted name. content: hash, or a file of that content"""
+        key = name, size
+        with self.lock:
+            for one in self._unread.pop(key, ()):
+                with contextlib.suppress(OSError):  # it has gone
+                    self._known[key][hash_of(self.folder / one)] = one
+            known = self._known.get(key, {})
+        if not known and not is_of_size(self.folder / name, size):
+            return None
+        wanted = hash_of(content) if isinstance(content, Path) else content
+        place = self.folder / (found := known.get(wanted, name))
+        return found if is_of_size(place, size) and hash_of(place) == wanted else None
 
     def add(self, file: Path, name: str) -> str:
         """Move a whole file to a wanted name, or to one with a number behind it. Returns the name."""
@@ -142,26 +148,26 @@ class Arrived:
 class Upload:
     """A file on its way into an album.
 
-    name: wanted, with "/"; size: bytes of the whole file; crc: CRC-32 of its content in eight hexadecimal digits, by
-    which it goes on and is known to be there; empty if the sender has not computed it
+    name: wanted, with "/"; size: bytes of the whole file; content: its hash, by which it goes on and is known to be
+    there; empty if the sender has not computed it
     """
 
     album: Album
     name: str
     size: int
-    crc: str = ""
+    content: str = ""
 
     @property
     def partial(self) -> Path:
         place = self.album.folder / self.name
-        return place.with_name(f".{place.name}.{self.size}-{self.crc}.part")
+        return place.with_name(f".{place.name}.{self.size}-{self.content}.part")
 
     def arrived(self) -> Arrived:
         """State of this upload. Raises LumigraphError if it is new and the project has all the files that it may."""
         have = self.partial.stat().st_size if self.partial.is_file() else 0
         if 0 < have < self.size:
             return Arrived(have, self.name)
-        if self.crc and (name := self.album.find(self.name, self.size, lambda place: crc_of(place) == self.crc)):
+        if self.content and (name := self.album.find(self.name, self.size, self.content)):
             return Arrived(self.size, name, True)
         self.check_number()
         return Arrived(0, self.name)
@@ -208,8 +214,7 @@ class Upload:
         try:
             if fault := fault_of(self.partial, self.name):
                 raise LumigraphError(fault)
-            same = self.album.find(self.name, self.size, lambda place: filecmp.cmp(place, self.partial, shallow=False))
-            if same is not None:
+            if same := self.album.find(self.name, self.size, self.partial):
                 return same
             self.check_number()
             with explained(self.album.folder / self.name):
@@ -224,7 +229,7 @@ class Upload:
             )
 
 
-def upload(folder: Path, name: str, size: int, crc: str = "") -> Upload:
+def upload(folder: Path, name: str, size: int, content: str = "") -> Upload:
     """An upload into a project's photographs. Raises LumigraphError for names and sizes that are refused."""
     name = safe_name(name)
     kind = kind_of_file(name)
@@ -233,9 +238,9 @@ def upload(folder: Path, name: str, size: int, crc: str = "") -> Upload:
     if not 0 < size <= MAX_FILE_BYTES[kind]:
         much = f"{MAX_FILE_BYTES[kind] >> 30} GB are the most for a {kind}"
         raise LumigraphError(f"{name} {'is empty' if size < 1 else f'has {size:,} bytes, and {much}'}; leave it out")
-    if crc and not re.fullmatch("[0-9a-f]{8}", crc):
-        raise LumigraphError(f"{crc[:20]!r} is no checksum; load the page again")
-    return Upload(album(folder), name, size, crc)
+    if content and not re.fullmatch(f"[0-9a-f]{{{2 * HASH_BYTES}}}", content):
+        raise LumigraphError(f"{content[:20]!r} is no hash; load the page again")
+    return Upload(album(folder), name, size, content)
 
 
 def safe_name(name: str) -> str:
@@ -300,13 +305,17 @@ def listed(folder: Path) -> Iterator[str]:
     return (path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts))
 
 
-def crc_of(path: Path) -> str:
-    """CRC-32 of a file's content, as the page computes it."""
-    crc = 0
+def is_of_size(path: Path, size: int) -> bool:
+    return path.is_file() and path.stat().st_size == size
+
+
+def hash_of(path: Path) -> str:
+    """Hash of a file's content, as the page computes it (page/hash.js)."""
+    hasher = hashlib.blake2s(digest_size=HASH_BYTES)
     with open(path, "rb") as file:
-        while piece := file.read(CRC_BYTES):
-            crc = zlib.crc32(piece, crc)
-    return f"{crc:08x}"
+        while piece := file.read(READ_BYTES):
+            hasher.update(piece)
+    return hasher.hexdigest()
 
 
 def check_room(folder: Path, size: int) -> None:

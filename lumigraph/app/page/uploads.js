@@ -1,6 +1,7 @@
 // Uploads in pieces: several files at a time, each goes on where the app has it, and waits while the app is away.
 
 import { api, of } from "./common.js";
+import { hashOf } from "./hash.js";
 
 const PIECE_BYTES = 8 << 20;
 const AT_A_TIME = 3;
@@ -57,11 +58,11 @@ async function work(key, state) {
 }
 
 async function send(key, { name, file }, count, state) {
-  const crc = await crcOf(file);
+  const hash = await hashOf(file);
   let offset = null;
   for (let tries = 0; ; ) {
     try {
-      const about = new URLSearchParams({ name, size: file.size, crc });
+      const about = new URLSearchParams({ name, size: file.size, hash });
       if (offset === null) {
         const found = await api("GET", `${of(key)}/photographs?${about}`);
         offset = found.have;
@@ -95,21 +96,6 @@ async function send(key, { name, file }, count, state) {
       offset = null;
     }
   }
-}
-
-const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
-  for (let bit = 0; bit < 8; bit += 1) n = n & 1 ? (n >>> 1) ^ 0xedb88320 : n >>> 1;
-  return n;
-});
-
-// CRC-32 of a file, by which the app knows whether it has that very content. The browser's own hashes need https.
-async function crcOf(file) {
-  let crc = -1;
-  for (let at = 0; at < file.size; at += PIECE_BYTES) {
-    const bytes = new Uint8Array(await file.slice(at, at + PIECE_BYTES).arrayBuffer());
-    for (let i = 0; i < bytes.length; i += 1) crc = (crc >>> 8) ^ CRC_TABLE[(crc ^ bytes[i]) & 255];
-  }
-  return (~crc >>> 0).toString(16).padStart(8, "0");
 }
 
 // Files of a drop, with those in folders: { title, files: [{ name, file }] }
