@@ -7,6 +7,7 @@ import hashlib
 import io
 import itertools
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -37,7 +38,7 @@ from .projects import Item
 from .reduce import reduced
 from .uploads import MAX_FILES
 
-THUMBNAIL_SIDE = 320  # pixels
+THUMBNAIL_SIDE, KEPT_SIDE = 320, 512  # pixels of a thumbnail; of those that are kept in memory, at most
 DARK = -6.5  # mean log2 of the luminance, below which noise of a photograph has its detail
 USUAL_VIEWS = 20  # photographs of a scene that has no gaps
 MAX_NAMED = 3  # photographs that a piece of advice names
@@ -77,7 +78,7 @@ _listings, _firsts = Finder(_listing, PAGE_SECONDS), Finder(_first)
 def files_of(folder: Path) -> dict[str, Path]:
     """Photographs and videos of a folder by name, in natural order, as far as the bounds of a `Look`; of a file the
     file itself."""
-    if folder.is_file():
+    if is_file(folder):
         return {folder.name: folder}
     found = _listings(folder)
     return dict(found[1]) if found else {}
@@ -88,7 +89,7 @@ def first_of(folder: Path, until: float) -> tuple[Path | None, str]:
 
     until: moment (time.monotonic) after which no folder is looked through
     """
-    if folder.is_file():
+    if is_file(folder):
         return folder, ""
     found = _firsts(folder, until)
     return (None, "") if found is None else (found[1], "" if found[1] else found[0].sentence)
@@ -97,13 +98,13 @@ def first_of(folder: Path, until: float) -> tuple[Path | None, str]:
 def listing_fault(item: Item) -> str:
     """A sentence where the photographs of an item are not all listed; empty otherwise."""
     folder = folder_of(item)
-    found = None if item.kind == "run" or folder.is_file() else _listings(folder)
+    found = None if item.kind == "run" or is_file(folder) else _listings(folder)
     return found[0].sentence if found else ""
 
 
 def named_file(folder: Path, name: str) -> Path | None:
     """Photograph or video below a folder by its name; None for any other name. Of a file the file itself."""
-    if folder.is_file():
+    if is_file(folder):
         return folder if name == folder.name else None
     parts = PurePosixPath(name).parts
     path = folder.joinpath(*parts)
@@ -116,7 +117,7 @@ def named_file(folder: Path, name: str) -> Path | None:
 def folder_of(item: Item) -> Path:
     """Folder of an item's photographs, or its video; of a scene its folder of images."""
     images = item.path / "images"
-    return images if item.kind == "scene" and images.is_dir() else item.photographs
+    return images if item.kind == "scene" and os.path.isdir(images) else item.photographs
 
 
 def photographs_of(item: Item) -> dict[str, Path]:
@@ -125,7 +126,7 @@ def photographs_of(item: Item) -> dict[str, Path]:
 
 
 def is_film(path: Path) -> bool:
-    return path.suffix.lower() in VIDEOS and path.is_file() and not path.name.startswith(".")
+    return path.suffix.lower() in VIDEOS and is_file(path) and not path.name.startswith(".")
 
 
 def input_of(item: Item) -> Path:
@@ -147,7 +148,8 @@ def input_of(item: Item) -> Path:
 def thumbnail(path: Path, side: int = THUMBNAIL_SIDE) -> bytes:
     """JPEG of a photograph, or of the first frame of a video, upright."""
     about = path.stat()
-    return _thumbnail(path, about.st_mtime_ns, about.st_size, side)
+    make = _thumbnail if side <= KEPT_SIDE else _thumbnail.__wrapped__
+    return make(path, about.st_mtime_ns, about.st_size, side)
 
 
 @lru_cache(MAX_KEPT)
