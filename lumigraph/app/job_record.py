@@ -29,7 +29,9 @@ from .projects import JOB_FILE, Item
 KEY_FILE, KEY_BYTES = "app.key", 32  # in the user's cache folder
 NOT_SEALED = "This was not asked for by the app at this place; press the button to begin"
 Sentence = Annotated[str, msgspec.Meta(max_length=10_000)]
-PlainName = Annotated[str, msgspec.Meta(max_length=255, pattern=r"\A[^./\\:\x00-\x1f][^/\\:\x00-\x1f]*\Z")]
+PLAIN = r"[^./\\:\x00-\x1f][^/\\:\x00-\x1f]*"  # name of one file or folder that is not hidden
+PlainName = Annotated[str, msgspec.Meta(max_length=255, pattern=rf"\A{PLAIN}\Z")]
+RunName = Annotated[str, msgspec.Meta(max_length=255, pattern=rf"\A({PLAIN})?\Z")]
 ShareName = Literal["page", "film", "splats", "mesh", "points", "compare"]
 JobState = Literal["queued", "running", "paused", "stopped", "failed", "done"]
 Mapper = Literal["incremental", "global"]
@@ -57,7 +59,7 @@ class Making:
     downscale: Downscale | None = None
     mask_object: bool = False
     stage: Literal["capture", "train"] = "capture"
-    run: PlainName | Literal[""] = ""
+    run: RunName = ""
     fault: Sentence = ""
     process: Tally = 0
 

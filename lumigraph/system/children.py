@@ -20,6 +20,7 @@ from typing import Any
 
 PACKAGE = Path(__file__).resolve().parents[1]
 PR_SET_PDEATHSIG = 1  # Linux's number
+PYTHON = sys.executable, "-P"  # imports do not begin in the working directory
 REQUESTED = "-m", "lumigraph.commands.request"  # the program that runs the Request on its standard input
 
 
@@ -49,7 +50,7 @@ def start_python(
              that; elsewhere a child should watch its standard input, which ends at the same moment.
     """
     tied_to_us = tied(ends_by) if sys.platform == "linux" else None
-    return subprocess.Popen([sys.executable, "-P", *words], cwd=folder, preexec_fn=tied_to_us, **options)
+    return subprocess.Popen([*PYTHON, *words], cwd=folder, preexec_fn=tied_to_us, **options)
 
 
 def tied(number: int) -> Any:
