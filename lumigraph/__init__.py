@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from .system.isolation import ignore_working_directory
 
-from .system import threads
+ignore_working_directory()  # before the imports below
+
+import importlib  # noqa: E402
+from typing import TYPE_CHECKING, Any  # noqa: E402
+
+from .system import threads  # noqa: E402
 
 if TYPE_CHECKING:
     from .camera import Camera as Camera

@@ -19,7 +19,8 @@ CHECKED_CALLS = 5
 JIT = re.compile(r"^\s*(import|from) (numba|triton)\b", re.MULTILINE)
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int will do for a float
 PACKAGE = Path(__file__).parent.parent / "lumigraph"
-OWN = {"lumigraph.system", "lumigraph.system.threads"}  # must come before PyTorch, and has no shapes
+# Loaded before anything else, and without shapes.
+OWN = {"lumigraph.system", "lumigraph.system.isolation", "lumigraph.system.threads"}
 
 every_call = jaxtyping.jaxtyped
 test = 0  # number of the present one

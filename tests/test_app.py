@@ -15,6 +15,7 @@ import threading
 import zlib
 from collections import namedtuple
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,43 +30,45 @@ from waiting import until
 from websockets.sync.server import serve as serve_websockets
 
 from lumigraph.app import folders, jobs, pictures, progress, projects, sharing, uploads
-from lumigraph.app.job_record import read_job
+from lumigraph.app.job_record import Making, change, read_job
+from lumigraph.app.jobs import child_address
 from lumigraph.app.projects import find_item, new_project
 from lumigraph.app.scene_views import SceneView
 from lumigraph.app.server import App, build, qr_code
 from lumigraph.errors import LumigraphError
-from lumigraph.viewer.address import Address, free_port
+from lumigraph.viewer.address import Address
 
 pytestmark = budget("exports", 12)
 
 BASE = "http://127.0.0.1:8080"
 HOST = {"Host": "127.0.0.1:8080"}  # for websockets, where the client would have another
 TOKEN = "a-token-nobody-guesses"
-# The command line, in short: capture makes a scene, train a run. It waits for the file `go`, and fails as `fault` says.
+# The commands, in short: capture makes a scene, train a run. It waits for the file `go`, and fails as `fault` says.
 PROGRAM = """
 import json, os, pathlib, shutil, signal, sys, time
-words, here = sys.argv[1:], pathlib.Path.cwd()
+request = json.load(sys.stdin)
+command, options = request["command"], request["options"]
+root = pathlib.Path(sys.argv[0]).parent / "scenes-here"
+made = pathlib.Path(options.get("output") or options["run_folder"])
+here = root / made.relative_to(root).parts[0]
 def stop(number, frame):
     print("saved", flush=True)
     sys.exit(128 + number)
 signal.signal(signal.SIGINT, stop)
 signal.signal(signal.SIGTERM, stop)
 with open(here / "calls.txt", "a") as calls:
-    calls.write(json.dumps(words) + "\\n")
-while not (here.parent / "go").exists():
+    calls.write(json.dumps(request) + "\\n")
+while not (root / "go").exists():
     time.sleep(0.01)
-if (fault := here.parent / "fault").exists():
+if (fault := root / "fault").exists():
     sys.exit(print("warning: something\\nlumigraph: " + fault.read_text()) or 2)
-def option(name):
-    return pathlib.Path(words[words.index(name) + 1])
-if words[0] == "capture":
-    option("--output").mkdir()
-    (option("--output") / "transforms.json").write_text("{}")
-elif words[0] in ("train", "resume"):
-    run = pathlib.Path(words[1]) if words[0] == "resume" else option("--output")
-    shutil.copytree((here.parent.parent / "ball.txt").read_text(), run, dirs_exist_ok=True)
-elif words[0] != "eval":
-    pathlib.Path(words[3] if words[0] == "export" else option("--output")).write_bytes(b"<p>made</p>")
+if command == "capture":
+    made.mkdir()
+    (made / "transforms.json").write_text("{}")
+elif command in ("train", "resume"):
+    shutil.copytree((root.parent / "ball.txt").read_text(), made, dirs_exist_ok=True)
+elif command != "eval":
+    made.write_bytes(b"<p>made</p>")
 """
 
 
@@ -82,9 +85,7 @@ def app(tmp_path, ball_run) -> App:
     (tmp_path / "program.py").write_text(PROGRAM)
     (tmp_path / "ball.txt").write_text(str(Path(ball_run.path).resolve()))
     (tmp_path / "scenes-here").mkdir()
-    return App(
-        tmp_path / "scenes-here", Address("127.0.0.1", 8080), [sys.executable, "-S", str(tmp_path / "program.py")]
-    )
+    return App(tmp_path / "scenes-here", Address("127.0.0.1", 8080), ["-S", str(tmp_path / "program.py")])
 
 
 @pytest.fixture
@@ -260,6 +261,18 @@ def test_a_piece_that_comes_several_times_at_once_is_added_once(app, project):
             said = [one.result() for one in [pool.submit(add) for _ in range(6)]]
         assert sorted(said) == [str(offset + len(piece)), *["misplaced"] * 5]
     assert contents(app, project) == [data]
+
+
+def test_a_link_in_a_received_project_leads_no_upload_out(app, client, project, tmp_path):
+    photos, data = app.root / project / "photos", jpeg()
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    (photos / "walk").symlink_to(elsewhere)
+    (photos / f".a.jpg.{len(data)}-.part").symlink_to(elsewhere / "a.jpg")
+    for name in ("walk/a.jpg", "a.jpg"):
+        refused = put(client, project, name, data)
+        assert refused.status_code == 400 and "is a link" in refused.json()["fault"]
+        assert client.get(f"/api/items/{project}/picture", params={"name": name}).status_code == 400
+    assert list(elsewhere.iterdir()) == []
 
 
 def test_uploads_list_the_folder_once(app, client, project, monkeypatch):
@@ -461,14 +474,14 @@ def test_thumbnails_show_pictures_of_all_kinds(tmp_path, monkeypatch, name, is_l
 def test_large_pictures_are_decoded_one_at_a_time_elsewhere_and_once(app, client, project, monkeypatch):
     monkeypatch.setattr(pictures, "LARGE_PIXELS", 1000)
     children, alive = [], []
-    real = pictures.start
+    real = pictures.start_python
 
     def start(command, *options, **more):
         alive.append(sum(child.poll() is None for child in children))
         children.append(real(command, *options, **more))
         return children[-1]
 
-    monkeypatch.setattr(pictures, "start", start)
+    monkeypatch.setattr(pictures, "start_python", start)
     for i in range(3):
         Image.fromarray(np.full((60, 80, 3), 40 * i, np.uint8)).save(app.root / project / "photos" / f"{i}.png")
     asked = [{"name": f"{i}.png", "side": side} for i in range(3) for side in (320, 512)]
@@ -547,9 +560,11 @@ def test_a_path_on_this_machine_needs_no_upload(app, client, tmp_path):
 # Jobs
 
 
-def calls(app, key: str) -> list[list[str]]:
+def calls(app, key: str) -> list[tuple[str, dict]]:
+    """Commands that ran, with those of their options that are given."""
     place = app.root / key / "calls.txt"
-    return [json.loads(line) for line in place.read_text().splitlines()] if place.exists() else []
+    asked = map(json.loads, place.read_text().splitlines() if place.exists() else ())
+    return [(one["command"], {k: x for k, x in one["options"].items() if x is not None}) for one in asked]
 
 
 def state(client, key: str) -> str:
@@ -568,17 +583,13 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     assert running.post(f"/api/items/{project}/make", json={"quality": "superb"}).status_code == 400
     running.post(f"/api/items/{project}/make", json={"quality": "good", "mapper": "global"})
     until(lambda: state(running, project) == "done")
-    capture, train = calls(app, project)
+    (capture, scene), (train, run) = calls(app, project)
     here = app.root / project
-    assert capture == ["capture", str(here / "photos"), "--output", str(here / "scene"), "--mapper", "global"]
-    assert train[:5] == [
-        "train",
-        "gaussian-splatting",
-        str(here / "scene"),
-        "--output",
-        str(here / "runs/gaussian-splatting-1"),
-    ]
-    assert train[5:7] == ["--quality", "good"] and "--no-stay" in train
+    made = {"what": [str(here / "photos")], "output": str(here / "scene"), "mapper": "global", "mask_object": False}
+    assert (capture, scene) == ("capture", made) and train == "train" and len(run.pop("token")) > 20
+    place = str(here / "runs/gaussian-splatting-1")
+    expected = {"method": "gaussian-splatting", "scene": str(here / "scene"), "output": place, "quality": "good"}
+    assert run == expected | {"view": True, "stay": False, "port": run["port"]}
 
     asked = {"kind": "film", "run": "gaussian-splatting-1"}
     assert running.post(f"/api/items/{project}/shares", json=asked | {"run": "../x"}).status_code == 400
@@ -586,7 +597,7 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
     row = until(
         lambda: next((one for one in running.get(f"/api/items/{project}").json()["shares"] if one["bytes"]), None)
     )
-    assert calls(app, project)[2][:2] == ["render", str(here / "runs/gaussian-splatting-1")]
+    assert calls(app, project)[2] == ("render", {"source": place, "output": str(here / "shared" / row["name"])})
     file = running.get(f"/api/items/{project}/shares/{row['name']}")
     assert file.content == b"<p>made</p>" and "attachment" in file.headers["Content-Disposition"]
     assert "sandbox" in file.headers["Content-Security-Policy"]
@@ -596,6 +607,8 @@ def test_photographs_become_a_run_and_a_file(app, running, project):
 
 def test_the_folder_is_shown_on_its_own_machine_alone(app, client, project, tmp_path, monkeypatch):
     folder, asked = app.root / project / "shared", []
+    assert "does not exist yet" in client.post(f"/api/items/{project}/reveal").json()["fault"]
+    folder.mkdir()
     monkeypatch.setenv("PATH", str(tmp_path))
     assert "No file manager was found" in client.post(f"/api/items/{project}/reveal").json()["fault"]
     monkeypatch.setattr(sharing.subprocess, "Popen", lambda words, **options: asked.append(words))
@@ -621,8 +634,8 @@ def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run)
     let(app)
     running.post(f"/api/items/{project}/shares", json={"kind": "compare", "run": "a"})
     until(lambda: running.get(f"/api/items/{project}").json()["shares"][0]["state"] == "done")
-    (words,) = calls(app, project)
-    assert words == ["eval", str(place), "--split", "test", "--views", "12", "--save-images", "--overwrite"]
+    expected = {"run_folder": str(place), "split": "test", "views": 12, "save_images": True, "overwrite": True}
+    assert calls(app, project) == [("eval", expected)]
     run = Run(place)
     evaluate_run(run, run.method("cpu"), tiny.scene(), "test", True, 2)  # as the command does
     compared = running.get(f"/api/items/{project}").json()["runs"][0]["compared"]
@@ -660,8 +673,8 @@ def test_a_job_is_paused_and_goes_on_by_resume(app, running, project):
     until(lambda: state(running, project) == "done")
     running.post(f"/api/items/{project}/more", json={"minutes": 2})
     until(lambda: len(calls(app, project)) == 4 and state(running, project) == "done")
-    assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train", "resume"]
-    assert calls(app, project)[3][2:4] == ["--seconds", "120.0"]
+    assert [command for command, _ in calls(app, project)] == ["capture", "capture", "train", "resume"]
+    assert calls(app, project)[3][1]["seconds"] == 120.0
 
 
 def test_a_training_gets_more_time_while_it_runs(app, running, project):
@@ -677,7 +690,8 @@ def test_a_training_gets_more_time_while_it_runs(app, running, project):
     assert state(running, project) == "running"
     let(app)
     until(lambda: state(running, project) == "done")
-    assert calls(app, project)[3][0] == "resume" and calls(app, project)[3][2:4] == ["--quality", "good"]
+    command, options = calls(app, project)[3]
+    assert command == "resume" and options["quality"] == "good" and "seconds" not in options
 
 
 def test_a_scene_with_poses_is_trained_without_a_capture(app, running, ball_folder):
@@ -688,8 +702,9 @@ def test_a_scene_with_poses_is_trained_without_a_capture(app, running, ball_fold
     assert (card["kind"], card["key"]) == ("scene", "scenes:ball")
     made = running.post("/api/items/scenes:ball/make", json={"minutes": 1}).json()
     until(lambda: state(running, made["key"]) == "done")
-    (train,) = calls(app, made["key"])
-    assert train[:3] == ["train", "gaussian-splatting", str(scene)] and train[5:7] == ["--seconds", "60.0"]
+    ((train, options),) = calls(app, made["key"])
+    assert (train, options["method"], options["scene"]) == ("train", "gaussian-splatting", str(scene))
+    assert options["seconds"] == 60.0 and "quality" not in options
 
 
 def test_jobs_wait_for_each_other_and_go_with_their_project(app, running):
@@ -724,7 +739,7 @@ def test_a_killed_app_goes_on_where_it_was(app, project):
     again.runner.begin()
     until(lambda: read_job(item).make.state == "done")
     again.runner.end()
-    assert [words[0] for words in calls(app, project)] == ["capture", "capture", "train"]
+    assert [command for command, _ in calls(app, project)] == ["capture", "capture", "train"]
 
 
 def test_a_damaged_record_is_told_and_stops_nobody_else(app, running, project):
@@ -782,8 +797,7 @@ def database(app, project):
 
 
 def make_running(app, key: str, stage: str) -> None:
-    making = {"state": "running", "asked": 1.0, "stage": stage, "run": "a"}
-    (app.root / key / "job.json").write_text(json.dumps({"make": making}))
+    change(find_item(app.root, key), lambda job: replace(job, make=Making("running", 1.0, stage=stage, run="a")))
 
 
 PAGES = "", "/states", "/features?name=a.jpg", "/model", "/advice"
@@ -936,16 +950,18 @@ def test_the_viewer_is_reached_through_the_app_alone(app, project):
             connection.send(b"seen " + message)
 
     def page(connection, request):
+        if request.headers.get("Cookie") != address.cookie:
+            return connection.respond(403, "no token")
         if "Upgrade" not in request.headers:
             return connection.respond(200, f"viewer at {request.path}")
         return None
 
-    port = free_port("127.0.0.1", 0)
-    with serve_websockets(echo, "127.0.0.1", port, process_request=page, subprotocols=["viser-v1"]) as server:
+    address = child_address()
+    with serve_websockets(echo, "127.0.0.1", address.port, process_request=page, subprotocols=["viser-v1"]) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         client = TestClient(build(app), base_url=BASE)
         assert client.get(f"/scene/{project}/a/").status_code == 404  # nobody has opened it
-        view = SceneView(port, _Child(), app.root / "log")
+        view = SceneView(address, _Child(), app.root / "log")
         app.views.views[run] = view
         shown = client.get(f"/scene/{project}/a/some/file.js")
         assert (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 import threading
 from collections import Counter, namedtuple
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ def served(tmp_path):
     (tmp_path / "program.py").write_text(PROGRAM)
     (tmp_path / "scenes-here").mkdir()
     address = Address("127.0.0.1", free_port("127.0.0.1", 0) or 0)
-    program = [sys.executable, "-S", str(tmp_path / "program.py")]
+    program = ["-S", str(tmp_path / "program.py")]
     app = App(tmp_path / "scenes-here", address, program)
     opened = threading.Event()
     config = uvicorn.Config(build(app), port=address.port, log_level="error", ws="websockets-sansio")

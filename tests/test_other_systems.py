@@ -12,7 +12,7 @@ from listing import names
 from lumigraph import files
 from lumigraph.errors import LumigraphError
 from lumigraph.files import locks, partials
-from lumigraph.system import allocation, cache, memory, signals
+from lumigraph.system import allocation, cache, children, memory, signals
 
 pytestmark = budget("house", 5)  # 0.5 s alone; 5.0 s at the end of a session, whose garbage is collected three times
 fcntl = pytest.importorskip("fcntl")
@@ -60,9 +60,9 @@ def test_without_locks_files_are_written_and_leftovers_stay(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("platform", ["darwin", "win32"])
 def test_children_begin_where_no_call_ties_them(monkeypatch, on, platform):
-    on(platform, signals)
-    monkeypatch.setattr(signals, "tied", None)
-    assert signals.start([sys.executable, "-S", "-c", "raise SystemExit(7)"]).wait(60) == 7
+    on(platform, children)
+    monkeypatch.setattr(children, "tied", None)
+    assert children.start_python(["-S", "-c", "raise SystemExit(7)"]).wait(60) == 7
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ def test_pycolmap_is_loaded_at_one_place():
 def test_children_die_with_their_parent(tmp_path):
     """A parent that is killed outright, and its child, which writes its number and sleeps."""
     child = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60)"
-    parent = f"import sys; from lumigraph.system.signals import start; start([sys.executable, '-c', {child!r}]).wait()"
+    parent = f"import sys; from lumigraph.system.children import start_python; start_python(['-c', {child!r}]).wait()"
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
     with subprocess.Popen(
         [sys.executable, "-c", parent], env=environment, stdout=subprocess.PIPE, text=True

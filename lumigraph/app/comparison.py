@@ -14,12 +14,12 @@ VIEWS = 12  # at most
 SPLITS = "test", "train"  # held-out photographs first
 
 
-def eval_options(run: Path) -> list[str]:
+def eval_options(run: Path) -> dict[str, Any]:
     """Options of `lumigraph eval`: held-out photographs, or training photographs of a run without any."""
     from ..run import Run
 
     split = next((name for name in SPLITS if Run(run).settings.splits.get(name)), "train")
-    return ["--split", split, "--views", str(VIEWS), "--save-images", "--overwrite"]
+    return {"split": split, "views": VIEWS, "save_images": True, "overwrite": True}
 
 
 def comparison(run: Path) -> dict[str, Any] | None:

@@ -1,17 +1,38 @@
-"""Records of jobs in job.json: as they were asked for, and how far they are."""
+"""Records of jobs in job.json: as they were asked for, and how far they are.
+
+A record is sealed with a key of this user. A job of another record, as in a folder that was received or moved, does not
+begin by itself: it waits until somebody presses a button.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import hashlib
+import hmac
+import json
+import os
+import secrets
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import msgspec
 
 from ..budget import Quality
 from ..files import read_json, write_json
-from ..files.ranges import Count, Downscale, Seconds, Steps
+from ..files.ranges import Count, Downscale, Pixels, Seconds, Steps, Tally
+from ..system.cache import cache_folder
 from .projects import JOB_FILE, Item
 
+KEY_FILE, KEY_BYTES = "app.key", 32  # in the user's cache folder
+NOT_SEALED = "This was not asked for by the app at this place; press the button to begin"
+Sentence = Annotated[str, msgspec.Meta(max_length=10_000)]
+PLAIN = r"[^./\\:\x00-\x1f][^/\\:\x00-\x1f]*"  # name of one file or folder that is not hidden
+PlainName = Annotated[str, msgspec.Meta(max_length=255, pattern=rf"\A{PLAIN}\Z")]
+RunName = Annotated[str, msgspec.Meta(max_length=255, pattern=rf"\A({PLAIN})?\Z")]
+ShareName = Literal["page", "film", "splats", "mesh", "points", "compare"]
 JobState = Literal["queued", "running", "paused", "stopped", "failed", "done"]
 Mapper = Literal["incremental", "global"]
 
@@ -32,29 +53,29 @@ class Making:
     quality: Quality | None = None
     seconds: Seconds | None = None
     steps: Steps | None = None
-    method: str = "gaussian-splatting"
+    method: PlainName = "gaussian-splatting"
     mapper: Mapper = "incremental"
     frames: Count | None = None
     downscale: Downscale | None = None
     mask_object: bool = False
     stage: Literal["capture", "train"] = "capture"
-    run: str = ""
-    fault: str = ""
-    process: int = 0
+    run: RunName = ""
+    fault: Sentence = ""
+    process: Tally = 0
 
 
 @dataclass(frozen=True)
 class ShareJob:
-    """A run to a file in the project's shared folder. command: words between the run and the file, see `sharing`"""
+    """A run to a file in the project's shared folder. size: longer side of a film in pixels"""
 
-    name: str
-    kind: str
-    run: str
-    options: list[str]
+    name: PlainName
+    kind: ShareName
+    run: PlainName
     state: JobState
     asked: float
-    fault: str = ""
-    process: int = 0
+    size: Pixels | None = None
+    fault: Sentence = ""
+    process: Tally = 0
 
 
 @dataclass(frozen=True)
@@ -63,20 +84,59 @@ class JobRecord:
 
     make: Making | None = None
     shares: list[ShareJob] = field(default_factory=list)
+    seal: str = ""
 
 
 _writing = threading.RLock()  # around reading, changing and writing a record
 
 
 def read_job(item: Item) -> JobRecord:
+    """The record of an item's jobs. Jobs that this user's app did not ask for at this place wait."""
     path = item.path / JOB_FILE
-    return read_json(path, JobRecord) if path.is_file() else JobRecord()
+    if not path.is_file():
+        return JobRecord()
+    record = read_json(path, JobRecord)
+    return record if hmac.compare_digest(record.seal, seal_of(item, record)) else waiting(record)
+
+
+def waiting(record: JobRecord) -> JobRecord:
+    """A record whose jobs begin when somebody presses a button."""
+
+    def held_up(job: Any, state: JobState) -> Any:
+        return replace(job, state=state, fault=NOT_SEALED, process=0) if job.state in ("queued", "running") else job
+
+    return JobRecord(record.make and held_up(record.make, "paused"), [held_up(one, "failed") for one in record.shares])
+
+
+def seal_of(item: Item, record: JobRecord) -> str:
+    """Seal of a record at its place (HMAC-SHA256)."""
+    text = json.dumps([str(item.path.resolve()), asdict(replace(record, seal=""))], sort_keys=True)
+    return hmac.new(user_key(), text.encode(), hashlib.sha256).hexdigest()
+
+
+@functools.cache
+def user_key() -> bytes:
+    """This user's key, made at first use; one of this process alone where it cannot be kept."""
+    place, new = cache_folder() / KEY_FILE, secrets.token_bytes(KEY_BYTES)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileExistsError), open(place, "xb", opener=of_this_user) as file:
+            file.write(new)
+        kept = place.read_bytes()
+    except OSError:
+        return new
+    return kept if len(kept) == KEY_BYTES else new
+
+
+def of_this_user(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 def change(item: Item, make: Callable[[JobRecord], JobRecord]) -> JobRecord:
     """Read, change and write a record; nobody else does meanwhile."""
     with _writing:
         after = make(read_job(item))
+        after = replace(after, seal=seal_of(item, after))
         write_json(item.path / JOB_FILE, asdict(after), ours=True)
         return after
 

@@ -1,4 +1,4 @@
-"""Jobs: commands of the command line in processes of their own, one after another.
+"""Jobs: commands in processes of their own, one after another, each asked for by a typed request.
 
 A record changes before its process does. After a kill of the app its child is asked to end (SIGTERM), saves and ends;
 the next app finds the job as running and begins the same command again, which goes on from its stages or checkpoints.
@@ -10,7 +10,6 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -18,19 +17,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from .. import methods
 from ..errors import LumigraphError
-from ..system.signals import start
-from ..viewer.address import HOST, free_port
+from ..files import open_anew, refuse_links
+from ..system.children import REQUESTED, Request
+from ..viewer.address import HOST, Address, free_port, new_token
 from .job_record import JobRecord, JobState, Making, ShareJob, change, change_making, change_share, read_job
 from .pictures import input_of
-from .projects import JOB_FILE, LOG_FILE, RUNS, SCENE, SHARED, Item, is_plain_name, items
-from .sharing import command_of
+from .projects import JOB_FILE, LOG_FILE, PHOTOS, RUNS, SCENE, SHARED, Item, is_plain_name, items
+from .sharing import share_request
 
 POLL_SECONDS = 0.2  # between looks at a child
 IDLE_SECONDS = 2.0  # between looks for jobs that nobody announced
 PATIENCE_SECONDS = 60.0  # for the child of an app that was killed to save
 LOG_BYTES = 60_000  # of the end of a log that are read
-PROGRAM = (sys.executable, "-m", "lumigraph")
 
 
 @dataclass
@@ -40,7 +40,7 @@ class QueuedJob:
     item: Item
     share: str | None
     child: subprocess.Popen[Any] | None = None
-    port: int | None = None  # of the viewer of a training
+    viewer: Address | None = None  # of a training
 
     @property
     def job(self) -> Making | ShareJob | None:
@@ -59,10 +59,10 @@ class QueuedJob:
 class Runner:
     """Thread that runs the jobs of a folder, one after another, from `begin` until `end`.
 
-    program: words before those of a command
+    program: words of Python before a request
     """
 
-    def __init__(self, root: Path, program: Sequence[str] = PROGRAM):
+    def __init__(self, root: Path, program: Sequence[str] = REQUESTED):
         self.root, self.program = root, list(program)
         self.current: QueuedJob | None = None
         self._wake, self._ended = threading.Event(), False
@@ -159,8 +159,8 @@ class Runner:
         """The commands of a job, until it is done, was paused, or the app ends."""
         while not self._ended and (job := task.job) and job.state in ("queued", "running"):
             task.set(state="running", fault="")
-            words, task.port = self._command(task)
-            code = self._call(task, words)
+            request, task.viewer = self._request(task)
+            code = self._call(task, request)
             job = task.job
             if self._ended or job is None or job.state != "running":
                 return
@@ -171,35 +171,40 @@ class Runner:
             else:
                 task.set(state="done", process=0)
 
-    def _command(self, task: QueuedJob) -> tuple[list[str], int | None]:
-        """Words of the next command, and the port of its viewer."""
+    def _request(self, task: QueuedJob) -> tuple[Request, Address | None]:
+        """The next command, and the address of its viewer."""
         job = task.job
         if isinstance(job, ShareJob):
-            return command_of(task.item, job), None
+            return share_request(task.item, job), None
         assert job is not None
-        if job.stage == "capture" and (words := capture_command(task.item, job)):
-            return words, None
+        if job.stage == "capture" and (request := capture_request(task.item, job)):
+            return request, None
         if job.stage == "capture" or not job.run:
             task.set(stage="train", run=job.run or next_run(task.item, job.method))
             job = task.job
             assert isinstance(job, Making)
-        port = free_port(HOST, 0)
-        return train_command(task.item, job, port or 0), port
+        viewer = child_address()
+        return train_request(task.item, job, viewer), viewer
 
-    def _call(self, task: QueuedJob, words: list[str]) -> int:
+    def _call(self, task: QueuedJob, request: Request) -> int:
         """Run a command with its messages in the log. Returns its exit code."""
-        with open(task.item.path / LOG_FILE, "wb") as log:
-            log.write(f"$ lumigraph {' '.join(words)}\n".encode())
+        refuse_links(task.item.path, () if task.item.kind == "run" else (PHOTOS,))
+        with open_anew(task.item.path / LOG_FILE) as log:
+            log.write(f"$ lumigraph {request.command}\n".encode())
             log.flush()
-            pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
-            task.child = start([*self.program, *words], cwd=task.item.path, **pipes)
+            task.child = request.start(self.program, stdout=log, stderr=subprocess.STDOUT)
         task.set(process=task.child.pid)
         job = task.job
         if self._ended or job is None or job.state != "running":  # paused while it was being started
             task.child.send_signal(signal.SIGINT)
         code = task.child.wait()
-        task.child = task.port = None
+        task.child = task.viewer = None
         return code
+
+
+def child_address() -> Address:
+    """Address on this machine for a child's viewer, with a token: only who has it, the app, gets an answer."""
+    return Address(HOST, free_port(HOST, 0) or 0, new_token())
 
 
 def is_alive(process: int) -> bool:
@@ -212,16 +217,16 @@ def is_alive(process: int) -> bool:
     return True
 
 
-def capture_command(item: Item, job: Making) -> list[str]:
-    """Words of `lumigraph capture`; empty for photographs whose poses are known."""
+def capture_request(item: Item, job: Making) -> Request | None:
+    """`lumigraph capture`; None for photographs whose poses are known."""
     from ..capture.photos import is_bare
 
     place = input_of(item)
     if not is_bare(place):
-        return []
-    words = ["capture", str(place), "--output", str(item.path / SCENE), "--mapper", job.mapper]
-    words += ["--frames", str(job.frames)] if job.frames and place.is_file() else []
-    return words + (["--mask-object"] if job.mask_object else [])
+        return None
+    options = {"what": [str(place)], "output": str(item.path / SCENE), "mapper": job.mapper}
+    frames = {"frames": job.frames} if place.is_file() else {}
+    return Request("capture", options | frames | {"mask_object": job.mask_object})
 
 
 def scene_of(item: Item) -> Path:
@@ -234,16 +239,15 @@ def run_folder(item: Item, name: str) -> Path:
     return item.path / RUNS / name if item.kind == "project" else item.path
 
 
-def train_command(item: Item, job: Making, port: int) -> list[str]:
-    """Words of `lumigraph train`, or of `resume` for a run that was begun."""
+def train_request(item: Item, job: Making, viewer: Address) -> Request:
+    """`lumigraph train`, or `resume` for a run that was begun."""
     run = run_folder(item, job.run)
-    budget = [("--quality", job.quality), ("--seconds", job.seconds), ("--steps", job.steps)]
-    words = [word for name, value in budget if value is not None for word in (name, str(value))]
-    words += ["--view", "--no-stay", "--port", str(port)]
+    options: dict[str, Any] = {"quality": job.quality, "seconds": job.seconds, "steps": job.steps}
+    options |= {"view": True, "stay": False, "port": viewer.port, "token": viewer.token}
     if (run / "config.json").is_file():
-        return ["resume", str(run), *words]
-    words += ["--downscale", str(job.downscale)] if job.downscale else []
-    return ["train", job.method, str(scene_of(item)), "--output", str(run), *words]
+        return Request("resume", {"run_folder": str(run)} | options)
+    options |= {"method": methods.check(job.method), "scene": str(scene_of(item)), "output": str(run)}
+    return Request("train", options | {"downscale": job.downscale})
 
 
 def next_run(item: Item, method: str) -> str:
@@ -257,7 +261,7 @@ def next_run(item: Item, method: str) -> str:
 def log_lines(item: Item) -> list[str]:
     """Last lines of the messages of the last command."""
     path = item.path / LOG_FILE
-    if not path.is_file():
+    if path.is_symlink() or not path.is_file():
         return []
     with open(path, "rb") as file:
         file.seek(max(0, path.stat().st_size - LOG_BYTES))

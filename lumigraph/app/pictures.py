@@ -10,12 +10,12 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from PIL import Image, ImageOps
 
@@ -31,7 +31,7 @@ from ..capture.raw import is_raw
 from ..errors import LumigraphError
 from ..files import is_file
 from ..files.names import counted, natural
-from ..system.signals import start
+from ..system.children import start_python
 from . import reduce
 from .folders import PAGE_SECONDS, Finder, Look
 from .projects import Item
@@ -210,9 +210,9 @@ def _reduced(path: Path, modified: int, size: int, pixels: tuple[int, int]) -> b
         check_pixels(pixels, BYTES_PER_PIXEL)
     except ValueError as fault:
         raise LumigraphError(f"{path.name} cannot be shown: {fault}; close programs, or leave it out") from fault
-    command = [sys.executable, "-P", reduce.__file__, str(path.absolute()), str(REDUCED_SIDE)]
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    with start(command, signal.SIGKILL, **pipes) as child:
+    words = [reduce.__file__, str(path.absolute()), str(REDUCED_SIDE)]
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with start_python(words, signal.SIGKILL, **pipes) as child:
         try:
             made = child.communicate(timeout=REDUCE_SECONDS)[0]
         finally:

@@ -20,12 +20,12 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import LumigraphError
-from ..files import exists, explained, is_file, read_json, remove, write_json
+from ..files import exists, explained, is_file, read_json, refuse_link, remove, write_json
 from ..files.names import natural
 from .folders import size_within
 
@@ -35,6 +35,7 @@ APP_FOLDER, TRASH = ".lumigraph-app", "trash"
 SHELVES = "", RUNS, "scenes"  # folders whose folders are items
 SCENE_FILES = "transforms.json", "transforms_train.json", "sparse", "poses_bounds.npy"  # of photographs with poses
 MAX_TITLE_LENGTH = 120  # letters
+WRITTEN = PHOTOS, "left-out", SCENE, RUNS, SHARED  # folders of an item that the app writes into
 SEPARATOR = ":"  # between the folders of a key, as "/" cannot be in one part of a URL
 
 ItemKind = Literal["project", "run", "scene"]
@@ -84,7 +85,8 @@ class Item:
     def record(self) -> ProjectRecord:
         """Contents of project.json; of another item its name and date."""
         if self.kind == "project":
-            return read_json(self.path / PROJECT_FILE, ProjectRecord)
+            record = read_json(self.path / PROJECT_FILE, ProjectRecord)
+            return replace(record, title=readable_title(record.title) or self.path.name)
         return ProjectRecord(self.path.name, changed_at(self.path))
 
     def keep(self, record: ProjectRecord) -> None:
@@ -165,6 +167,8 @@ def find_item(root: Path, key: str) -> Item:
     shelves = {root / shelf for shelf in SHELVES}
     if path is None or path.parent not in shelves or not is_item(path):
         raise LumigraphError(f"There is no scene {key[:80]!r} here; load the page again")
+    for place in (path.parent, path, *(path / name for name in WRITTEN)):
+        refuse_link(place)
     return Item(root, path)
 
 
@@ -175,9 +179,14 @@ def is_plain_name(name: str) -> bool:
 
 def check_title(title: str) -> str:
     title = " ".join(title.split())
-    if not title or len(title) > MAX_TITLE_LENGTH or not title.isprintable():
+    if not title or title != readable_title(title):
         raise LumigraphError(f"A name has 1 to {MAX_TITLE_LENGTH} letters; choose another one")
     return title
+
+
+def readable_title(title: str) -> str:
+    """A title on one line, without letters that are not shown, no longer than allowed."""
+    return "".join(x for x in " ".join(title.split()) if x.isprintable())[:MAX_TITLE_LENGTH]
 
 
 def free_place(root: Path, title: str) -> Path:

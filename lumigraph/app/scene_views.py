@@ -18,17 +18,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from starlette.requests import Request
+from starlette.requests import Request as BrowserRequest
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ..errors import LumigraphError
-from ..system.signals import start
-from ..viewer.address import HOST, free_port
+from ..files import open_anew
+from ..system.children import REQUESTED, Request
+from ..system.memory import free_memory
+from ..viewer.address import Address
 from ..viewer.guard import ISOLATION_HEADERS
-from .jobs import PROGRAM
+from .jobs import child_address
 
-MAX_VIEWS = 2  # processes of viewers at a time; each holds a scene in memory
+MAX_VIEWS, MAX_VIEWS_IN_MEMORY = 2, 8  # processes of viewers at a time, each with a scene; where memory is free
+FREE_BYTES = 4 << 30  # of memory that a further viewer leaves for training
+OPENING_SECONDS = 20.0  # since a page asked for a viewer, during which it is in use although nobody is connected
 IDLE_SECONDS = 120.0  # after the last connection, at which a viewer ends
 HOP_HEADERS = {"connection", "content-length", "transfer-encoding", "server", "date", "keep-alive"}
 
@@ -37,23 +41,30 @@ HOP_HEADERS = {"connection", "content-length", "transfer-encoding", "server", "d
 class SceneView:
     """A viewer's process."""
 
-    port: int
+    address: Address
     child: subprocess.Popen[Any]
     log: Path
     connections: int = 0
     used: float = field(default_factory=time.monotonic)
 
+    @property
+    def in_use(self) -> bool:
+        return bool(self.connections) or time.monotonic() - self.used < OPENING_SECONDS
+
 
 class SceneViews:
     """Viewers by the path of what they show."""
 
-    def __init__(self, folder: Path, program: Sequence[str] = PROGRAM):
+    def __init__(self, folder: Path, program: Sequence[str] = REQUESTED):
         self.folder, self.program = folder, list(program)
         self.views: dict[Path, SceneView] = {}
         self._opening = threading.Lock()
 
     def open(self, path: Path) -> SceneView:
-        """The viewer of a run or a splat file, which may still be starting."""
+        """The viewer of a run or a splat file, which may still be starting.
+
+        Raises LumigraphError while others use as many as there may be.
+        """
         with self._opening:
             return self._open(path)
 
@@ -61,13 +72,12 @@ class SceneViews:
         view = self.views.get(path)
         if view is None or view.child.poll() is not None:
             self._make_room()
-            port = free_port(HOST, 0) or 0
+            address = child_address()
             self.folder.mkdir(parents=True, exist_ok=True)
-            log = self.folder / f"view-{port}.log"
-            with open(log, "wb") as said:
-                pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": subprocess.STDOUT}
-                words = [*self.program, "view", str(path), "--port", str(port)]
-                view = SceneView(port, start(words, cwd=path.parent, **pipes), log)
+            log = self.folder / f"view-{address.port}.log"
+            request = Request("view", {"source": str(path), "port": address.port, "token": address.token})
+            with open_anew(log) as said:
+                view = SceneView(address, request.start(self.program, stdout=said, stderr=subprocess.STDOUT), log)
             self.views[path] = view
         view.used = time.monotonic()
         return view
@@ -78,7 +88,7 @@ class SceneViews:
             lines = view.log.read_text("utf-8", errors="replace").splitlines()
             said = [line.removeprefix("lumigraph: ") for line in lines if line.startswith("lumigraph: ")]
             raise LumigraphError(said[-1] if said else "The viewer ended by itself; open the scene again")
-        return answers(view.port)
+        return answers(view.address)
 
     def close(self, path: Path) -> None:
         """End the viewers of a path, or of what lies below it."""
@@ -100,9 +110,14 @@ class SceneViews:
         self.views.clear()
 
     def _make_room(self) -> None:
-        while len(self.views) >= MAX_VIEWS:
-            path = min(self.views, key=lambda one: (self.views[one].connections > 0, self.views[one].used))
-            end(self.views.pop(path))
+        """End the viewer that was left longest ago where there are too many."""
+        most = MAX_VIEWS_IN_MEMORY if free_memory() > FREE_BYTES else MAX_VIEWS
+        if len(self.views) < most:
+            return
+        idle = [path for path, view in self.views.items() if not view.in_use]
+        if not idle:
+            raise LumigraphError(f"{len(self.views)} scenes are open already; close the page of one and try again")
+        end(self.views.pop(min(idle, key=lambda path: self.views[path].used)))
 
 
 def end(view: SceneView) -> None:
@@ -116,26 +131,26 @@ def end(view: SceneView) -> None:
     view.log.unlink(missing_ok=True)
 
 
-def answers(port: int) -> bool:
-    """True if a viewer answers at a port."""
+def answers(address: Address) -> bool:
+    """True if a viewer answers."""
     try:
-        socket.create_connection((HOST, port), 2).close()
+        socket.create_connection((address.host, address.port), 2).close()
         return True
     except OSError:
         return False
 
 
-async def forward(request: Request, port: int, path: str) -> Response:
+async def forward(request: BrowserRequest, viewer: Address, path: str) -> Response:
     """A viewer's answer to a GET."""
-    status, headers, body = await asyncio.to_thread(fetch, port, path, request.headers.get("accept-encoding", ""))
+    status, headers, body = await asyncio.to_thread(fetch, viewer, path, request.headers.get("accept-encoding", ""))
     kept = {name: value for name, value in headers if name.lower() not in HOP_HEADERS | {"set-cookie"}}
     return Response(body, status, kept | ISOLATION_HEADERS)
 
 
-def fetch(port: int, path: str, encoding: str) -> tuple[int, list[tuple[str, str]], bytes]:
-    connection = http.client.HTTPConnection(HOST, port, timeout=60)
+def fetch(viewer: Address, path: str, encoding: str) -> tuple[int, list[tuple[str, str]], bytes]:
+    connection = http.client.HTTPConnection(viewer.host, viewer.port, timeout=60)
     try:
-        connection.request("GET", path, headers={"Accept-Encoding": encoding})
+        connection.request("GET", path, headers={"Accept-Encoding": encoding, "Cookie": viewer.cookie})
         response = connection.getresponse()
         return response.status, response.getheaders(), response.read()
     except (OSError, http.client.HTTPException):
@@ -144,7 +159,7 @@ def fetch(port: int, path: str, encoding: str) -> tuple[int, list[tuple[str, str
         connection.close()
 
 
-async def forward_messages(browser: WebSocket, port: int, view: SceneView | None) -> None:
+async def forward_messages(browser: WebSocket, viewer: Address, view: SceneView | None) -> None:
     """Connect a browser's websocket with a viewer's, until either ends."""
     from websockets.asyncio.client import connect
     from websockets.exceptions import WebSocketException
@@ -152,7 +167,13 @@ async def forward_messages(browser: WebSocket, port: int, view: SceneView | None
     wanted = browser.scope.get("subprotocols", [])
     try:
         there = await connect(
-            f"ws://{HOST}:{port}/", subprotocols=wanted, max_size=None, compression=None, proxy=None, open_timeout=20
+            f"ws://{viewer.host}:{viewer.port}/",
+            subprotocols=wanted,
+            additional_headers={"Cookie": viewer.cookie},
+            max_size=None,
+            compression=None,
+            proxy=None,
+            open_timeout=20,
         )
     except (OSError, WebSocketException, TimeoutError):
         await browser.close(1013)

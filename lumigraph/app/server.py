@@ -9,7 +9,7 @@ import json
 import math
 import os
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -30,16 +30,17 @@ from websockets.http11 import Request as PlainRequest
 from .. import methods
 from ..budget import Quality
 from ..errors import LumigraphError
-from ..files import expanded, refusal
+from ..files import expanded, refusal, refuse_link
 from ..files.locks import held
 from ..files.ranges import Count, Downscale, Pixels
+from ..system.children import REQUESTED
 from ..viewer.address import Address
 from ..viewer.guard import ISOLATION_HEADERS, MAX_MESSAGE_BYTES, Guard
 from . import jobs, pictures, progress, projects, rows, sharing, uploads
-from .job_record import JobState, Mapper, read_job
+from .job_record import JobState, Mapper, ShareName, read_job
 from .jobs import Runner
 from .projects import APP_FOLDER, SHARED, Item, find_item, relocate
-from .scene_views import SceneViews, answers, forward, forward_messages
+from .scene_views import SceneView, SceneViews, answers, forward, forward_messages
 
 PAGE = Path(__file__).parent / "page"
 MEDIA_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
@@ -92,7 +93,7 @@ class MoreBody(msgspec.Struct, forbid_unknown_fields=True):
 class ShareBody(msgspec.Struct, forbid_unknown_fields=True):
     """Body of a request for a file to share. size: longer side of a film in pixels"""
 
-    kind: ShortName
+    kind: ShareName
     run: ShortName
     size: Pixels | None = None
 
@@ -169,9 +170,8 @@ def plain(scope: Scope) -> PlainRequest:
 class App:
     """State of the app: its folder, the jobs, the viewers. Everything that lasts is in files."""
 
-    def __init__(self, root: Path, address: Address, program: list[str] | None = None):
+    def __init__(self, root: Path, address: Address, program: Sequence[str] = REQUESTED):
         self.root, self.address = root.resolve(), address
-        program = program or list(jobs.PROGRAM)
         self.runner = Runner(self.root, program)
         self.views = SceneViews(self.root / APP_FOLDER, program)
         self._slow = ThreadPoolExecutor(SLOW_THREADS, "slow")
@@ -250,7 +250,7 @@ class App:
             ],
             "runs": runs,
             "make": rows.making_row(item, job.make) if job.make else None,
-            "live": current is not None and current.item == item and current.port is not None,
+            "live": current is not None and current.item == item and current.viewer is not None,
             "shares": [rows.share_row(item, share) for share in reversed(job.shares)],
             "result": result,
             "faults": list(filter(None, faults)),
@@ -335,8 +335,8 @@ class App:
     def view(self, item: Item, run: str) -> dict[str, Any]:
         """Address of the scene view of a run, and whether it answers."""
         current = self.runner.current
-        if not run and current and current.item == item and current.share is None and (port := current.port):
-            return {"url": f"/scene/{quote(item.key)}/live/", "ready": answers(port)}
+        if not run and current and current.item == item and current.share is None and (viewer := current.viewer):
+            return {"url": f"/scene/{quote(item.key)}/live/", "ready": answers(viewer)}
         path = item.run(run) if run else next(iter(reversed(item.runs)), None)
         if path is None:
             raise LumigraphError("There is no run to show yet")
@@ -344,13 +344,13 @@ class App:
         view = self.views.open(path)
         return {"url": f"/scene/{quote(item.key)}/{quote(path.name)}/", "ready": self.views.is_ready(view)}
 
-    def port_of(self, key: str, run: str) -> tuple[int | None, Any]:
-        """Port of the viewer behind a scene's address, and its view; None if there is none."""
+    def viewer_of(self, key: str, run: str) -> tuple[Address | None, SceneView | None]:
+        """Address of the viewer behind a scene's address, and its view; None if there is none."""
         item, current = self.item(key), self.runner.current
         if run == "live":
-            return (current.port if current and current.item == item else None), None
+            return (current.viewer if current and current.item == item else None), None
         view = self.views.views.get(item.run(run))
-        return (view.port if view else None), view
+        return (view.address if view else None), view
 
 
 def check_source(source: Path) -> None:
@@ -429,7 +429,7 @@ def build(app: App) -> ASGIApp:
     async def shared(request: Request) -> Response:
         item, name = app.item(request.path_params["key"]), request.path_params["name"]
         place = item.path / SHARED / name
-        if not projects.is_plain_name(name) or not place.is_file():
+        if not projects.is_plain_name(name) or place.is_symlink() or not place.is_file():
             raise LumigraphError(f"There is no file {name[:80]!r} here; make it again")
         shows = "inline" if "show" in request.query_params else "attachment"
         return FileResponse(place, filename=name, content_disposition_type=shows, headers=SHOWN_HEADERS)
@@ -444,20 +444,20 @@ def build(app: App) -> ASGIApp:
         return Answer({"key": item.key})
 
     async def scene(request: Request) -> Response:
-        port, _ = app.port_of(request.path_params["key"], request.path_params["run"])
-        if port is None:
+        viewer, _ = app.viewer_of(request.path_params["key"], request.path_params["run"])
+        if viewer is None:
             return PlainTextResponse("This scene is not open; load the page again.\n", 404)
-        return await forward(request, port, "/" + quote(request.path_params.get("rest", "")))
+        return await forward(request, viewer, "/" + quote(request.path_params.get("rest", "")))
 
     async def scene_socket(socket: WebSocket) -> None:
         try:
-            port, view = app.port_of(socket.path_params["key"], socket.path_params["run"])
+            viewer, view = app.viewer_of(socket.path_params["key"], socket.path_params["run"])
         except LumigraphError:
-            port, view = None, None
-        if port is None:
+            viewer, view = None, None
+        if viewer is None:
             await socket.close(1013)
             return
-        await forward_messages(socket, port, view)
+        await forward_messages(socket, viewer, view)
 
     def kinds(item: Item, body: RunBody) -> list[dict[str, Any]]:
         return sharing.kinds_for(item.run(body.run))
@@ -590,6 +590,8 @@ def serve(root: Path, address: Address, opened: Callable[[], object]) -> None:
     Raises LumigraphError if another app serves the folder.
     """
     place = root / APP_FOLDER
+    for folder in (place, projects.trash_folder(root)):
+        refuse_link(folder)
     place.mkdir(parents=True, exist_ok=True)
     with held(place, "served"):
         app = App(root, address)

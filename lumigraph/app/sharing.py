@@ -1,4 +1,4 @@
-"""Files to share: kinds, with the command that makes each and its size before it is written."""
+"""Files to share: kinds, with the request that makes each and its size before it is written."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LumigraphError
+from ..system.children import Request
 from .comparison import COMPARE, eval_options
-from .job_record import ShareJob
+from .job_record import ShareJob, ShareName
 from .projects import SHARED, Item, is_splats
 
 # Sizes: bytes of a Gaussian or of a second of film. Page and .spz: as measured on a cloud of 53,453 of degree 3.
@@ -27,7 +28,7 @@ MESH_BYTES, POINTS_BYTES = 6_000_000, 4_000_000
 class ShareKind:
     """One kind of file.
 
-    about: for people; words: of the command before the run; after: options behind the file
+    about: for people; command: that makes it
     clouds_only: True for methods of Gaussians alone
     size: estimate in bytes, from the number of Gaussians; None for other methods
     """
@@ -35,32 +36,32 @@ class ShareKind:
     title: str
     about: str
     ending: str
-    words: tuple[str, ...]
+    command: str
     size: Callable[[int | None], float]
     clouds_only: bool = False
 
 
-KINDS = {
+KINDS: dict[ShareName, ShareKind] = {
     "page": ShareKind(
         "Web page",
         "One file that opens in any browser, on a phone too, without a server",
         ".html",
-        ("export", "web"),
+        "export web",
         lambda n: VIEWS_PAGE_BYTES if n is None else PAGE_BYTES + n * PAGE_BYTES_PER_GAUSSIAN,
     ),
     "film": ShareKind(
-        "Film", "MP4, a flight around the scene", ".mp4", ("render",), lambda n: FILM_SECONDS * FILM_BYTES_PER_SECOND
+        "Film", "MP4, a flight around the scene", ".mp4", "render", lambda n: FILM_SECONDS * FILM_BYTES_PER_SECOND
     ),
     "splats": ShareKind(
         "Splats",
         "Gaussians for other programs, as .spz",
         ".spz",
-        ("export", "splats"),
+        "export splats",
         lambda n: (n or 0) * SPZ_BYTES_PER_GAUSSIAN,
         True,
     ),
-    "mesh": ShareKind("Mesh", "A coloured surface, as .glb", ".glb", ("export", "mesh"), lambda n: MESH_BYTES),
-    "points": ShareKind("Points", "Coloured points, as .ply", ".ply", ("export", "points"), lambda n: POINTS_BYTES),
+    "mesh": ShareKind("Mesh", "A coloured surface, as .glb", ".glb", "export mesh", lambda n: MESH_BYTES),
+    "points": ShareKind("Points", "Coloured points, as .ply", ".ply", "export points", lambda n: POINTS_BYTES),
 }
 
 
@@ -100,33 +101,34 @@ def header_count(weights: Path) -> int | None:
         return file.get_slice(names[0]).get_shape()[0] if names else None
 
 
-def share_job(item: Item, kind: str, run: Path, now: float, size: int | None = None) -> ShareJob:
+def share_job(item: Item, kind: ShareName, run: Path, now: float, size: int | None = None) -> ShareJob:
     """The job of a file to share. size: longer side of a film in pixels"""
     if kind == COMPARE:
-        return ShareJob(f"{COMPARE}-{run.name}", kind, run.name, eval_options(run), "queued", now)
-    if kind not in KINDS:
-        raise LumigraphError(f"{kind[:40]!r} cannot be made; choose {', '.join(KINDS)}")
+        return ShareJob(f"{COMPARE}-{run.name}", kind, run.name, "queued", now)
     if kind not in [one["kind"] for one in kinds_for(run)]:
         raise LumigraphError(f"{run.name} is no cloud of Gaussians, so there are no splats; choose another kind")
     stem = item.path.name if run == item.path else f"{item.path.name}-{run.name.partition('.')[0]}"
-    options = ["--size", str(size)] if kind == "film" and size else []
-    if kind == "page":
-        options = ["--title", item.record.title]
-    return ShareJob(f"{stem}{KINDS[kind].ending}", kind, run.name, options, "queued", now)
+    return ShareJob(f"{stem}{KINDS[kind].ending}", kind, run.name, "queued", now, size)
 
 
-def command_of(item: Item, job: ShareJob) -> list[str]:
-    """Words of the command that makes a file. A file of an earlier version is replaced, as it is one of ours."""
+def share_request(item: Item, job: ShareJob) -> Request:
+    """The command that makes a file. A file of an earlier version is replaced, as it is one of ours."""
     run, place = item.run(job.run), item.path / SHARED / job.name
     if job.kind == COMPARE:
-        return ["eval", str(run), *job.options]
+        return Request("eval", {"run_folder": str(run)} | eval_options(run))
     place.parent.mkdir(exist_ok=True)
-    output = ["--output", str(place)] if job.kind == "film" else [str(place)]
-    return [*KINDS[job.kind].words, str(run), *output, *job.options]
+    options: dict[str, Any] = {"source": str(run), "output": str(place)}
+    if job.kind == "film":
+        options["size"] = job.size
+    if job.kind == "page":
+        options["title"] = item.record.title
+    return Request(KINDS[job.kind].command, options)
 
 
 def reveal(folder: Path) -> None:
     """Open a folder in the system's file manager. Raises LumigraphError where there is none."""
+    if not folder.is_dir():  # what is no folder would be opened by the program of its kind
+        raise LumigraphError(f"{folder} does not exist yet; make a file first")
     program, pipe = FILE_MANAGERS.get(sys.platform, "xdg-open"), subprocess.DEVNULL
     try:
         subprocess.Popen([program, folder], stdin=pipe, stdout=pipe, stderr=pipe, start_new_session=True)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from ..errors import LumigraphError
-from ..files import explained, remove
+from ..files import explained, refuse_link, remove
 from ..files.names import counted
 
 MAX_PIECE_BYTES = 16 << 20  # bytes of one request
@@ -116,6 +116,7 @@ class Album:
         """Move a photograph into another folder, where nothing is replaced either."""
         with self.lock, explained(self.folder / name):
             target = folder / free_name(folder, name)
+            refuse_links_above(target, folder)
             target.parent.mkdir(parents=True, exist_ok=True)
             (self.folder / name).rename(target)
             self._count -= 1
@@ -200,6 +201,8 @@ class Upload:
             return Arrived(have, self._finish(), True)
 
     def _write(self, offset: int, data: bytes | bytearray) -> None:
+        refuse_link(self.partial)
+        refuse_links_above(self.album.folder / self.name, self.album.folder)
         try:
             self.partial.parent.mkdir(parents=True, exist_ok=True)
             with open(self.partial, "ab" if offset else "wb") as file:
@@ -297,6 +300,12 @@ def free_name(folder: Path, name: str, number: int = 2) -> str:
     place = PurePosixPath(name)
     others = (place.with_stem(f"{place.stem}-{n}").as_posix() for n in itertools.count(number))
     return next(one for one in itertools.chain([name], others) if not os.path.lexists(folder / one))
+
+
+def refuse_links_above(place: Path, folder: Path) -> None:
+    """Raise LumigraphError for a link among the folders between a place and the folder that it must be in."""
+    for above in place.relative_to(folder).parents:
+        refuse_link(folder / above)
 
 
 def listed(folder: Path) -> Iterator[str]:

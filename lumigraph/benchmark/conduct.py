@@ -6,11 +6,11 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,8 +28,9 @@ from ..figures.charts import line_chart, standalone
 from ..files.locks import check_place, held
 from ..metrics import scores_of
 from ..run import Run
+from ..system.children import start_python
 from ..system.progress import clock, counting
-from ..system.signals import Interrupt, start
+from ..system.signals import Interrupt
 from .cell import SHEET, Cell, CellSettings, Row, claim, evaluation, read_rows, row_of, scored, training
 from .table import markdown, over_time, over_views, places, resolution, together
 
@@ -53,8 +54,9 @@ def launch(arguments: Sequence[str], log: Path) -> int:
     with out, Interrupt() as interrupt:
         out.write(PROMPT + f"{' '.join(arguments)}\n".encode())
         out.flush()
-        command = [sys.executable, "-m", "lumigraph", *arguments]
-        process = start(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
+        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out}
+        words = ["-m", "lumigraph", *arguments]
+        process = start_python(words, folder=Path.cwd(), start_new_session=True, **pipes)
         passed_on = False
         try:
             while process.poll() is None:

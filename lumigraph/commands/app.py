@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import html
+import tempfile
 import webbrowser
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
@@ -45,11 +49,25 @@ class AppCommand:
             folder.mkdir(parents=True, exist_ok=True)
         address = choose_address(self.host, self.port)
 
-        def opened() -> None:
-            show({"app": f"{address.url} (Ctrl-C ends it)"})
-            if self.browser:
-                webbrowser.open(address.url)
+        with until_interrupted(), door(address) as url:
 
-        with until_interrupted():
+            def opened() -> None:
+                show({"app": f"{address.url} (Ctrl-C ends it)"})
+                if self.browser:
+                    webbrowser.open(url)
+
             serve(folder, address, opened)
         return 0
+
+
+@contextlib.contextmanager
+def door(address: Any) -> Iterator[str]:
+    """What a browser is given to open: the address; where that has a token, which other users would see among the
+    browser's arguments, a page of this user alone that leads there."""
+    if not address.token:
+        yield address.url
+        return
+    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:  # of mode 700
+        page = Path(folder) / "app.html"
+        page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(address.url)}">')
+        yield page.as_uri()

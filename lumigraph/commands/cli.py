@@ -16,7 +16,7 @@ import operator
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import is_dataclass, replace
 from pathlib import Path
@@ -160,9 +160,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         print(f"lumigraph {__version__}")
         return 0
+    return conduct(lambda: parse(arguments))
+
+
+def conduct(understand: Callable[[], Any]) -> int:
+    """Run the command that a function understands. Returns the exit code; a fault is one sentence on stderr."""
     try:
         with listening(), printed_warnings(), at_work():
-            return parse(arguments).run()
+            return understand().run()
     except LumigraphError as error:
         return refuse(str(error))
     except KeyboardInterrupt as stopped:

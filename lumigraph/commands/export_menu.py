@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import inspect
-import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any, Literal, get_args, get_origin
 
 from ..errors import LumigraphError
 from ..files.ranges import hints
-from ..system.signals import start
+from ..system.children import start_python
 from .export import What
 
 ENDINGS = {"mesh": ".glb", "octree": ".npz", "panorama": ".jpg", "points": ".ply", "snerg": "", "splats": ".spz"}
@@ -47,7 +45,8 @@ def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) 
     }
 
     def command(name: str, file: str, values: Mapping[str, str | bool], request: Any) -> list[str]:
-        words = ["lumigraph", "export", name, str(opened.path), os.path.join(opened.path.parent, file)]
+        place = opened.path.absolute()  # for a child in another folder
+        words = ["lumigraph", "export", name, str(place), str(place.parent / file)]
         for option in formats[name].options:
             words += typed_option(option.name, values[option.name], option.default)
         if "part" in hints(kinds[name]):
@@ -120,8 +119,8 @@ def run_export(command: list[str], report: Callable[[str], None]) -> str:
     Raises LumigraphError with its last line if it fails.
     """
     report("Exporting ...")
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with start([sys.executable, "-m", *command], text=True, **pipes) as process:
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with start_python(["-m", *command], text=True, **pipes) as process:
         assert process.stdout is not None and process.stderr is not None
         last = ""
         for line in process.stderr:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional, UseAppendAction, arg
+from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from ..errors import LumigraphError
 from ..files.ranges import Coordinate, Positive, Seed, Share, Steps
@@ -46,6 +46,8 @@ RunOption = Annotated[Positional[Path], needed("RUN", "Folder of the run.")]
 SeedOption = Annotated[Seed, option("N", about="Seed of all random choices.")]
 SOURCE = "Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."
 SourceOption = Annotated[Positional[Path], needed("RUN_OR_FILE", SOURCE)]
+# Secret of a viewer, for requests alone: `ps` shows options.
+ViewerToken = Annotated[str, Fixed, Suppress]
 INSTEAD = "Train for this number of steps instead."
 StepsOption = Annotated[Steps | None, option("N", "as long as --seconds", INSTEAD)]
 

@@ -10,7 +10,7 @@ from ..budget import Budget, Quality
 from ..errors import LumigraphError
 from ..files.ranges import Port, Seconds, Steps
 from .common import choose_device, exit_code, given_budget, quality_budget, typed
-from .options import RunOption, option
+from .options import RunOption, ViewerToken, option
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Resume:
     """Address that --view listens at; 0.0.0.0 gives access to other machines."""
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
+    token: ViewerToken = ""
 
     def run(self) -> int:
         from ..run import Run, is_block_run
@@ -93,7 +94,7 @@ class Resume:
             budget = budget_from_now(run, quality_budget(self.quality, method, data))
         if budget.to_json() != run.settings.budget:
             run.set_budget(**budget.to_json())
-        with watching(self.view, method, data, run, self.host, self.port) as watch:
+        with watching(self, method, data, run) as watch:
             outcome = fit(method, data, run, budget=budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
             show_outcome(run, outcome, method, data, end_training(watch, method))
             keep_showing(watch if self.stay else None, outcome.signal)

@@ -15,7 +15,7 @@ from ..budget import Budget
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Port, Positive, Steps
 from .common import choose_device, exit_code, method_config, next_free, scene_name
-from .options import DeviceOption, ReaderOption, SeedOption, needed, option
+from .options import DeviceOption, ReaderOption, SeedOption, ViewerToken, needed, option
 
 TRACKED_SIDE = 320  # pixels along the longer side of a frame, about, where the user says nothing
 
@@ -57,6 +57,7 @@ class Track:
     """Address that --view listens at; 0.0.0.0 gives access to other machines."""
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
+    token: ViewerToken = ""
 
     def run(self) -> int:
         from ..capture import confirm, open_scene
@@ -84,7 +85,7 @@ class Track:
         method: Any = build(kind, data.frame, config, device, seed, learning=True)
         budget = Budget(len(method.tracker.sequence(data)) + (self.steps_after or 0))
         run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
-        with watching(self.view, method, data, run, self.host, self.port) as watch:
+        with watching(self, method, data, run) as watch:
             begin = time.process_time()
             with run.kept_if_learnt():
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)

@@ -34,7 +34,7 @@ from .common import (
     typed,
     value_of,
 )
-from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, needed, option
+from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, ViewerToken, needed, option
 
 MEMORY_BYTES = 2 << 30  # bytes reserved for a block
 OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
@@ -245,6 +245,7 @@ class Train:
     """Address that --view listens at; 0.0.0.0 gives access to other machines."""
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
+    token: ViewerToken = ""
 
     def run(self, watch: Any = None) -> int:
         """Train, and print the outcome. watch: who looks on, in place of the viewer of --view; see `fit`"""
@@ -284,7 +285,7 @@ class Train:
             asked = self.quality or method.default_quality
             budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)
         run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
-        with watching(self.view, method, data, run, self.host, self.port) as viewer:
+        with watching(self, method, data, run) as viewer:
             with run.kept_if_learnt():
                 looking = viewer or watch
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)

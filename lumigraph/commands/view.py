@@ -15,7 +15,7 @@ from ..errors import LumigraphError
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
 from .common import show
-from .options import DeviceOption, Set, needed, open_method, option
+from .options import DeviceOption, Set, ViewerToken, needed, open_method, option
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class ViewCommand:
     """Port to listen at."""
     settings: Set = ()
     device: DeviceOption = "auto"
+    token: ViewerToken = ""
 
     def run(self) -> int:
         from ..viewer import Viewer, choose_address
@@ -45,9 +46,9 @@ class ViewCommand:
             behind=behind_of(opened, method, cameras),
             exporter=export_menu(opened, method, self.settings, self.device),
         )
-        address = choose_address(self.host, self.port)
+        address = choose_address(self.host, self.port, self.token)
         with until_interrupted(), Viewer(method, subject, address) as viewer:
-            show_address(viewer)
+            show_address(viewer, self.token)
             viewer.serve()
         return 0
 
@@ -128,9 +129,12 @@ def saver(opened: Any) -> Any:
 
 
 @contextlib.contextmanager
-def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: int | None) -> Iterator[Any]:
-    """A Viewer for `fit(..., watch=...)` while it trains a run; `None` without --view."""
-    if not wanted:
+def watching(command: Any, method: Any, data: Any, run: Any) -> Iterator[Any]:
+    """A Viewer for `fit(..., watch=...)` while it trains a run; `None` without --view.
+
+    command: `train`, or another one with options of a viewer
+    """
+    if not command.view:
         yield None
         return
     from ..viewer import Viewer, choose_address
@@ -138,8 +142,9 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
     subject = subject_of(run, finished=False)
     if run.photographed:
         subject = replace(subject, open_scene=lambda: data)
-    with Viewer(method, subject, choose_address(host, port), training=True) as viewer:
-        show_address(viewer)
+    address = choose_address(command.host, command.port, command.token)
+    with Viewer(method, subject, address, training=True) as viewer:
+        show_address(viewer, command.token)
         yield viewer
 
 
@@ -163,5 +168,7 @@ def keep_showing(viewer: Any, signal: int | None) -> None:
             viewer.serve()
 
 
-def show_address(viewer: Any) -> None:
-    show({"view": f"{viewer.address.url} (Ctrl-C ends it)"})
+def show_address(viewer: Any, token: str) -> None:
+    """Print the address, unless the starter of this process has it: its token must not be in a log."""
+    if not token:
+        show({"view": f"{viewer.address.url} (Ctrl-C ends it)"})

@@ -18,7 +18,7 @@ from ..datasets.words import Words
 from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..figures import save_picture
-from ..files import claim, scene_name, write_json
+from ..files import claim, refuse_link, scene_name, write_json
 from ..method import Method
 from ..metrics import Score
 from ..metrics.lpips import Lpips
@@ -117,6 +117,7 @@ def evaluate_run(
 
 def claim_evaluation(run: Trained, split: str, save_images: bool, overwrite: bool | None = None) -> None:
     """Raise LumigraphError unless what an evaluation writes may be written into its run; see `files.claim`."""
+    refuse_link(run.folder / "eval")
     for ending in (".json", ".png"):
         claim(run.folder / f"{stem(split)}{ending}", "evaluation", overwrite)
     for name in run.view_names().get(split, []) if save_images else []:

@@ -10,10 +10,13 @@ from .atomic import expanded as expanded
 from .atomic import explained as explained
 from .atomic import from_json as from_json
 from .atomic import is_file as is_file
+from .atomic import open_anew as open_anew
 from .atomic import read_bytes as read_bytes
 from .atomic import read_json as read_json
 from .atomic import read_text as read_text
 from .atomic import refusal as refusal
+from .atomic import refuse_link as refuse_link
+from .atomic import refuse_links as refuse_links
 from .atomic import remove as remove
 from .atomic import replacing as replacing
 from .atomic import replacing_folder as replacing_folder

@@ -16,10 +16,10 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 
@@ -188,6 +188,31 @@ def seen(path: Path) -> Seen | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     return about.st_dev, about.st_ino, about.st_mode, about.st_size, about.st_mtime_ns
+
+
+def refuse_link(path: str | Path) -> None:
+    """Raise LumigraphError for a link at a place that is about to be written to: it would lead elsewhere."""
+    if os.path.islink(path):
+        raise LumigraphError(f"{path} is a link, which may lead our files elsewhere; put a copy in its place")
+
+
+def refuse_links(folder: Path, read_only: Container[str] = ()) -> None:
+    """Raise LumigraphError for a link below a folder that is about to be written into.
+
+    read_only: names of folders in it that nothing is written into
+    """
+    for place, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            refuse_link(os.path.join(place, name))
+        if Path(place) == folder:
+            folders[:] = [name for name in folders if name not in read_only]
+
+
+def open_anew(path: Path) -> BinaryIO:
+    """A new and empty file of this user alone, open for writing. What lay there goes; a link's target stays."""
+    with explained(path):
+        path.unlink(missing_ok=True)
+        return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
 
 
 def check_room(place: Path) -> None:

@@ -175,10 +175,10 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
     """
     try:
         with _converting:
-            made = msgspec.convert(value, kind)
+            made = msgspec.convert(value, kind, dec_hook=path_of)
         if is_dataclass(made):
             coherent(made)
-        key = surplus(value, msgspec.to_builtins(made)) if closed else None
+        key = surplus(value, msgspec.to_builtins(made, enc_hook=str)) if closed else None
     except LumigraphError as error:  # from a dataclass that looks at itself
         raise LumigraphError(f"{where}: {str(error)[:1].lower()}{str(error)[1:]}") from error
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
@@ -195,6 +195,13 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
     if key is not None:
         raise LumigraphError(f"{where} does not hold what it should: nothing is known of {shown(key)}")
     return made
+
+
+def path_of(kind: type, value: Any) -> Any:
+    """A text of JSON as a path, for msgspec. Raises ValueError for text that is none."""
+    if kind is not Path or not isinstance(value, str) or not value or "\0" in value:
+        raise ValueError(f"Expected `{kind.__name__}`")
+    return Path(value)
 
 
 def surplus(said: Any, known: Any) -> str | None:

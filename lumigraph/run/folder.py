@@ -122,7 +122,9 @@ class Run(Trained):
             yield
 
     def held(self) -> AbstractContextManager[None]:
-        """A block in which no other process trains this run. Raises LumigraphError that says who does."""
+        """A block in which no other process trains this run. Raises LumigraphError that says who does, and for links in
+        the run, which would lead its files elsewhere."""
+        files.refuse_links(self.folder)
         return held(self.folder, "trained")
 
     def set_budget(self, **budget: Any) -> None:

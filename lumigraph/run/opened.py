@@ -17,6 +17,7 @@ from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..exchange import size_of
 from ..figures import png
+from ..files import refuse_link
 from ..gaussians import Gaussians
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
@@ -211,6 +212,7 @@ class Trained(Opened):
 
     @property
     def renders(self) -> Path:
+        refuse_link(self.folder / "renders")
         return self.folder / "renders"
 
     @property

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: work ends, nothing half-done counts as done, exit codes name the signal; child processes end."""
+"""Ctrl-C and SIGTERM: work ends, nothing half-done counts as done, exit codes name the signal."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ import contextlib
 import ctypes
 import os
 import signal
-import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
 HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 REMINDER_SECONDS = 0.5  # between reminders
 SIGACTION_BYTES = 1024  # no system's struct sigaction is as large
-PR_SET_PDEATHSIG = 1  # Linux's number
 
 
 class Stopped(KeyboardInterrupt):
@@ -168,23 +166,3 @@ def untouched() -> Iterator[None]:
         yield
     finally:
         system.sigaction(signal.SIGTERM, before, None)
-
-
-def start(command: Sequence[str], ends_by: int = signal.SIGTERM, **options: Any) -> subprocess.Popen[Any]:
-    """subprocess.Popen of a command that is sent a signal when this process ends, even where that was killed.
-
-    Linux alone can promise that; elsewhere a child should watch its standard input, which ends at the same moment.
-    """
-    return subprocess.Popen(command, preexec_fn=tied(ends_by) if sys.platform == "linux" else None, **options)
-
-
-def tied(number: int) -> Any:
-    """Set-up of the child between fork and exec, where it must not load modules."""
-    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
-
-    def tie() -> None:
-        prctl(PR_SET_PDEATHSIG, number)
-        if os.getppid() != parent:  # it died just before
-            os._exit(1)
-
-    return tie

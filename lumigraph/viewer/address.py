@@ -31,6 +31,11 @@ class Address:
         return self.urls[0]
 
     @property
+    def cookie(self) -> str:
+        """Cookie that carries the token."""
+        return f"lumigraph-{self.port}={self.token}"
+
+    @property
     def urls(self) -> list[str]:
         """All addresses that the viewer answers to, as far as they can be found."""
         hosts = own_addresses() if is_wildcard(self.host) else [self.host]
@@ -38,10 +43,11 @@ class Address:
         return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}{secret}" for host in hosts]
 
 
-def choose_address(host: str = HOST, port: int | None = None) -> Address:
+def choose_address(host: str = HOST, port: int | None = None, token: str = "") -> Address:
     """An address to listen at. Without a port, the first free one from 8080 on.
 
-    Warns, with the addresses, where others than this machine can reach it.
+    token: secret that the starter of this process shares with it; without one, other machines get one in the address,
+           with a warning
     Raises LumigraphError if the host is not this machine's or the port is not to be had.
     """
     if port is not None and not 0 <= port <= 65535:
@@ -52,8 +58,8 @@ def choose_address(host: str = HOST, port: int | None = None) -> Address:
         raise LumigraphError(f"Ports {PORT} to {PORT + MAX_PORT_TRIES - 1} are all in use; choose another by --port")
     if found is None:
         raise LumigraphError(f"Port {port} is in use; choose another by --port, or leave it out to get a free one")
-    address = Address(host, found, "" if is_local(host) else secrets.token_urlsafe(16))
-    if address.token:
+    address = Address(host, found, token or ("" if is_local(host) else new_token()))
+    if address.token and not token:
         warnings.warn(
             "Whoever can reach this machine and knows the token in the address can look at the scene and use the "
             f"viewer: {', '.join(address.urls)}",
@@ -61,6 +67,10 @@ def choose_address(host: str = HOST, port: int | None = None) -> Address:
             stacklevel=2,
         )
     return address
+
+
+def new_token() -> str:
+    return secrets.token_urlsafe(16)  # 128 bits
 
 
 def free_port(host: str, port: int) -> int | None:

@@ -49,7 +49,7 @@ class Guard:
 
     def __init__(self, address: Address):
         self.token = address.token
-        self._cookie = f"lumigraph-{address.port}"
+        self._address = address
         self._names = own_names(address)
 
     def refusal(self, request: Request) -> str | None:
@@ -80,12 +80,12 @@ class Guard:
     @property
     def cookie(self) -> str:
         """Value of the header Set-Cookie that keeps the token."""
-        return f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return f"{self._address.cookie}; HttpOnly; SameSite=Strict; Path=/"
 
     def has_token(self, request: Request) -> bool:
         tokens = parse_qs(urlsplit(request.path).query).get("token", [])
         for line in request.headers.get_all("Cookie"):
-            tokens += cookies(line, self._cookie)
+            tokens += cookies(line, self._address.cookie.partition("=")[0])
         return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in tokens)
 
     def answering(self, answer: Answers) -> Answers:

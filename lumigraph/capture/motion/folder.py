@@ -14,7 +14,7 @@ from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import claim as claim_file
-from ...files import claim_folder, read_json, remove, replacing, replacing_folder, write_json
+from ...files import claim_folder, read_json, refuse_links, remove, replacing, replacing_folder, write_json
 from ...files.marks import is_ours
 from ...system.library import pycolmap
 from ..masks import MASKS as MASKS
@@ -51,6 +51,7 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
             )
     if any(path.resolve() == folder.resolve() for path in sources):
         raise LumigraphError(f"{folder} holds the photographs themselves; name another folder by --output")
+    refuse_links(folder)
     if folder.is_dir() and any(folder.iterdir()):
         owner, result = work / SOURCES_FILE, folder / RESULT_FILE
         if owner.is_file():

@@ -6,7 +6,6 @@ import hashlib
 import json
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
@@ -17,7 +16,7 @@ from typing import Any
 from ...errors import LumigraphError
 from ...files import read_json, write_json
 from ...files.ranges import Lasted
-from ...system.signals import start
+from ...system.children import start_python
 
 WORKER = Path(__file__).with_name("worker.py")
 DONE = "done\n"  # the worker's line at the end of a job
@@ -113,7 +112,7 @@ class Stages:
 def start_worker(log: Path) -> subprocess.Popen[str]:
     with open(log, "ab") as messages:
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": messages}
-        return start([sys.executable, "-P", str(WORKER)], signal.SIGKILL, **pipes, start_new_session=True, text=True)
+        return start_python([str(WORKER)], signal.SIGKILL, Path.cwd(), **pipes, start_new_session=True, text=True)
 
 
 def last_words(log: Path) -> str:
