@@ -11,8 +11,8 @@ from typing import Generic, TypeVar
 
 from ..files.atomic import refusal
 
-MAX_ENTRIES, MAX_DEPTH = 20_000, 64  # of one look
-CARD_SECONDS, PAGE_SECONDS = 0.25, 3.0  # of one look for a card of many, and for the page of one item
+MAX_ENTRIES, MAX_DEPTH = 20_000, 64  # of one search
+CARD_SECONDS, PAGE_SECONDS = 0.25, 3.0  # of one search for a card of many, and for the page of one item
 CUT_SECONDS = 60.0  # until a folder that was not looked through is tried again
 SETTLED_SECONDS = 0.1  # after which a further change gives a folder another time of change
 MAX_KEPT = 4096  # folders whose findings are kept
@@ -20,11 +20,11 @@ MAX_KEPT = 4096  # folders whose findings are kept
 T = TypeVar("T")
 
 
-class Look:
-    """One look through a folder.
+class Search:
+    """A search through a folder, within bounds.
 
     changed: times of change (content, permissions) of each folder that was read
-    fault:   a sentence on what could not be read; is_cut: whether the look ended at a bound
+    fault:   a sentence on what could not be read; is_cut: whether the search ended at a bound
     """
 
     def __init__(self, folder: Path, seconds: float):
@@ -34,8 +34,8 @@ class Look:
 
     def entries(self, folder: Path) -> Iterator[Path]:
         """Entries of a folder; none of one that cannot be read."""
-        if len(folder.parts) - len(self.folder.parts) > MAX_DEPTH:
-            self.is_cut = True
+        self.is_cut |= len(folder.parts) - len(self.folder.parts) > MAX_DEPTH
+        if self.is_cut:
             return
         try:
             self.changed[str(folder)] = times_of(folder)
@@ -60,7 +60,7 @@ class Look:
         return self.fault
 
     def is_current(self) -> bool:
-        """True until one of the folders changes; for a look that was cut, for a while."""
+        """True until one of the folders changes; for a search that was cut, for a while."""
         if self.is_cut:
             return time.monotonic() - self.begun < CUT_SECONDS
         try:
@@ -85,34 +85,34 @@ class Finder(Generic[T]):
     find: looks through the folder, for so many seconds
     """
 
-    def __init__(self, find: Callable[[Look], T], seconds: float = CARD_SECONDS):
+    def __init__(self, find: Callable[[Search], T], seconds: float = CARD_SECONDS):
         self._find, self._seconds = find, seconds
-        self._kept: dict[Path, tuple[Look, T]] = {}
+        self._kept: dict[Path, tuple[Search, T]] = {}
 
-    def __call__(self, folder: Path, until: float = float("inf")) -> tuple[Look, T] | None:
-        """A look and its finding. until: moment (time.monotonic) after which an earlier finding is returned, if any"""
+    def __call__(self, folder: Path, until: float = float("inf")) -> tuple[Search, T] | None:
+        """A search and its finding. until: moment (time.monotonic) after which only an earlier finding is returned"""
         known = self._kept.get(folder)
         if time.monotonic() > until or (known and known[0].is_current()):
             return known
-        look = Look(folder, self._seconds)
-        found = look, self._find(look)
+        search = Search(folder, self._seconds)
+        found = search, self._find(search)
         if len(self._kept) > MAX_KEPT:
             self._kept.clear()
-        if look.is_settled() or look.is_cut:
+        if search.is_settled() or search.is_cut:
             self._kept[folder] = found
         return found
 
 
-def _size(look: Look) -> int | None:
-    total, ahead = 0, [look.folder]
+def _size(search: Search) -> int | None:
+    total, ahead = 0, [search.folder]
     while ahead:
-        for path in look.entries(ahead.pop()):
+        for path in search.entries(ahead.pop()):
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():
                     ahead.append(path)
                 elif path.is_file():
                     total += path.stat().st_size
-    return None if look.is_cut else total
+    return None if search.is_cut else total
 
 
 _sizes = Finder(_size)

@@ -33,7 +33,7 @@ from ..files import is_file
 from ..files.names import counted, natural
 from ..system.children import start_python
 from . import reduce
-from .folders import PAGE_SECONDS, Finder, Look
+from .folders import PAGE_SECONDS, Finder, Search
 from .projects import Item
 from .reduce import reduced
 from .uploads import MAX_FILES
@@ -59,24 +59,24 @@ class Advice:
     names: list[str]
 
 
-def _listing(look: Look) -> dict[str, Path]:
-    films = (path for path in look.entries(look.folder) if is_film(path))
-    found = itertools.islice(itertools.chain(walk(look.folder, list_entries=look.entries), films), MAX_FILES + 1)
-    names = {path.relative_to(look.folder).as_posix(): path for path in found}
-    look.is_cut |= len(names) > MAX_FILES
+def _listing(search: Search) -> dict[str, Path]:
+    films = (path for path in search.entries(search.folder) if is_film(path))
+    found = itertools.islice(itertools.chain(walk(search.folder, list_entries=search.entries), films), MAX_FILES + 1)
+    names = {path.relative_to(search.folder).as_posix(): path for path in found}
+    search.is_cut |= len(names) > MAX_FILES
     return {name: names[name] for name in sorted(names, key=natural)[:MAX_FILES]}
 
 
-def _first(look: Look) -> Path | None:
-    films = (path for path in look.entries(look.folder) if is_film(path))
-    return next(itertools.chain(walk(look.folder, list_entries=look.entries), films), None)
+def _first(search: Search) -> Path | None:
+    films = (path for path in search.entries(search.folder) if is_film(path))
+    return next(itertools.chain(walk(search.folder, list_entries=search.entries), films), None)
 
 
 _listings, _firsts = Finder(_listing, PAGE_SECONDS), Finder(_first)
 
 
 def files_of(folder: Path) -> dict[str, Path]:
-    """Photographs and videos of a folder by name, in natural order, as far as the bounds of a `Look`; of a file the
+    """Photographs and videos of a folder by name, in natural order, as far as the bounds of a `Search`; of a file the
     file itself."""
     if is_file(folder):
         return {folder.name: folder}
