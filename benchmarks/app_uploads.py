@@ -66,7 +66,7 @@ UPLOAD_NAMED = """async ([key, names]) => {
 }"""
 FAULTS = """async (key) => {
   const { isUploading, stateOf } = await import("/static/uploads.js");
-  return isUploading(key) ? null : stateOf(key).faults;
+  return isUploading(key) || !stateOf(key).count ? null : { faults: stateOf(key).faults };
 }"""
 ATTACK = """async (app) => {
   const said = [(answer) => `${answer.type} ${answer.status}`, (fault) => fault.name];
@@ -134,8 +134,7 @@ class Uploads(Walk):
 
     def faults_of(self, page: Any, key: str) -> list[str]:
         """Sentences of an upload that is over."""
-        until(lambda: page.evaluate(FAULTS, key) is not None, self.patience)
-        return list(page.evaluate(FAULTS, key))
+        return list(until(lambda: page.evaluate(FAULTS, key), self.patience)["faults"])
 
 
 def make_photographs(folder: Path, count: int) -> list[Path]:
