@@ -12,7 +12,7 @@ from listing import names
 from lumigraph import files
 from lumigraph.errors import LumigraphError
 from lumigraph.files import locks, partials
-from lumigraph.system import allocation, cache, children, memory, signals
+from lumigraph.system import allocation, cache, children, memory
 
 pytestmark = budget("house", 5)  # 0.5 s alone; 5.0 s at the end of a session, whose garbage is collected three times
 fcntl = pytest.importorskip("fcntl")

@@ -18,7 +18,7 @@ from test_app import BASE, app, calls, client, jpeg, let, project, put, running,
 from waiting import until
 
 from lumigraph.app import jobs, sharing
-from lumigraph.app.job_record import NOT_SEALED, read_job
+from lumigraph.app.job_record import NOT_SEALED, read_job, user_key
 from lumigraph.app.projects import LOG_FILE, WRITTEN, find_item, new_project
 from lumigraph.app.scene_views import SceneView, SceneViews
 from lumigraph.app.server import App, build, serve
@@ -245,6 +245,19 @@ def test_the_app_keeps_no_files_behind_a_link(tmp_path):
 
 
 # Who may look
+
+
+def test_the_key_of_seals_is_of_this_user_alone(tmp_path, monkeypatch):
+    monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache"))
+    user_key.cache_clear()
+    key = user_key()
+    user_key.cache_clear()
+    assert user_key() == key and len(key) == 32
+    assert (tmp_path / "cache" / "app.key").stat().st_mode & 0o777 == 0o600
+    monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache" / "app.key" / "none"))  # cannot be written
+    user_key.cache_clear()
+    assert user_key() == user_key() != key
+    user_key.cache_clear()
 
 
 class Child:

@@ -62,8 +62,8 @@ class AppCommand:
 
 @contextlib.contextmanager
 def door(address: Any) -> Iterator[str]:
-    """What a browser is given to open: the address; where that has a token, which other users would see among the
-    browser's arguments, a page of this user alone that leads there."""
+    """Address that a browser is given. One with a token, which other users would see among the browser's arguments, is
+    in a page of this user alone that leads there."""
     if not address.token:
         yield address.url
         return

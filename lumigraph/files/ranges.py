@@ -190,6 +190,7 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
             found, wanted = found_at(kind, value, name) if name else (value, kind)
             ranged = domain(wanted) if re.match(r"Expected `\w+` [<>]", fault) else ""
             should = f"be from {ranged}" if ranged else fault.replace("Expected", "be", 1)
+            should = "be a name" if "matching regex" in should else should
             what = f"{name or 'it'} is {shown(found)}, and should {should}"
         raise LumigraphError(f"{where} does not hold what it should: {what}") from error
     if key is not None:

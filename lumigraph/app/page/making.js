@@ -108,7 +108,9 @@ function Curve({ points }) {
 function Paused({ detail, act }) {
   const { make } = detail;
   return html`<section class="panel" aria-label="Paused"><h2>Paused</h2>
-    <p class="faint">What is done is kept${make.progress ? `: ${make.progress.stage.toLowerCase()}, ${Math.round(100 * make.progress.share)} %` : ""}.</p>
+    ${make.fault
+      ? html`<p class="fault" role="alert">${make.fault}</p>`
+      : html`<p class="faint">What is done is kept${make.progress ? `: ${make.progress.stage.toLowerCase()}, ${Math.round(100 * make.progress.share)} %` : ""}.</p>`}
     <div class="row"><button class="main" onClick=${() => act(() => api("POST", `${of(detail.key)}/more`, {}))}>Go on</button>
     <button onClick=${() => act(() => api("POST", `${of(detail.key)}/stop`))}>Stop here</button></div></section>`;
 }
