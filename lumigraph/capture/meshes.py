@@ -127,7 +127,8 @@ def fans(polygons: np.ndarray) -> tuple[Int[np.ndarray, "triangle 3"], Int[np.nd
     triangles, faces = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for length in np.unique(lengths[lengths >= 3]):
         group = np.flatnonzero(lengths == length)
-        corners = np.stack([*polygons[group]]).astype(np.int64)
+        some = polygons[group]
+        corners = (np.stack([*some]) if some.dtype == object else some).astype(np.int64)
         fan = np.broadcast_to(corners[:, :1], (len(group), length - 2)), corners[:, 1:-1], corners[:, 2:]
         triangles.append(np.stack(fan, -1).reshape(-1, 3))
         faces.append(np.repeat(group, length - 2))
