@@ -65,6 +65,15 @@ def test_meshes_and_points_of_any_file(tmp_path, order):
     assert read_shape(path, "a").normals is not None
 
 
+@pytest.mark.parametrize("order", KINDS)
+def test_vertices_with_lists_of_different_lengths(tmp_path, order):
+    types = {"x": "float", "seen": "list uchar ushort", "y": "float", "z": "float"}
+    rows = [(float(i), [*range(i)], 1.0, 2.0) for i in range(4)]
+    (tmp_path / "a.ply").write_bytes(ply_file([("vertex", types, rows)], order))
+    assert read_ply(tmp_path / "a.ply").points.tolist() == [[i, 1, 2] for i in range(4)]
+    assert [list(x) for x in read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]["seen"]] == [row[1] for row in rows]
+
+
 def test_writing_is_read_back(tmp_path):
     kinds = ["i1", "u1", "<i2", ">u2", "<i4", ">u4", "<i8", "<f2", ">f4", "<f8"]
     rows = np.zeros(3, [(f"p{i}", kind) for i, kind in enumerate(kinds)])

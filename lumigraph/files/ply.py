@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.lib.recfunctions import structured_to_unstructured
+from numpy.lib.recfunctions import repack_fields, structured_to_unstructured
 
 from ..errors import LumigraphError
 from ..system.memory import ask_for
@@ -284,7 +284,8 @@ def columns(rows: np.ndarray, names: Sequence[str], dtype: type = np.float32) ->
     if not names:
         return np.empty((len(rows), 0), dtype)
     with np.errstate(over="ignore", invalid="ignore"):  # what does not fit becomes infinite, and is found later
-        return structured_to_unstructured(rows[[*names]], dtype)
+        chosen = rows[[*names]]
+        return structured_to_unstructured(repack_fields(chosen) if rows.dtype.hasobject else chosen, dtype)
 
 
 def plain_names(rows: np.ndarray) -> list[str]:
