@@ -77,7 +77,10 @@ def captured(tmp_path_factory):
     bad = spoil(photos)
     before = digests(photos)
     told = Told()
-    result = reconstruct([photos], base / "scene", track=told)
+    (base / "temporary").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(base / "temporary"))
+        result = reconstruct([photos], base / "scene", track=told)
     assert digests(photos) == before, "the user's files were changed"
     return photos, poses, bad, base / "scene", result, told
 
@@ -130,6 +133,12 @@ def test_progress_counts_what_there_is(captured):
     told = captured[-1].counts
     assert told["Looking at photographs"] == 18
     assert told["Finding details"] == 16 and told["Comparing pairs"] == 16 * 15 / 2 and told["Placing cameras"] == 16
+
+
+def test_nothing_is_left_in_the_temporary_folder(captured):
+    """COLMAP's logging library would leave files there that name all photographs."""
+    assert not list((captured[0].parent / "temporary").iterdir())
+    assert "Creating SIFT" in (captured[3] / "work" / "colmap.log").read_text()  # its messages are here
 
 
 def test_both_readers_see_the_same_cameras_and_points(captured):

@@ -11,17 +11,18 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
-import plyfile
 import pytest
 import torch
 import zstandard
 from budgets import budget
 from listing import names
+from ply_files import ply_file
 
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import REORDERED, SUFFIXES, is_splat_file, read_gaussians, write_gaussians
 from lumigraph.exchange.codes import morton_order
 from lumigraph.exchange.spz import gzipped
+from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians, turned
 
 pytestmark = budget("exports", 10)
@@ -373,17 +374,10 @@ def test_reads_ply_of_any_kind(tmp_path, order):
     """Text and big-endian files, other types, other orders of properties, other elements."""
     cloud = make(5, 1)
     write_gaussians(tmp_path / "a.ply", cloud)
-    vertex = plyfile.PlyData.read(tmp_path / "a.ply")["vertex"].data
-    names = sorted(vertex.dtype.names)
-    shuffled = np.empty(5, [(name, "f8" if name == "x" else "f4") for name in names])
-    for name in names:
-        shuffled[name] = vertex[name]
-    face = np.empty(2, [("vertex_indices", "i4", (3,))])
-    face["vertex_indices"] = 1
-    elements = [plyfile.PlyElement.describe(face, "face"), plyfile.PlyElement.describe(shuffled, "vertex")]
-    plyfile.PlyData(elements, text=order == "text", byte_order="=" if order == "text" else order).write(
-        str(tmp_path / "b.ply")
-    )
+    vertex = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+    types = {name: "double" if name == "x" else "float" for name in sorted(vertex.dtype.names)}
+    face = ("face", {"vertex_indices": "list uchar int"}, [([1, 1, 1],)] * 2)
+    (tmp_path / "b.ply").write_bytes(ply_file([face, ("vertex", types, vertex[[*types]].tolist())], order))
     assert same(read_gaussians(tmp_path / "b.ply"), cloud)
 
 
@@ -525,11 +519,11 @@ def test_nothing_unsound_is_written(tmp_path, suffix, name):
 def test_nothing_unsound_is_read(tmp_path):
     cloud = make(5, 1)
     write_gaussians(tmp_path / "a.ply", cloud)
-    data = plyfile.PlyData.read(tmp_path / "a.ply", mmap=False)
-    data["vertex"].data["x"][:2] = np.nan, -np.inf
-    data["vertex"].data["f_rest_4"][1:3] = np.inf
-    data["vertex"].data["opacity"][:] = np.inf, -np.inf, 1, 1, 1  # as they occur in good files
-    data.write(str(tmp_path / "b.ply"))
+    rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"].copy()
+    rows["x"][:2] = np.nan, -np.inf
+    rows["f_rest_4"][1:3] = np.inf
+    rows["opacity"][:] = np.inf, -np.inf, 1, 1, 1  # as they occur in good files
+    write_rows(tmp_path / "b.ply", "splats", {"vertex": rows})
     sentence = refusal(tmp_path / "b.ply")
     assert "3 of 5 Gaussians" in sentence and "means: 2" in sentence and "colours: 2" in sentence
     assert "opacities" not in sentence
@@ -539,8 +533,8 @@ def test_nothing_unsound_is_read(tmp_path):
 
 
 def test_a_point_cloud_is_no_cloud_of_gaussians(tmp_path):
-    points = np.zeros(7, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-    plyfile.PlyData([plyfile.PlyElement.describe(points, "vertex")]).write(str(tmp_path / "a.ply"))
+    types = dict.fromkeys("xyz", "float") | dict.fromkeys(["red", "green", "blue"], "uchar")
+    (tmp_path / "a.ply").write_bytes(ply_file([("vertex", types, [(0,) * 6] * 7)]))
     assert "7 points and no Gaussians" in refusal(tmp_path / "a.ply")
 
 

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
-import plyfile
 import pytest
 import tiny
 import torch
@@ -33,6 +32,7 @@ from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, simplified, smoothed, zero_level
+from lumigraph.files.ply import read_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.run import Run
@@ -402,11 +402,11 @@ def test_a_file_of_points(tmp_path):
     frame = Frame(source_from_scene=MOVED)
     points = extract_points(Seen(ball()), around(), 500)
     write_points(tmp_path / "points.ply", points.in_source(frame))
-    vertex = plyfile.PlyData.read(tmp_path / "points.ply")["vertex"]
+    vertex = read_rows(tmp_path / "points.ply", ["vertex"])["vertex"]
     position, normal = (np.stack([vertex[x] for x in names], -1) for names in (("x", "y", "z"), ("nx", "ny", "nz")))
     np.testing.assert_allclose(np.linalg.norm(position - [5, -1, 0.5], axis=-1), 1.2, atol=0.05)
     np.testing.assert_allclose(normal, (position - [5, -1, 0.5]) / 1.2, atol=0.25)
-    assert vertex["red"].dtype == np.uint8 and len(vertex.data) == len(points.positions)
+    assert vertex["red"].dtype == np.uint8 and len(vertex) == len(points.positions)
 
 
 # Commands and faults

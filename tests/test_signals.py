@@ -164,6 +164,23 @@ def test_colmap_does_not_take_sigterm_away():
     )
 
 
+PNG = """
+import io
+from lumigraph.system.library import pycolmap
+from PIL import Image
+pycolmap.logging.warning("a word")
+Image.new("RGB", (300, 200)).save(io.BytesIO(), "PNG")
+"""
+
+
+def test_pillow_saves_png_after_colmap_is_loaded(tmp_path):
+    """In the order that ended the process by a double free; and the logging library leaves no files."""
+    environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", PNG], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and "a word" in done.stderr, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_pycolmap_is_loaded_at_one_place():
     loading = {
         path.relative_to(PACKAGE).as_posix()

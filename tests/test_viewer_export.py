@@ -93,7 +93,7 @@ def test_every_export_is_offered_and_its_command_line_works(ball_run, tmp_path):
     request = replace(request_of(tiny.scene().cameras[0], (60, 60)), crop=box)
     file = tmp_path / "ball.ply"
     command = menu.command("points", str(file), defaults | {"count": "500"}, request)
-    assert command[5:] == ["--count=500", "--box", *3 * ["-1.000000"], *3 * ["0.500000"]]
+    assert command[5:] == ["--count=500", "--no-origin", "--box", *3 * ["-1.000000"], *3 * ["0.500000"]]
     assert main(command[1:]) == 0 and file.exists()
 
 

@@ -116,9 +116,9 @@ def film_is_whole(path: Path) -> bool:
 
 
 def ply_is_whole(path: Path) -> bool:
-    import plyfile
+    from lumigraph.files import ply
 
-    return len(plyfile.PlyData.read(str(path)).elements) > 0
+    return len(ply.read_rows(path, ply.read_header(path).elements)) > 0
 
 
 def spz_is_whole(data: bytes) -> bool:

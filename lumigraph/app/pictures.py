@@ -162,7 +162,7 @@ def _thumbnail(path: Path, modified: int, size: int, side: int) -> bytes:
                 image = ImageOps.exif_transpose(reduced(whole, side))
         image.thumbnail((side, side))
         out = io.BytesIO()
-        image.save(out, "JPEG", quality=80)
+        image.save(out, "JPEG", quality=80, comment="")  # Pillow would keep the photograph's
     except LumigraphError:
         raise
     except Exception as fault:  # image libraries raise anything for a damaged file

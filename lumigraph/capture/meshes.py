@@ -9,21 +9,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from plyfile import PlyData
+from jaxtyping import Float, Int, UInt8
 
 from ..datasets.dataset import splits_of
 from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import natural
+from ..files.ply import columns, plain_names, read_header
 from ..system.memory import ask_for, free_memory
 from ..system.progress import track
+from .points import colours_of as ply_colours
+from .points import read_vertices
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 Z_UP_SUFFIXES = (".stl", ".off")  # by custom with +z up; the others have +y up
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # to +z
 MAX_COORDINATE, ZERO_EXTENT = 1e12, 1e-12  # units of a file, from its origin; largest extent that counts as zero
+POLYGONS = "vertex_indices", "vertex_index"  # names of lists of corners in PLY files
+NORMAL = ["nx", "ny", "nz"]
 DEFAULT_GREY = 160  # for meshes without colour
 TRIANGLE_BYTES = 500  # of memory for each triangle: its corners, and the tree over all of them
 
@@ -69,8 +73,11 @@ def read_mesh(path: Path) -> Mesh:
     if path.stat().st_size > free_memory():
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
     try:
-        loaded: Any = trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
+        own = path.suffix.lower() == ".ply" and not has_texture(path)
+        loaded: Any = read_ply(path) if own else trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
         parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    except LumigraphError:
+        raise
     except Exception as error:  # readers of many formats fail in many ways
         reason = " ".join(str(error).split()) or type(error).__name__
         raise LumigraphError(f"{path} cannot be read as a mesh ({reason}); export it once more") from error
@@ -92,6 +99,40 @@ def read_mesh(path: Path) -> Mesh:
     if meshes and not len(made.faces):
         raise LumigraphError(f"{path} has triangles, and none of them has an area; export it once more")
     return made
+
+
+def has_texture(path: Path) -> bool:
+    """True if a PLY file names a picture for its surface, as MeshLab writes it; those are read by trimesh."""
+    return any(line.startswith("TextureFile") for line in read_header(path).comments)
+
+
+def read_ply(path: Path) -> Any:
+    """Triangles of a PLY file, its polygons cut into fans; its points if it has none."""
+    import trimesh
+
+    rows = read_vertices(path, "face")
+    vertices, faces = rows["vertex"], rows.get("face", np.empty(0, []))
+    positions, colours = np.array(columns(vertices, "xyz", np.float64)), ply_colours(vertices)
+    name = next((name for name in POLYGONS if name in (faces.dtype.names or ())), None)
+    if name is None or not len(faces):
+        return trimesh.PointCloud(positions, colours)
+    triangles, face = fans(faces[name])
+    face_colours = None if (found := ply_colours(faces)) is None else found[face]
+    return trimesh.Trimesh(positions, triangles, face_colors=face_colours, vertex_colors=colours, process=False)
+
+
+def fans(polygons: np.ndarray) -> tuple[Int[np.ndarray, "triangle 3"], Int[np.ndarray, " triangle"]]:
+    """Triangles of polygons from their first corner, and the polygon that each is of."""
+    lengths = np.array([*map(len, polygons)]) if polygons.dtype == object else np.full(*polygons.shape)
+    triangles, faces = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
+    for length in np.unique(lengths[lengths >= 3]):
+        group = np.flatnonzero(lengths == length)
+        some = polygons[group]
+        corners = (np.stack([*some]) if some.dtype == object else some).astype(np.int64)
+        fan = np.broadcast_to(corners[:, :1], (len(group), length - 2)), corners[:, 1:-1], corners[:, 2:]
+        triangles.append(np.stack(fan, -1).reshape(-1, 3))
+        faces.append(np.repeat(group, length - 2))
+    return np.concatenate(triangles), np.concatenate(faces)
 
 
 def is_sound(part: Any) -> bool:
@@ -142,13 +183,10 @@ def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
     """The normals of a cloud of points, of unit length; None without, or with any that is 0 or NaN."""
     if path.suffix.lower() != ".ply":
         return None
-    try:
-        table = PlyData.read(path)["vertex"].data
-    except Exception:  # it was read by another library, which has no normals either
+    table = read_vertices(path)["vertex"]
+    if not {*NORMAL} <= {*plain_names(table)}:
         return None
-    if not {"nx", "ny", "nz"} <= set(table.dtype.names):
-        return None
-    found = np.stack([table[axis].astype(np.float64) for axis in ("nx", "ny", "nz")], -1)
+    found = columns(table, NORMAL, np.float64)
     length = np.linalg.norm(found, axis=-1, keepdims=True)
     return found / length if (length > 0).all() and np.isfinite(length).all() else None
 

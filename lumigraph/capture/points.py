@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import plyfile
 from jaxtyping import Float, UInt8
 
 from ..errors import LumigraphError
 from ..files import read_bytes
+from ..files.ply import columns, plain_names, read_header, read_rows
 from ..system.memory import free_memory
 
+COLOURS = ["red", "green", "blue"]
 POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera positions belong to one capture
 
 
@@ -29,20 +29,31 @@ class SparsePoints:
 
 def read_ply(path: Path) -> SparsePoints:
     """Vertices with x, y, z and, where they have them, red, green, blue, and sightings (in how many photographs)."""
-    try:
-        vertex = plyfile.PlyData.read(io.BytesIO(read_bytes(path, free_memory())))["vertex"]
-        positions = np.stack([np.asarray(vertex[k], np.float64) for k in "xyz"], -1)
-        names = {p.name for p in vertex.properties}
-        if names >= {"red", "green", "blue"}:
-            colours = np.stack([np.asarray(vertex[k]) for k in ("red", "green", "blue")], -1)
-            if colours.dtype != np.uint8:
-                colours = (colours * 255).round().clip(0, 255).astype(np.uint8)
-        else:
-            colours = np.full(positions.shape, 128, np.uint8)
-        sightings = np.array(vertex["sightings"]) if "sightings" in names else np.full(len(positions), 2)
-    except Exception as fault:
-        raise LumigraphError(f"{path} cannot be read as a point cloud ({fault}); restore or remove it") from fault
+    vertex = read_vertices(path)["vertex"]
+    positions, colours = np.array(columns(vertex, "xyz", np.float64)), colours_of(vertex)
+    if colours is None:
+        colours = np.full(positions.shape, 128, np.uint8)
+    has_sightings = "sightings" in plain_names(vertex)
+    sightings = np.array(vertex["sightings"]) if has_sightings else np.full(len(positions), 2)
     return SparsePoints(positions, colours, sightings)
+
+
+def read_vertices(path: Path, *further: str) -> dict[str, np.ndarray]:
+    """Vertices of a PLY file, and further elements where it has them. Raises LumigraphError without x, y and z."""
+    header = read_header(path)
+    if not {*"xyz"} <= {*header.properties.get("vertex", [])}:
+        raise LumigraphError(f"{path} has no vertices with x, y and z; name another file")
+    return read_rows(path, ["vertex", *further], header)
+
+
+def colours_of(rows: np.ndarray) -> UInt8[np.ndarray, "row 3"] | None:
+    """red, green and blue of a PLY file's rows: integers up to 255, or floats up to 1 or to 255. None without them."""
+    if not {*COLOURS} <= {*plain_names(rows)}:
+        return None
+    found = np.stack([rows[name] for name in COLOURS], -1)
+    if found.dtype.kind == "f":
+        found = np.nan_to_num(found * (1 if found.max(initial=0) > 1 else 255)).round()
+    return found.clip(0, 255).astype(np.uint8)
 
 
 def read_points3d(path: Path) -> SparsePoints:

@@ -18,6 +18,7 @@ from .export_web import ExportWeb
 from .options import (
     DeviceOption,
     Keeping,
+    OriginOption,
     Overwrite,
     PhotographsOption,
     Scaling,
@@ -29,6 +30,7 @@ from .options import (
     open_method,
     option,
     photographers,
+    told_origin,
 )
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
@@ -85,6 +87,7 @@ class ExportMesh:
     moments: Annotated[Annotated[int, between(2, 1000)] | None, option("N", "one, as --set time says")] = None
     """Number of moments of a scene that moves, evenly spread: a mesh each, FILE-000 and on."""
     scene: PhotographsOption = None
+    origin: OriginOption = True
     overwrite: Overwrite = False
     scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
@@ -92,16 +95,14 @@ class ExportMesh:
     device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ..export.mesh_file import files_of, write_mesh
+        from ..export.mesh_file import files_of
 
         if self.moments is not None:
             return self._sequence(self.moments)
         for path in files_of(self.output, self.texture):
             claim(path, "mesh", self.overwrite, [self.source])
         opened, mesh, why = self.extracted()
-        up = opened.frame.to_source.rotation[:, 2].numpy()
-        written = write_mesh(self.output, mesh, up, lit=self.lit, origin=opened.frame.origin)
-        show(self.rows(opened, mesh, written, why))
+        show(self.written(opened, mesh, why))
         return 0
 
     def _sequence(self, count: int) -> int:
@@ -158,8 +159,13 @@ class ExportMesh:
                 warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
             return None
 
-    def rows(self, opened: Any, mesh: Any, written: list[Path], why: str) -> dict[str, str]:
-        """Results for the terminal. written: files;  why: source of the surface, and the reason"""
+    def written(self, opened: Any, mesh: Any, why: str, pieces: Any = None) -> dict[str, str]:
+        """Write the files. Returns results for the terminal. why: source of the surface, and the reason"""
+        from ..export.mesh_file import WITH_ORIGIN, write_mesh
+
+        up = opened.frame.to_source.rotation[:, 2].numpy()
+        origin, place = told_origin(opened.frame, self.origin and self.output.suffix.lower() in WITH_ORIGIN)
+        written = write_mesh(self.output, mesh, up, lit=self.lit, origin=origin, pieces=pieces)
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         frame = "in the frame of the photographs"
         frame += f", times {opened.frame.scale:.6g}" if opened.frame.scale != 1 else ""
@@ -170,7 +176,7 @@ class ExportMesh:
             "extent": " x ".join(f"{x:.4g}" for x in high - low) + f" {frame}",
             "size": f"{sum(file.stat().st_size for file in written) / 1e6:.1f} MB",
         }
-        return rows | ({"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {})
+        return rows | ({"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {}) | place
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -359,6 +365,7 @@ class ExportPoints:
     """Longer side of the pictures that points are taken from, at most that of the photographs."""
     views: Annotated[Count, option("N")] = 64
     """Largest number of these pictures."""
+    origin: OriginOption = True
     overwrite: Overwrite = False
     scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
@@ -375,13 +382,14 @@ class ExportPoints:
         seers, method = opened.survey(cameras["train"]), at_one_moment(method)
         method, crop = self.part.without_floaters(method, opened), self.part.crop(opened.frame)
         points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
-        write_points(self.output, points, opened.frame.origin)
+        origin, place = told_origin(opened.frame, self.origin)
+        write_points(self.output, points, origin)
         rows = {
             "file": str(self.output),
             "points": f"{len(points.positions):,}",
             "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
         }
-        show(rows)
+        show(rows | place)
         return 0
 
 
@@ -599,16 +607,13 @@ class ExportCollision(ExportMesh):
 
     def run(self) -> int:
         from ..export.collision import convex_pieces
-        from ..export.mesh_file import write_mesh
 
         claim(self.output, "mesh", self.overwrite, [self.source])
         opened, mesh, why = self.extracted()
         found = convex_pieces(mesh, self.concavity, self.pieces)
         named = {PIECE_NAMES[self.engine].format(name="source", number=i): piece for i, piece in enumerate(found)}
-        up = opened.frame.to_source.rotation[:, 2].numpy()
-        written = write_mesh(self.output, mesh, up, lit=self.lit, origin=opened.frame.origin, pieces=named)
         rows = {"pieces": f"{len(found)}, {sum(len(faces) for _, faces in found):,} triangles"}
-        show(self.rows(opened, mesh, written, why) | rows)
+        show(self.written(opened, mesh, why, named) | rows)
         return 0
 
     def check(self) -> None:

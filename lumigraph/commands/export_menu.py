@@ -24,6 +24,7 @@ ELSEWHERE = (
     "settings",
     "device",
 )  # fields that the viewer sets otherwise
+PRIVATE = "origin"  # a switch that is off in the viewer, whose files are often passed on; on the command line it is on
 
 
 def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) -> Any:
@@ -48,7 +49,8 @@ def export_menu(opened: Any, method: Any, settings: Sequence[str], device: str) 
         place = opened.path.absolute()  # for a child in another folder
         words = ["lumigraph", "export", name, str(place), str(place.parent / file)]
         for option in formats[name].options:
-            words += typed_option(option.name, values[option.name], option.default)
+            default = option.default or option.name == PRIVATE
+            words += typed_option(option.name, values[option.name], default)
         if "part" in hints(kinds[name]):
             crop = request.crop
             if isinstance(crop, CropBox):
@@ -84,7 +86,7 @@ def options_of(kind: type) -> Iterator[Any]:
         name = next((mark.name for mark in marks if mark.name), field.name).replace("_", "-")
         hint = next((str(mark.help_behavior_hint) for mark in marks if mark.help_behavior_hint), "")
         if isinstance(field.default, bool):
-            yield ExportOption(name, field.default, hint=hint)
+            yield ExportOption(name, field.default and name != PRIVATE, hint=hint)
             continue
         choices = list(choices_of(said[field.name]))
         default = str(field.default) if field.default is not None else "default" if choices else ""

@@ -14,6 +14,7 @@ from .common import show
 from .options import (
     DeviceOption,
     Keeping,
+    OriginOption,
     Overwrite,
     Scaling,
     Set,
@@ -23,6 +24,7 @@ from .options import (
     open_method,
     option,
     photographers,
+    told_origin,
 )
 
 Along = Annotated[int, between(1, 65_535)]
@@ -53,6 +55,7 @@ class ExportProbes:
     """Mesh of the page (.glb, .obj, .ply ...)."""
     view: Annotated[str | None, option("NAME_OR_NUMBER", "the middle one")] = None
     """Photograph whose camera the page looks through."""
+    origin: OriginOption = True
     overwrite: Overwrite = False
     scaling: OmitArgPrefixes[Scaling] = Scaling()
     part: OmitArgPrefixes[Keeping] = Keeping()
@@ -74,7 +77,8 @@ class ExportProbes:
         spacing = None if self.spacing is None else self.spacing / opened.frame.to_export.scale
         seers = photographers(opened, method)
         grid = bake_probes(method, seers, box, spacing, self.counts, self.order, self.resolution)
-        write_probes(self.output, grid, opened.frame.origin and opened.frame.origin.to_json())
+        origin, place = told_origin(opened.frame, self.origin)
+        write_probes(self.output, grid, origin and origin.to_json())
         state = grid.state
         rows = {
             "probes": str(self.output),
@@ -84,7 +88,7 @@ class ExportProbes:
         }
         if self.page is not None:
             rows |= {"page": self._page(opened, method, cameras, grid)}
-        show(rows)
+        show(rows | place)
         return 0
 
     def _page(self, opened: Any, method: Any, cameras: Any, grid: Any) -> str:

@@ -39,6 +39,8 @@ OVERWRITE = (
     "with other files in them never are."
 )
 Overwrite = Annotated[bool, arg(help=OVERWRITE)]
+ORIGIN = "Write latitude and longitude of the frame's origin into the file, where they are known."
+OriginOption = Annotated[bool, arg(help=ORIGIN)]
 PHOTOGRAPHS = "Path of the photographs, if they were moved since training."
 PhotographsOption = Annotated[str | None, option("SCENE", "the path used in training", PHOTOGRAPHS)]
 ReaderOption = Annotated[Reader | None, option("NAME", "detected", f"Layout of the folder: {LISTED}.")]
@@ -253,3 +255,11 @@ class Keeping(Cropping):
     def without_floaters(self, method: Any, opened: Any) -> Any:
         """All of a method but its floaters, for what crops by itself."""
         return replace(self, box=None, sphere=None).of_method(method, opened)
+
+
+def told_origin(frame: Any, wanted: bool) -> tuple[Any, dict[str, str]]:
+    """Origin on Earth to write into a file, and the row that says so; neither where it is unknown or unwanted."""
+    if not wanted or frame.origin is None:
+        return None, {}
+    place = f"latitude {frame.origin.latitude:.6f}, longitude {frame.origin.longitude:.6f}"
+    return frame.origin, {"place": f"the file holds {place} of its origin; --no-origin leaves them out"}

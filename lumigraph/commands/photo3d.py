@@ -12,7 +12,7 @@ from ..errors import LumigraphError
 from ..files.ranges import Downscale, between
 from .capture import posed
 from .common import show, typed
-from .options import Overwrite, ReaderOption, needed, option
+from .options import OriginOption, Overwrite, ReaderOption, needed, option, told_origin
 
 Views = Annotated[int, between(2, 100)]
 
@@ -38,6 +38,7 @@ class Photo3DCommand:
     downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
     """Reduce the photographs by this whole number before reading."""
     reader: ReaderOption = None
+    origin: OriginOption = True
     overwrite: Overwrite = False
 
     def run(self) -> int:
@@ -53,11 +54,12 @@ class Photo3DCommand:
         source = posed(self.scene)
         scene = open_scene(source, self.downscale, self.reader, whole=True)
         found = photo3d(scene, self.size, self.views)
+        origin, place = told_origin(scene.frame, self.origin and not page)
         if page:
             write_page(self.output, found, self.title or Path(self.scene).stem)
         else:
             up = scene.frame.to_source.rotation[:, 2].numpy()
-            write_mesh(self.output, found.mesh.in_source(scene.frame), up, origin=scene.frame.origin)
+            write_mesh(self.output, found.mesh.in_source(scene.frame), up, origin=origin)
         trusted = f"{100 * found.trusted:.0f} % of the photographs' pixels"
         if found.flat:
             trusted = "none: the photographs were taken from one place, without parallax; this is a panorama instead"
@@ -66,6 +68,7 @@ class Photo3DCommand:
                 "trusted depth": trusted,
                 "triangles": f"{len(found.mesh.faces):,}",
                 "page" if page else "mesh": f"{self.output} ({self.output.stat().st_size / 1e6:.1f} MB)",
+                **place,
                 "next": typed("depth", source, "--output", "FOLDER"),
             }
         )

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from ..errors import LumigraphError
 from ..files import claim, claim_folder, exists, expanded, explained
+from ..files.ply import read_header
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
 from ..system.progress import counting
 from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
 from .checks import checked
-from .ply import read_header
 
 WRITERS = {
     ".compressed.ply": compressed_ply.write,

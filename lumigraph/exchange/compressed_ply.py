@@ -17,11 +17,11 @@ import math
 from pathlib import Path
 
 import numpy as np
-import plyfile
 import torch
 from jaxtyping import Float
 
 from ..errors import LumigraphError
+from ..files.ply import Header, columns, read_header, read_rows
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
 from .checks import check_room
@@ -38,7 +38,7 @@ from .codes import (
     with_largest,
     without_largest,
 )
-from .ply import Header, by_channel, by_coefficient, columns, read_header, read_rows, rest_names, save
+from .ply import by_channel, by_coefficient, is_antialiased, rest_names, save
 
 CHUNK = 256
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -73,7 +73,7 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
         )
     rest = rest_names(path, header.properties.get("sh", []))
     check_room(path, count, 1 + len(rest) // 3)
-    rows = read_rows(path)
+    rows = read_rows(path, ["chunk", "vertex", "sh"], header)
     chunk_of = np.arange(count) // CHUNK
     ends = {span: [columns(rows["chunk"], names)[chunk_of].astype(float) for names in RANGES[span]] for span in spans}
     position, rotation, scale, colour = columns(rows["vertex"], PACKED, np.uint32).T.astype(np.int64)
@@ -88,7 +88,7 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
         _between(_unpack(scale), *ends["scale"]),
         LOGITS[parts[:, 3]],
         harmonics,
-        header.antialiased,
+        is_antialiased(header),
     )
 
 
@@ -116,12 +116,11 @@ def write(path: Path, gaussians: Gaussians) -> None:
     vertices["packed_rotation"] = _smallest_three(array(gaussians.quaternions))
     vertices["packed_scale"] = _pack(shares["scale"])
     vertices["packed_color"] = rgba.view(">u4")[:, 0]
-    elements = [plyfile.PlyElement.describe(chunks, "chunk"), plyfile.PlyElement.describe(vertices, "vertex")]
+    elements = {"chunk": chunks, "vertex": vertices}
     if gaussians.degree:
         rest = by_channel(array(gaussians.harmonics[:, 1:]))
         codes = np.floor(256 * (rest / (2 * MAX_HARMONIC) + 0.5)).clip(0, 255).astype(np.uint8)
-        table = codes.view([(f"f_rest_{i}", "u1") for i in range(codes.shape[1])])[:, 0]
-        elements.append(plyfile.PlyElement.describe(table, "sh"))
+        elements["sh"] = codes.view([(f"f_rest_{i}", "u1") for i in range(codes.shape[1])])[:, 0]
     save(path, elements, gaussians.antialiased)
 
 

@@ -108,6 +108,7 @@ def files_of(path: Path, texture: bool) -> list[Path]:
     return [path, *(path.with_name(path.stem + end) for end in further)]
 
 
+WITH_ORIGIN = ".ply", ".glb"  # endings of files that hold the frame's origin on Earth
 Parts = dict[str, bytes]  # contents of files, by what follows the name without its ending; "" for the file itself
 MATERIAL, PICTURE, NORMALS = ".mtl", ".png", "-normals.png"
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import plyfile
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -16,7 +15,7 @@ from ..camera.crop import Crop
 from ..datasets.scene import Frame, GeographicOrigin
 from ..depth_maps import DepthMap, SurfacePoints, Tolerance, render_depth_maps
 from ..errors import LumigraphError
-from ..files import replacing
+from ..files.ply import write_rows
 from ..method import Method
 from ..system.progress import counting, track
 from ..system.work import at_work
@@ -134,7 +133,6 @@ def write_points(path: Path, points: PointCloud, origin: GeographicOrigin | None
     values = np.concatenate([points.positions, points.normals, points.colours], -1)
     for name, column in zip((*floats, *bytes_), values.T, strict=True):
         rows[name] = column
-    with replacing(path, "points") as partial, open(partial, "wb") as file:
-        comments = ["written by Lumigraph", *([] if origin is None else [origin.sentence])]
-        elements = [plyfile.PlyElement.describe(rows, "vertex")]
-        plyfile.PlyData(elements, byte_order="<", comments=comments).write(file)
+    write_rows(
+        path, "points", {"vertex": rows}, ["written by Lumigraph", *([] if origin is None else [origin.sentence])]
+    )

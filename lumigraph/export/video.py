@@ -1,9 +1,10 @@
-"""Films, with the format of their ending: H.264 in MP4, which plays everywhere; GIF and WebP, moving pictures."""
+"""Films, with the format of their ending: H.264 in MP4, which plays everywhere, where PyAV has it; GIF and WebP."""
 
 from __future__ import annotations
 
 import contextlib
 import tempfile
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from fractions import Fraction
@@ -19,11 +20,15 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 from torch import Tensor
 
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import Kind, replacing
 from ..system.progress import counting, track
 
-CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
+ENCODERS: dict[str, tuple[str, dict[str, str]]] = {  # of an .mp4; the first that PyAV has is used
+    "libx264": ("H.264", {"crf": "17", "preset": "slow"}),  # constant rate factor: 0 is lossless, 18 looks it
+    "libvpx-vp9": ("VP9", {"crf": "18", "b": "0", "cpu-used": "4", "row-mt": "1"}),
+    "mpeg4": ("MPEG-4", {"flags": "+qscale", "global_quality": "236"}),  # FFmpeg's own; twice its finest step
+}
 WEBP_QUALITY = 85  # of 100
 GIF_COLOURS = 255  # of a GIF; its 256th means "as before"
 PALETTE_SAMPLES = 400_000  # pixels of all frames together that choose a GIF's colours
@@ -116,12 +121,21 @@ class Mp4(Video):
     options: ClassVar[dict[str, str]] = {"movflags": "+faststart"}  # a browser can begin before it has all
 
     def padded(self, pixels: np.ndarray) -> np.ndarray:
-        """An odd last row or column is repeated, because H.264 halves the colours' size."""
+        """An odd last row or column is repeated, because the encoders halve the colours' size."""
         height, width = pixels.shape[:2]
         return np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
     def begin(self) -> None:
-        self.codec = self.stream("libx264", "yuv420p", {"crf": str(CRF), "preset": "slow"})
+        name = next(filter(has_encoder, ENCODERS), "mpeg4")
+        coding, options = ENCODERS[name]
+        if name != "libx264":
+            warnings.warn(
+                f"PyAV has no H.264 here, so {self.path} holds {coding}, which fewer players show; for H.264 install "
+                "PyAV's own wheel",
+                LumigraphWarning,
+                stacklevel=2,
+            )
+        self.codec = self.stream(name, "yuv420p", options)
         context = self.codec.codec_context
         context.color_range, context.colorspace = ColorRange.MPEG, Colorspace.ITU709
         context.color_primaries, context.color_trc = 1, 1  # BT.709, both
@@ -180,6 +194,14 @@ class Gif(Video):
             picture.pts, picture.time_base = round(100 * i / self.fps), Fraction(1, 100)
             self.container.mux(self.codec.encode(picture))
         super().flush()
+
+
+def has_encoder(name: str) -> bool:
+    try:
+        av.Codec(name, "w")
+    except ValueError:  # PyAV's UnknownCodecError is one
+        return False
+    return True
 
 
 KINDS: dict[str, type[Video]] = {".mp4": Mp4, ".gif": Gif, ".webp": WebP}

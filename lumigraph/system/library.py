@@ -1,8 +1,17 @@
-"""pycolmap, loaded so that SIGTERM stays ours: its logging library would answer by a stack of C++ and exit code -15."""
+"""pycolmap, loaded after Pillow, without log files, and so that SIGTERM stays ours.
+
+- Once pycolmap is loaded first, the first PNG that Pillow saves ends the process by a double free.
+- Its logging library answers SIGTERM by a stack of C++ and exit code -15.
+- It writes the names of all photographs to files in the system's temporary folder, which other users may read.
+"""
+
+import PIL.Image  # noqa: F401  # before pycolmap
 
 from .signals import untouched
 
 with untouched():
     import pycolmap
+
+pycolmap.logging.logtostderr = True
 
 __all__ = ["pycolmap"]

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plyfile
 from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import claim as claim_file
 from ...files import claim_folder, read_json, refuse_links, remove, replacing, replacing_folder, write_json
 from ...files.marks import is_ours
+from ...files.ply import write_rows
 from ...system.library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
@@ -171,5 +171,4 @@ def write_points(path: Path, model: pycolmap.Reconstruction) -> None:
     points = list(model.points3D.values())
     kinds = [(k, "f4") for k in "xyz"] + [(k, "u1") for k in ("red", "green", "blue")] + [("sightings", "i4")]
     rows = np.array([(*p.xyz, *p.color, p.track.length()) for p in points], kinds)
-    with replacing(path, "capture") as partial:
-        plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(partial)
+    write_rows(path, "capture", {"vertex": rows})

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+pycolmap.logging.logtostderr = True  # and no files in the system's temporary folder, with names of photographs
 COUNTER = Path(__file__).with_name("counter.py")
 SAMPLED_VIEWS = 2  # photographs that decide whether features are looked for without the octave of twice their size
 BLOCK_VIEWS = 16  # photographs whose features are written to the database together
@@ -70,7 +71,7 @@ def add_coarse(job: dict[str, Any], names: list[str]) -> int:
     """Add the features of the photographs that have enough without the octave of twice their size; their number."""
     if not names:
         return 0
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory(dir=os.path.dirname(job["database"])) as place:
         aside = os.path.join(place, "coarse.db")
         extract(aside, job, names, first_octave=0)
         added = 0
@@ -309,7 +310,7 @@ def triangulated(
             model.frame(number).rig_from_world = part.frame(number).rig_from_world
     for number in {*joined.reg_frame_ids(), *other.reg_frame_ids()}:
         model.register_frame(number)
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory(dir=os.path.dirname(job["database"])) as place:
         model = pycolmap.triangulate_points(
             model, job["database"], job["images"], place, options=incremental_options(job), refine_intrinsics=True
         )
