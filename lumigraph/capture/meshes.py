@@ -17,6 +17,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import natural
+from ..files.reading import reader
 from ..system.memory import ask_for, free_memory
 from ..system.progress import track
 
@@ -62,18 +63,15 @@ def read_shape(path: Path, name: str) -> Shape:
     return normalised(name, made, None if len(made.faces) else normals_of(path), up)
 
 
+@reader("cannot be read as a mesh", "export it once more")
 def read_mesh(path: Path) -> Mesh:
     """All triangles of a file, or all its points, in its own frame. Raises LumigraphError if that is nothing."""
     import trimesh  # which takes a while
 
     if path.stat().st_size > free_memory():
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
-    try:
-        loaded: Any = trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
-        parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
-    except Exception as error:  # readers of many formats fail in many ways
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise LumigraphError(f"{path} cannot be read as a mesh ({reason}); export it once more") from error
+    loaded: Any = trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
+    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
     if not meshes and not clouds:

@@ -236,7 +236,7 @@ def array_of(shape: tuple[int, ...], dtype: np.dtype, data: Any, order: str = "C
     if len(shape) > MAX_AXES or not all(type(side) is int and 0 <= side <= MAX_VALUES for side in shape):
         raise ValueError(f"it holds an array of shape {str(shape)[:50]}")
     count = math.prod(shape)
-    if dtype == object:
+    if dtype.hasobject:
         if not isinstance(data, list) or len(shape) > 1 or len(data) != count:
             raise ValueError("it holds an array of references with other items than its shape says")
         return data if shape else data[0]
