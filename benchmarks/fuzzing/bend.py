@@ -18,7 +18,7 @@ from typing import Any
 
 import zstandard
 
-from . import nasty
+from . import hostile, nasty
 
 EXTREMES = [b"\xff" * 8, b"\0" * 8, b"\xff" * 3 + b"\x7f" + b"\0" * 4, struct.pack("<d", float("nan"))]
 EXTREMES += [struct.pack("<Q", n) for n in (2**31, 2**32, 10**9, 10**12, 2**62, 2**63)]
@@ -178,6 +178,8 @@ def npy(data: bytes, chance: random.Random) -> bytes:
     """An array of other numbers, of another shape or kind than there is, or that promises what is not there."""
     import numpy as np
 
+    if b"|O" in data[:128]:
+        return hostile.pickled(data, chance)
     way = chance.randrange(4)
     if way == 0:
         return words(data[:128], chance).ljust(128) + data[128:]
@@ -369,7 +371,9 @@ WAYS: dict[str, tuple[Bend, ...]] = {
     ".off": (words,),
     ".png": (png,),
     ".ply": (ply,),
-    ".npy": (npy,),
+    ".npy": (npy, npy),
+    ".las": (hostile.lidar, hostile.lidar),
+    ".laz": (hostile.lidar, hostile.lidar),
     ".safetensors": (safetensors, numbers),
     ".packed": (packed, packed),
     ".spz": (older, stream, stream, bomb),

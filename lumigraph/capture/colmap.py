@@ -14,7 +14,7 @@ from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
 from ..files import exists, read_bytes, read_text
 from ..files.names import natural
-from ..files.reading import reader, reading
+from ..files.reading import reading, reads
 from ..system.library import pycolmap
 from ..system.memory import free_memory
 from .capture import Capture, Shot
@@ -69,7 +69,7 @@ def read(folder: Path) -> Capture:
     return Capture(str(folder), shots, missing=missing, **vars(read_points(place, model)))
 
 
-@reader("holds no readable COLMAP model", "make or copy it again")
+@reads("holds no readable COLMAP model", "make or copy it again")
 def read_model(place: Path) -> pycolmap.Reconstruction:
     """Raises LumigraphError for what is no whole model."""
     if (place / "images.bin").is_file():

@@ -17,7 +17,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import natural
-from ..files.reading import reader
+from ..files.reading import reads
 from ..system.memory import ask_for, free_memory
 from ..system.progress import track
 
@@ -63,7 +63,7 @@ def read_shape(path: Path, name: str) -> Shape:
     return normalised(name, made, None if len(made.faces) else normals_of(path), up)
 
 
-@reader("cannot be read as a mesh", "export it once more")
+@reads("cannot be read as a mesh", "export it once more")
 def read_mesh(path: Path) -> Mesh:
     """All triangles of a file, or all its points, in its own frame. Raises LumigraphError if that is nothing."""
     import trimesh  # which takes a while

@@ -15,13 +15,13 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.lib import format as npy
 
 from ..files import read_bytes
-from ..files.reading import reader
+from ..files.reading import reads
 
 MAX_VALUES = 1 << 19  # numbers and texts of a file, each counted wherever it is referred to
 MAX_OPCODES = 4 * MAX_VALUES
@@ -43,7 +43,7 @@ DTYPE = re.compile(r"b1|[iu][1248]|f[248]|[SU][1-9]\d{0,3}")
 OBJECTS = ("O", "O4", "O8")  # names of the type of references
 
 
-@reader("cannot be read as arrays")
+@reads("cannot be read as arrays")
 def load_pickled(path: Path) -> Any:
     """The dictionary of arrays, numbers and lists in a pickled .npy file. Raises LumigraphError for others."""
     file = io.BytesIO(read_bytes(path))
@@ -86,7 +86,7 @@ def opcodes(file: io.BytesIO) -> Iterator[tuple[str, Any]]:
             raise ValueError("it ends early, or is no pickle")
         if opcode.name == "STRING":
             quoted = pickletools.read_stringnl(file, decode=False)
-            yield opcode.name, codecs.escape_decode(quoted)[0].decode("latin-1")  # type: ignore[attr-defined]
+            yield opcode.name, codecs.escape_decode(quoted)[0].decode("latin-1")
         else:
             yield opcode.name, opcode.arg.reader(file) if opcode.arg else None
     raise ValueError(f"it has more than {MAX_OPCODES:,} opcodes")
@@ -154,11 +154,12 @@ def described(program: Iterable[tuple[str, Any]]) -> Any:
 
 def extend(target: Any, kind: type, items: Sequence[Any]) -> None:
     """Append items to a list, or put pairs of them into a dictionary."""
-    if type(target) is not kind:
+    if not isinstance(target, kind):
         raise ValueError(f"it adds items to something else than a {kind.__name__}")
-    if kind is list:
-        target += items
+    if isinstance(target, list):
+        target.extend(items)
         return
+    assert isinstance(target, dict)
     for key, value in zip(items[::2], items[1::2], strict=True):
         if not (isinstance(key, str) or (isinstance(key, int) and abs(key) < MAX_KEY)):
             raise ValueError(f"a key is a {type(key).__name__}")
@@ -229,7 +230,7 @@ def dtype_of(code: str, order: str) -> np.dtype:
     return np.dtype(order + code)
 
 
-def array_of(shape: tuple[int, ...], dtype: np.dtype, data: Any, order: str = "C") -> Any:
+def array_of(shape: tuple[int, ...], dtype: np.dtype, data: Any, order: Literal["C", "F"] = "C") -> Any:
     """Array of bytes; of references the only item, or a list of items."""
     if not (isinstance(shape, tuple) and isinstance(dtype, np.dtype) and order in ("C", "F")):
         raise ValueError("it holds an array whose shape or type is none")

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from ..errors import LumigraphError
 from ..files import read_bytes
-from ..files.reading import reader
+from ..files.reading import reads
 from ..system.memory import free_memory
 
 POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera positions belong to one capture
@@ -46,7 +46,7 @@ def read_ply(path: Path) -> SparsePoints:
     return SparsePoints(positions, colours, sightings)
 
 
-@reader("is truncated", "restore or remove it")
+@reads("is truncated", "restore or remove it")
 def read_points3d(path: Path) -> SparsePoints:
     """COLMAP's points3D.bin by itself: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
     data = read_bytes(path, free_memory())

@@ -23,7 +23,7 @@ from ..camera import Camera
 from ..camera.lens import Lens, Pinhole
 from ..depth_maps import back_project
 from ..errors import LumigraphError
-from ..files.reading import reader
+from ..files.reading import reads
 from ..geometry import evenly
 from ..system.memory import ask_for, free_memory
 from ..system.signals import start
@@ -71,7 +71,7 @@ def with_surveyed(capture: Capture, path: Path) -> Capture:
     return replace(capture, shots=[with_depth(shot) for shot in capture.shots])
 
 
-@reader("cannot be read as a cloud", "export it once more")
+@reads("cannot be read as a cloud", "export it once more")
 def read_surveyed(path: Path) -> Surveyed:
     """Points or triangles of a file. Raises LumigraphError, with what to install where a library is missing."""
     suffix = path.suffix.lower()

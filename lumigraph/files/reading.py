@@ -14,13 +14,12 @@ from .atomic import refusal
 RUST_PANIC = "PanicException"  # of libraries in Rust; no Exception, and its class cannot be imported
 MAX_REASON = 300  # characters of a library's message
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 @contextmanager
-def reading(
-    path: Path | str, fault: str = "cannot be read", remedy: str = "restore it from a copy"
-) -> Iterator[None]:
+def reading(path: Path | str, fault: str = "cannot be read", remedy: str = "restore it from a copy") -> Iterator[None]:
     """Context in which any exception becomes a LumigraphError: "PATH FAULT (reason); REMEDY".
 
     A LumigraphError passes as it is, and so do warnings and Ctrl-C. The exception is the error's cause, which
@@ -36,16 +35,16 @@ def reading(
         raise LumigraphError(sentence(path, error, fault, remedy)) from error
 
 
-def reader(
+def reads(
     fault: str = "cannot be read", remedy: str = "restore it from a copy"
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of a function whose first argument is the path that it reads: its body is inside `reading`."""
+    """Decorator of a function whose first path among its arguments is what it reads: its body is inside `reading`."""
 
     def behind_door(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)
         def read(*args: P.args, **options: P.kwargs) -> R:
-            path = args[0] if args else next(iter(options.values()))
-            with reading(str(path), fault, remedy):
+            path = next(x for x in (*args, *options.values()) if isinstance(x, Path | str))
+            with reading(path, fault, remedy):
                 return function(*args, **options)
 
         return read
