@@ -33,6 +33,9 @@ Bend = Callable[[bytes, random.Random], bytes]
 def bend(path: Path, chance: random.Random) -> str:
     """Change a file in place. Gives the name of what was done to it."""
     data = path.read_bytes()
+    if b"|O" in data[: hostile.HEADER]:
+        path.write_bytes(hostile.pickled(data, chance))
+        return "pickled"
     ways = [*WAYS.get(path.suffix.lower(), ()), raw]
     way = chance.choices(ways, [3.0] * (len(ways) - 1) + [1.0])[0]
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
@@ -178,8 +181,6 @@ def npy(data: bytes, chance: random.Random) -> bytes:
     """An array of other numbers, of another shape or kind than there is, or that promises what is not there."""
     import numpy as np
 
-    if b"|O" in data[:128]:
-        return hostile.pickled(data, chance)
     way = chance.randrange(4)
     if way == 0:
         return words(data[:128], chance).ljust(128) + data[128:]

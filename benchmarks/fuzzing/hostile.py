@@ -30,7 +30,10 @@ class Described:
 
 
 def pickled(data: bytes, chance: random.Random) -> bytes:
-    """A pickled .npy file with opcodes, types, shapes or values that are others, or with a program that multiplies."""
+    """A pickled .npy file with opcodes, types, shapes or values that are others, or with a program that multiplies.
+
+    data: a file as it should be, for it is unpickled
+    """
     head, body = data[:HEADER], data[HEADER:]
     way = chance.choice((swapped, swapped, other_value, other_value, other_state, other_state, program, program))
     return head + way(body, chance)
@@ -60,7 +63,9 @@ def other_value(body: bytes, chance: random.Random) -> bytes:
         place[key].flat[chance.randrange(place[key].size)] = chance.choice((np.nan, np.inf, 3e307, -1e30, 0.0))
     else:
         place[key] = chance.choice((*WRONG, bomb(chance), described_array(chance)))
-    return pickle.dumps(whole if key != "whole" else np.array(place[key], object), chance.randrange(6))
+    made = np.empty((), object)
+    made[()] = place["whole"] if key == "whole" else whole[()]
+    return pickle.dumps(made, chance.randrange(6))
 
 
 def other_state(body: bytes, chance: random.Random) -> bytes:
@@ -144,6 +149,6 @@ def lidar(data: bytes, chance: random.Random) -> bytes:
             new: Any = chance.choice((float("nan"), 1e300, 0.0)) if kind == "<d" else chance.choice(SIZES)
             changed[at : at + wide] = struct.pack("<d", new) if kind == "<d" else struct.pack("<Q", new)[:wide]
     if chance.random() < 0.3:
-        at = chance.randrange(points, len(data))
+        at = chance.randrange(min(points, len(data) - 1), len(data))
         changed[at : at + chance.choice((1, 8, 200))] = chance.randbytes(chance.choice((1, 8, 200)))
     return bytes(changed)

@@ -31,7 +31,9 @@ class Limits:
 
 @dataclass(frozen=True)
 class Ended:
-    """code: exit code, or minus the signal that ended it;  why: we ended it, if so;  memory: bytes it took, children included
+    """code: exit code, or minus the signal that ended it;  why: we ended it, if so
+
+    memory: bytes that it and its children took, at most, beyond those of this process
 
     left: whether processes that it started were still there a moment later
     """

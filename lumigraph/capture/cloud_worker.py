@@ -8,12 +8,14 @@ once the result is whole; otherwise the last line of standard error has the reas
 from __future__ import annotations
 
 import contextlib
+import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 
 PIECE = 1_000_000  # points that are unpacked together
+LAS_HEADER_BYTES, RECORD_BYTES = 375, 54  # of version 1.4; of a record's own header
 POINT_BYTES = 3 * 24  # of memory for each point: its coordinates, and copies of them
 
 
@@ -39,11 +41,24 @@ def limit(memory: int, seconds: int) -> None:
 def read_las(path: Path, memory: int) -> np.ndarray:
     import laspy
 
+    check_records(path)
     with laspy.open(path) as file:
         if file.header.point_count * POINT_BYTES > memory:
             raise ValueError(f"it declares {file.header.point_count:,} points, more than its size can hold")
         pieces = [np.stack([piece.x, piece.y, piece.z], -1) for piece in file.chunk_iterator(PIECE)]
     return np.concatenate([np.zeros((0, 3)), *pieces])
+
+
+def check_records(path: Path) -> None:
+    """Raise ValueError for more records of variable length than the file has room for: the library would walk through
+    all of them."""
+    with open(path, "rb") as file:
+        head = file.read(LAS_HEADER_BYTES).ljust(LAS_HEADER_BYTES, b"\0")
+        size = file.seek(0, 2)
+    (records,), version = struct.unpack_from("<I", head, 100), head[25]
+    further = struct.unpack_from("<I", head, 243)[0] if version >= 4 else 0
+    if RECORD_BYTES * (records + further) > size:
+        raise ValueError(f"it declares {records + further:,} records, more than its size can hold")
 
 
 def read_e57(path: Path) -> np.ndarray:

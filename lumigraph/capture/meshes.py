@@ -57,6 +57,7 @@ def read_shapes(path: Path, partial: bool = False) -> Shapes:
     return shapes
 
 
+@reads("cannot be read as a shape", "export it once more")
 def read_shape(path: Path, name: str) -> Shape:
     """All that one file holds, as one shape. Raises LumigraphError if that is nothing."""
     made, up = read_mesh(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP

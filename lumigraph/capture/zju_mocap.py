@@ -69,7 +69,7 @@ def read(folder: Path) -> Capture:
             pose = np.concatenate([turns[camera].T, -turns[camera].T @ shifts[camera][:, None]], 1)
             k = matrices[camera]
             values = (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), bends[camera]
-            lens = OpenCV(*(torch.tensor([x], dtype=torch.float32) for x in values))
+            lens = OpenCV(*(torch.from_numpy(np.array([x])).float() for x in values))
             with readable(folder / name), Image.open(folder / name) as image:
                 size = image.size
             mask = next(
