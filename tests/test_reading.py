@@ -17,7 +17,9 @@ import torch
 from budgets import budget
 from fuzzing import hostile
 from PIL import Image, PngImagePlugin
+from test_bodies import write_zju
 from test_depth_in import wall_points, write_cloud
+from test_neural_scene_graph import write_kitti
 
 import lumigraph
 from lumigraph import exchange
@@ -27,7 +29,6 @@ from lumigraph.capture.surveyed import read_surveyed
 from lumigraph.commands.cli import main
 from lumigraph.components.guidance.clip_files import read_tensors
 from lumigraph.errors import LumigraphError
-from lumigraph.exchange.bones import read_bones
 from lumigraph.files.reading import reading
 from lumigraph.selection.strokes import read_strokes
 
@@ -279,6 +280,69 @@ def test_hostile_pickles(case, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["a.npy"]
 
 
+# Numbers that cannot be
+
+
+def with_zju(folder: Path, file: str, value: object) -> None:
+    """ZJU-MoCap's layout, one of whose files holds something else."""
+    write_zju(folder)
+    if file.endswith(".png"):
+        Image.new("L", (3, 3)).save(folder / file)
+    else:
+        np.save(folder / file, np.array(value, object) if isinstance(value, dict) else value)
+
+
+POSE = {"poses": np.zeros((1, 72)), "Rh": np.zeros((1, 3)), "Th": np.zeros((1, 3))}
+
+
+@pytest.mark.parametrize(
+    ("file", "value", "sentence"),
+    [
+        ("lbs/joints.npy", np.full((24, 3), np.nan), "24 joints of 3 coordinates"),
+        ("lbs/joints.npy", np.zeros((24, 3)), "all in one place"),
+        ("lbs/joints.npy", np.zeros((9, 3)), "24 joints of 3 coordinates"),
+        ("lbs/parents.npy", np.full(24, -7), "a joint comes before its parent"),
+        ("lbs/parents.npy", np.arange(24), "a joint comes before its parent"),
+        ("lbs/parents.npy", np.full(24, 99), "a joint comes before its parent"),
+        ("new_params/0.npy", POSE | {"Th": np.full((1, 3), np.inf)}, "Th has numbers that are not finite"),
+        ("new_params/0.npy", POSE | {"poses": np.full((1, 72), 3e307)}, "poses has numbers .* beyond 1e"),
+        ("new_params/0.npy", POSE | {"poses": np.zeros((1, 71))}, "does not hold a pose"),
+        ("annots.npy", {"cams": {"K": 1}, "ims": []}, "does not hold cameras"),
+        ("annots.npy", {"cams": dict.fromkeys("KDRT", [[]]), "ims": [3]}, "does not hold cameras"),
+        ("mask/Camera_B1/000000.png", None, "its size is not that of 000000.jpg"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_bodies_that_cannot_be(file, value, sentence, tmp_path):
+    with_zju(tmp_path / "zju", file, value)
+    with pytest.raises(LumigraphError, match=sentence):
+        open_scene(tmp_path / "zju")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "sentence"),
+    [
+        ("label_02/0006.txt", "1.6 10.0", "1.6 3e307", "too large"),
+        ("calib/0006.txt", "-3.0", "3e307", "too large"),
+        ("calib/0006.txt", "40 -3.0", "40", "no P2"),
+        ("calib/0006.txt", "60 0 40", "0 0 0", "no projection"),
+        ("calib/0006.txt", "Tr_imu_velo 1", "Tr_imu_velo 0", "a calibration of rotations"),
+        ("oxts/0006.txt", "8.0 100.0 0 0 1.5707963267948966" + " 0" * 24, "8.0", "6 columns"),
+        ("oxts/0006.txt", "0.000000000000 8.0", "90 8.0", "latitude"),
+        ("oxts/0006.txt", "8.0 100.0", "8.0 1e6", "altitude"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_drives_that_cannot_be_leave_no_run(file, old, new, sentence, tmp_path, capsys):
+    write_kitti(tmp_path / "drive", 2)
+    path = tmp_path / "drive" / file
+    assert old in (text := path.read_text())
+    path.write_text(text.replace(old, new))
+    assert main(["train", "gaussian-splatting", str(tmp_path / "drive"), "--output", str(tmp_path / "run")]) == 2
+    told = capsys.readouterr().err
+    assert sentence in told and told.count("lumigraph:") == 1 and not (tmp_path / "run").exists()
+
+
 # Others
 
 
@@ -311,9 +375,3 @@ def test_weights_that_are_not_finite(tmp_path):
     save_file({"a": torch.tensor([1.0, float("nan")])}, tmp_path / "clip.safetensors")
     with pytest.raises(LumigraphError, match="a has numbers that are not finite"):
         read_tensors(tmp_path / "clip.safetensors")
-
-
-def test_bones_of_no_size(tmp_path):
-    (tmp_path / "bones.json").write_text('{"format": "lumigraph bones 1", "rest": 0}')
-    with pytest.raises(LumigraphError, match=r"bones\.json"):
-        read_bones(tmp_path / "bones.json")

@@ -57,7 +57,8 @@ def read(folder: Path) -> Capture:
     projection = matrices["P2"]
     fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     lens = Pinhole(torch.tensor([[fx, fy]]), torch.tensor([[cx + 0.5, cy + 0.5]]))
-    aside = -np.linalg.solve(projection[:, :3], projection[:, 3])  # camera 2 in the frame of camera 0
+    with reading(root / CALIBRATION / f"{name}.txt", "has a P2 that is no projection", "restore the file"):
+        aside = -np.linalg.solve(projection[:, :3], projection[:, 3])  # camera 2 in the frame of camera 0
     shots = []
     for path in pictures:
         frame = frame_number(path)
@@ -124,6 +125,8 @@ def read_drive(path: Path, matrices: dict[str, np.ndarray]) -> tuple[list[np.nda
                 f"{path} gives the path of the inertial unit, and the calibration lacks {name}; restore it"
             )
     camera_from_imu = whole(matrices["R_rect"]) @ whole(matrices["Tr_velo_cam"]) @ whole(matrices["Tr_imu_velo"])
+    with reading(path, "needs a calibration of rotations and places", "restore that file"):
+        imu_from_camera = np.linalg.inv(camera_from_imu)
     rows = [[float(x) for x in row[:OXTS_COLUMNS]] for row in read_rows(path, OXTS_COLUMNS)]
     if not rows or not all(abs(row[0]) < MAX_LATITUDE for row in rows):
         raise LumigraphError(f"{path} has no line, or a latitude beyond {MAX_LATITUDE:g} degrees; restore the file")
@@ -136,7 +139,7 @@ def read_drive(path: Path, matrices: dict[str, np.ndarray]) -> tuple[list[np.nda
         pose = np.eye(4)
         pose[:3, :3] = about(2, yaw) @ about(1, pitch) @ about(0, roll)
         pose[:3, 3] = place - first
-        poses.append(pose @ np.linalg.inv(camera_from_imu))
+        poses.append(pose @ imu_from_camera)
     return poses, GeographicOrigin(*rows[0][:3])
 
 

@@ -55,18 +55,18 @@ def load_pickled(path: Path) -> Any:
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedFunction:
     """A function or class that a pickle names."""
 
     name: str
 
     @staticmethod
-    def of(module: str, name: str) -> Named:
+    def of(module: str, name: str) -> NamedFunction:
         """Raises ValueError for a name that no array needs."""
         found = f"{module}.{name}".replace("numpy.core.", "numpy._core.").replace("__builtin__.", "builtins.")
         if found not in NAMED:
             raise ValueError(f"it names {module}.{name}, which is no array")
-        return Named(found)
+        return NamedFunction(found)
 
 
 @dataclass(eq=False)
@@ -131,13 +131,13 @@ def described(program: Iterable[tuple[str, Any]]) -> Any:
             stack.append([] if name == "EMPTY_LIST" else {})
         elif name == "GLOBAL":
             module, _, attribute = argument.partition(" ")
-            stack.append(Named.of(module, attribute))
+            stack.append(NamedFunction.of(module, attribute))
         elif name == "STACK_GLOBAL":
             attribute, module = stack.pop(), stack.pop()
-            stack.append(Named.of(str(module), str(attribute)))
+            stack.append(NamedFunction.of(str(module), str(attribute)))
         elif name == "REDUCE":
             arguments, called = stack.pop(), stack.pop()
-            if not (isinstance(called, Named) and called.name in CALLED and isinstance(arguments, tuple)):
+            if not (isinstance(called, NamedFunction) and called.name in CALLED and isinstance(arguments, tuple)):
                 raise ValueError("it calls something else than NumPy's functions of arrays")
             stack.append(Call(called.name, arguments))
         elif name == "BUILD":
@@ -176,7 +176,7 @@ class Values:
         self.known = dict[int, tuple[Any, int] | None]()  # by identity; None while its items are looked at
 
     def of(self, value: Any, depth: int = 0) -> tuple[Any, int]:
-        if isinstance(value, Named):
+        if isinstance(value, NamedFunction):
             raise ValueError(f"it holds {value.name} itself")
         if not isinstance(value, list | tuple | dict | Call):
             return value, 1

@@ -30,6 +30,7 @@ from .pictures import readable, stat
 
 EXPECTED_FILES = "annots.npy and new_params/ or params/ (ZJU-MoCap)"
 MILLIMETRES = 1000.0
+MAX_NUMBER = 1e9  # in any file, whatever its unit
 TEST_INTERVAL = 30  # frames between those of cameras that test (Peng 2021)
 PARAMS = "new_params", "params"
 MASKS = "mask_cihp", "mask"
@@ -99,8 +100,8 @@ def text(name: Any) -> str:
 def finite(values: Any, name: str) -> np.ndarray:
     """Numbers in double precision. Raises ValueError for others."""
     found = np.array(values, float)
-    if not np.isfinite(found).all():
-        raise ValueError(f"{name} has numbers that are not finite")
+    if not (np.abs(found) <= MAX_NUMBER).all():
+        raise ValueError(f"{name} has numbers that are not finite or beyond {MAX_NUMBER:g}")
     return found
 
 

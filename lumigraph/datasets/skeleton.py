@@ -72,7 +72,8 @@ class Skeleton:
         return len(self.names)
 
     def check(self) -> None:
-        """Raises LumigraphError for a skeleton without bones, poses of other bones, and times that go back."""
+        """Raises LumigraphError for a skeleton without bones, poses of other bones, joints all in one
+        place, and times that go back."""
         count = len(self.names)
         if not count or len(self.parents) != count:
             raise LumigraphError(f"A skeleton has {count} names and {len(self.parents)} parents; give one of each bone")
@@ -83,6 +84,8 @@ class Skeleton:
                 raise LumigraphError(
                     f"Bone {self.names[number]} comes before its parent; list the bones from the root on"
                 )
+        if count > 1 and len(set(self.rest.positions)) == 1:
+            raise LumigraphError("The joints of a skeleton at rest are all in one place; give the pose of a body")
         if not self.times or len(self.times) != len(self.poses):
             raise LumigraphError(
                 f"A skeleton has {len(self.times)} times and {len(self.poses)} poses; give as many of each"
