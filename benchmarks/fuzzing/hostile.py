@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+MARK = "ran"  # file that a pickle makes if it runs; the second program below counts its letters
 HEADER = 128  # bytes of a .npy file ahead of its pickle
 OPCODES = [opcode.code.encode("latin-1") for opcode in pickletools.opcodes]
 SIZES = (0, 1, 255, 65_535, 2**24, 2**31 - 1, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1)
@@ -102,8 +103,8 @@ def program(body: bytes, chance: random.Random) -> bytes:
     size = chance.choice(SIZES)
     return chance.choice(
         (
-            b"c" + chance.choice(NAMES) + b"\n(S'touch ran'\ntR.",
-            b"\x80\x04\x8c\x02os\x8c\x06system\x93\x8c\x09touch ran\x85R.",
+            b"c" + chance.choice(NAMES) + b"\n(S'touch %b'\ntR." % MARK.encode(),
+            b"\x80\x04\x8c\x02os\x8c\x06system\x93\x8c\x09touch %b\x85R." % MARK.encode(),
             b"]q\x00h\x00a.",
             b"]q\x00(h\x00h\x00h\x00e.",
             b"}q\x00X\x01\0\0\0ah\x00s.",
