@@ -131,7 +131,8 @@ def choose(shot: Shot, downscale: int | None) -> Chosen:
     size = smaller(own, wanted)
 
     def make() -> np.ndarray:
-        made = pixels if isinstance(pixels, np.ndarray) else pixels()
+        with reading(shot.name):
+            made = pixels if isinstance(pixels, np.ndarray) else pixels()
         return np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
 
     identity = shot.identity if shot.mask is None and shot.alpha is None else None

@@ -84,8 +84,6 @@ class Skeleton:
                 raise LumigraphError(
                     f"Bone {self.names[number]} comes before its parent; list the bones from the root on"
                 )
-        if count > 1 and len(set(self.rest.positions)) == 1:
-            raise LumigraphError("The joints of a skeleton at rest are all in one place; give the pose of a body")
         if not self.times or len(self.times) != len(self.poses):
             raise LumigraphError(
                 f"A skeleton has {len(self.times)} times and {len(self.poses)} poses; give as many of each"
@@ -100,6 +98,8 @@ class Skeleton:
                 )
             if not all(any(rotation) for rotation in pose.rotations):
                 raise LumigraphError(f"{what} has a rotation of four zeros; give a quaternion (w, x, y, z)")
+        if count > 1 and len(set(self.rest.positions)) == 1:
+            raise LumigraphError("The joints of a skeleton at rest are all in one place; give the pose of a body")
 
     def transformed(self, frame: Similarity) -> Skeleton:
         """The same skeleton in another frame."""
