@@ -5,7 +5,8 @@
 Small valid files of everything that is opened are made wrong, and given to the command that opens them; options of all
 commands are given values that nobody expects. Each command runs in a process of its own with limits of time and memory.
 Counted as bad: a traceback, a signal, more time or memory than the limits, a fault that is not told in one sentence,
-an output that is half written, a file touched that is not ours, and a process left behind. Exit code 1 if there is any.
+an output that is half written, a file touched that is not ours, a folder that a refused training leaves, a pickle that
+ran, and a process left behind. Exit code 1 if there is any.
 
 An input is its class, its number and the seed; `--only CLASS` tries one class, `--number N` one input of it.
 """
@@ -44,6 +45,7 @@ class Options:
     control: bool = False  # try files as they should be, with every command, instead
     limit: float = 60.0  # seconds
     memory: float = 4.0  # GiB
+    seconds: float = 1e9  # after which no further input begins
     processes: int = 2
     keep: Path | None = None  # folder for what was bad: a home folder and a command each
     output: Path | None = None  # also write all that was found there, as JSON
@@ -75,6 +77,7 @@ def verdicts(options: Options, work: Path) -> Iterator[Verdict]:
     if options.processes == 1:
         yield from map(one, tasks)
         return
+    end = time.perf_counter() + options.seconds
     with ProcessPoolExecutor(options.processes, multiprocessing.get_context("fork")) as pool:
         for count, done in enumerate(as_completed([pool.submit(one, task) for task in tasks]), 1):
             verdict = done.result()
@@ -82,6 +85,9 @@ def verdicts(options: Options, work: Path) -> Iterator[Verdict]:
                 told = f"{verdict.kind} {verdict.number}: {verdict.outcome} {verdict.where}" if verdict.is_bad else ""
                 print(f"{count} of {len(tasks)} {told}"[:200], file=sys.stderr, flush=True)
             yield verdict
+            if time.perf_counter() > end:
+                pool.shutdown(cancel_futures=True)
+                return
 
 
 def numbers(kind: str, count: int, options: Options) -> Iterable[int]:

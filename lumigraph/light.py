@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import av
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -24,6 +23,7 @@ from . import files
 from .color.srgb import linear_from_srgb
 from .errors import LumigraphError
 from .files.ffmpeg import decode
+from .files.reading import reading
 from .kernels import spherical_harmonics
 
 SUFFIXES = (".hdr", ".exr", ".npy", ".png")
@@ -58,11 +58,8 @@ class EnvironmentLight:
             raise LumigraphError(f"{path} does not exist; name an environment map ({', '.join(SUFFIXES)})")
         if path.suffix.lower() not in SUFFIXES:
             raise LumigraphError(f"{path} is no environment map by its name; they end in {', '.join(SUFFIXES)}")
-        try:
-            values = _values(path)
-        except (ValueError, OSError, EOFError, StopIteration, av.FFmpegError) as error:
-            raise LumigraphError(f"{path} cannot be read as an environment map: {error}; export it again") from error
-        return EnvironmentLight.checked(values, str(path))
+        with reading(path, "cannot be read as an environment map", "export it again"):
+            return EnvironmentLight.checked(_values(path), str(path))
 
     @staticmethod
     def checked(values: np.ndarray, source: str) -> EnvironmentLight:

@@ -144,7 +144,7 @@ def test_damaged_files_are_refused(tmp_path):
     with pytest.raises(LumigraphError, match="cannot be read"):
         read_probes(tmp_path / "p")
     picture.unlink()
-    with pytest.raises(LumigraphError, match="cannot be read"):
+    with pytest.raises(LumigraphError, match="does not exist"):
         read_probes(tmp_path / "p")
     with pytest.raises(LumigraphError, match=r"holds no probes\.json"):
         read_probes(tmp_path)

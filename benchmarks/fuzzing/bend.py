@@ -18,7 +18,7 @@ from typing import Any
 
 import zstandard
 
-from . import nasty
+from . import hostile, nasty
 
 EXTREMES = [b"\xff" * 8, b"\0" * 8, b"\xff" * 3 + b"\x7f" + b"\0" * 4, struct.pack("<d", float("nan"))]
 EXTREMES += [struct.pack("<Q", n) for n in (2**31, 2**32, 10**9, 10**12, 2**62, 2**63)]
@@ -33,6 +33,9 @@ Bend = Callable[[bytes, random.Random], bytes]
 def bend(path: Path, chance: random.Random) -> str:
     """Change a file in place. Gives the name of what was done to it."""
     data = path.read_bytes()
+    if b"|O" in data[: hostile.HEADER]:
+        path.write_bytes(hostile.pickled(data, chance))
+        return "pickled"
     ways = [*WAYS.get(path.suffix.lower(), ()), raw]
     way = chance.choices(ways, [3.0] * (len(ways) - 1) + [1.0])[0]
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
@@ -369,7 +372,9 @@ WAYS: dict[str, tuple[Bend, ...]] = {
     ".off": (words,),
     ".png": (png,),
     ".ply": (ply,),
-    ".npy": (npy,),
+    ".npy": (npy, npy),
+    ".las": (hostile.lidar, hostile.lidar),
+    ".laz": (hostile.lidar, hostile.lidar),
     ".safetensors": (safetensors, numbers),
     ".packed": (packed, packed),
     ".spz": (older, stream, stream, bomb),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from . import flags
 from .bend import bend
+from .functions import FUNCTIONS
 
 TRAIN = "train gaussian-splatting given --steps 1 --output out/new --device cpu --initial-gaussians 100"
 SPLATS = "given/cloud"
@@ -81,6 +82,18 @@ KINDS: dict[str, Kind] = {
     "COLMAP binary": scene("colmap-binary", "sparse/0/*.bin"),
     "COLMAP text": scene("colmap-text", "sparse/0/*.txt"),
     "LLFF": scene("llff", "*.npy"),
+    "pickles": scene("zju", "annots.npy", "annots.npy", "new_params/*.npy"),
+    "ZJU-MoCap": scene("zju", "lbs/*.npy", "mask/*/*.png"),
+    "KITTI": scene("kitti", "calib/*", "label_02/*", "oxts/*"),
+    "Replica": scene("replica", "traj.txt", "cam_params.json", "results/depth*.png"),
+    "ScanNet": scene("scannet", "frames/*/*.txt", "frames/depth/*.png"),
+    "Polycam": scene("polycam", "keyframes/corrected_cameras/*.json", "keyframes/depth/*.png"),
+    "Nerfies": scene("nerfies", "*.json", "camera/*", "*.npy"),
+    "NR-NeRF": scene("nr-nerf", "*.json"),
+    "laz": Kind("lidar", ("cloud.laz",), (f"{TRAIN} --depth-from given/cloud.laz",)),
+    "las": Kind("lidar", ("cloud.las",), (f"{TRAIN} --depth-from given/cloud.las",), 0.5),
+    "e57": Kind("lidar", ("cloud.e57",), (f"{TRAIN} --depth-from given/cloud.e57",), 0.5),
+    **{f"{name} alone": Kind("alone", (f"{name}.*",), (f"read {name} {{file}}",), 1.5) for name in FUNCTIONS},
     "pictures of a scene": scene("blender", "all/*.png", share=0.5),
     "shapes": Kind("shapes", ("*",), ("info given",)),
     "pictures": Kind(
@@ -161,6 +174,7 @@ def controls(kind: str) -> list[list[str]]:
     if kind == "flags":
         return list(flags.COMMANDS.values())
     first = {"camera path": "given/keys.json", "pictures": "given/picture.png", "videos": "given/clip.mp4"}.get(kind)
+    first = f"given/{kind.removesuffix(' alone')}{FUNCTIONS[kind.removesuffix(' alone')]}" if "alone" in kind else first
     return [command.format(file=first).split() for command in dict.fromkeys(KINDS[kind].commands)]
 
 

@@ -48,6 +48,8 @@ def write_all(root: Path) -> None:
     with_layers(home(root, "layers") / "given", tiny)
     write_tum(home(root, "tum") / "given", tiny)
     write_seven_scenes(home(root, "seven-scenes") / "given", tiny)
+    write_other_layouts(root)
+    write_alone(home(root, "alone") / "given")
     write_shapes(home(root, "shapes") / "given")
     write_pictures(home(root, "pictures") / "given")
     write_photographs(home(root, "photographs") / "given")
@@ -115,6 +117,52 @@ def write_seven_scenes(folder: Path, tiny: object) -> None:
         write_png16(folder / f"frame-{i:06d}.depth.png", np.full((captures.HEIGHT, captures.WIDTH), 3000, np.uint16))
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
     np.savetxt(folder / "camera-intrinsics.txt", [[60, 0, 24], [0, 60, 18], [0, 0, 1]])
+
+
+def write_other_layouts(root: Path) -> None:
+    """Layouts whose writers are in the tests of their readers, and clouds of a LiDAR beside photographs."""
+    import test_bodies
+    import test_depth_in
+    import test_depth_readers
+    import test_neural_scene_graph
+
+    test_bodies.write_zju(given := home(root, "zju") / "given" / "x")
+    for path in given.iterdir():
+        path.rename(given.parent / path.name)
+    given.rmdir()
+    test_neural_scene_graph.write_kitti(home(root, "kitti") / "given")
+    shutil.rmtree(folder := home(root, "replica") / "given")
+    test_depth_readers.write_replica(folder)
+    test_depth_readers.write_scannet(home(root, "scannet") / "given")
+    test_depth_readers.write_polycam(home(root, "polycam") / "given")
+    test_depth_in.write_posed(folder := home(root, "lidar") / "given")
+    for suffix in ("laz", "las", "e57"):
+        test_depth_in.write_cloud(folder / f"cloud.{suffix}", test_depth_in.wall_points(3000))
+
+
+def write_alone(folder: Path) -> None:
+    """Files that are given to a reader's function."""
+    import bodies
+    import safetensors.torch
+    import test_neural_scene_graph
+    import torch
+
+    from lumigraph.capture.tracks import write_tracks
+    from lumigraph.composition.voxel_mask import VoxelMask
+    from lumigraph.exchange.bones import write_bones
+    from lumigraph.exchange.skinned_gltf import read_character
+
+    np.save(folder / "environment.npy", np.ones((8, 16, 3), np.float32))
+    strokes = np.zeros((24, 32, 3), np.uint8)
+    strokes[3:5], strokes[9:12] = (0, 255, 0), (255, 0, 0)
+    Image.fromarray(strokes).save(folder / "strokes.png")
+    bodies.write_bar(folder / "character.glb")
+    write_bones(folder / "bones.json", read_character(folder / "character.glb").clip(0))
+    write_tracks(folder / "tracks.json", (test_neural_scene_graph.drive(),))
+    safetensors.torch.save_file({"a": torch.rand(8, 8)}, folder / "weights.safetensors")
+    VoxelMask(torch.ones(3, 3, 3).byte(), torch.ones(3, 3, 3).byte(), (0.0, 0.0, 0.0), 0.1).write(
+        folder / "mask.safetensors"
+    )
 
 
 def write_shapes(folder: Path) -> None:

@@ -9,12 +9,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .folders import halfway, snapshot, touched
+from .hostile import MARK
 from .inputs import make
 from .warm import run
 from .watched import Ended, Limits, watch
 
 FINE = ("fine", "sentence", "usage", "stopped")
-BAD = ("no sentence", "traceback", "signal", "hang", "memory", "half-written", "foreign", "child left")
+BAD = (
+    "no sentence",
+    "traceback",
+    "signal",
+    "hang",
+    "memory",
+    "half-written",
+    "foreign",
+    "folder left",
+    "child left",
+    "code ran",
+)
 PATIENCE = 15.0  # seconds after which a command that was asked for much is told to end
 TELLTALES = ("Traceback (most recent call last)", "Exception ignored in", "terminate called", "Fatal Python error")
 FRAME = re.compile(r'File "[^"]*?(lumigraph/[^"]+)", line (\d+), in (\S+)')
@@ -65,6 +77,10 @@ def judged(kind: str, number: int, seed: int, templates: Path, work: Path, limit
             outcome, where = "foreign", foreign[0]
         elif half := halfway(work, mine, after):
             outcome, where = "half-written", half[0]
+        elif outcome == "sentence" and given.command[0] == "train" and (new := after.keys() - before.keys()):
+            outcome, where = "folder left", min(new)
+    if f"home/{MARK}" in after:
+        outcome, where = "code ran", given.bent
     return Verdict(kind, number, outcome, where, given.command, given.bent, ended.seconds, ended.memory)
 
 

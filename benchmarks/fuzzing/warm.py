@@ -43,14 +43,16 @@ def compiled(module: ModuleType) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """What `python -m lumigraph` does in a process of its own, and its exit code."""
+    """What `python -m lumigraph` does in a process of its own, and its exit code; or what a reader's function does."""
     import traceback
 
     from lumigraph.__main__ import main
 
+    from .functions import read
+
     sys.argv = ["lumigraph", *arguments]
     try:
-        return int(main() or 0)
+        return read(*arguments[1:]) if arguments[:1] == ["read"] else int(main() or 0)
     except SystemExit as leave:
         return leave.code if isinstance(leave.code, int) else int(leave.code is not None)
     except BaseException:

@@ -31,7 +31,9 @@ class Limits:
 
 @dataclass(frozen=True)
 class Ended:
-    """code: exit code, or minus the signal that ended it;  why: we ended it, if so;  memory: bytes it held at most
+    """code: exit code, or minus the signal that ended it;  why: we ended it, if so
+
+    memory: bytes that it and its children took, at most, beyond those of this process
 
     left: whether processes that it started were still there a moment later
     """
@@ -51,6 +53,7 @@ def watch(command: Callable[[], int], folder: Path, notes: Path, limits: Limits 
     folder: where it works;  notes: an existing folder for what it says, outside of `folder`
     """
     begin = time.perf_counter()
+    before = resident(os.getpid())  # the copy begins with as much
     child = begun(command, folder, notes)
     why: Literal["", "hang", "memory"] = ""
     most, limit, asked = 0, limits.seconds, False
@@ -58,7 +61,7 @@ def watch(command: Callable[[], int], folder: Path, notes: Path, limits: Limits 
         found, status, used = os.wait4(child, os.WNOHANG)
         if found:
             break
-        most = max(most, resident(child))
+        most = max(most, sum(map(resident, family(child))) - before)
         if most > limits.memory:
             why = "memory"
         elif time.perf_counter() - begin > limit:
@@ -127,6 +130,15 @@ def resident(process: int) -> int:
         return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * PAGE
     except (OSError, IndexError):
         return 0
+
+
+def family(process: int) -> list[int]:
+    """A process and those that it started, and that these started."""
+    try:
+        children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    except OSError:
+        children = []
+    return [process, *(one for child in children for one in family(int(child)))]
 
 
 def still_there(group: int, patience: float = 2.0) -> bool:

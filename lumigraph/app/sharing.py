@@ -122,6 +122,8 @@ def share_request(item: Item, job: ShareJob) -> Request:
         options["size"] = job.size
     if job.kind == "page":
         options["title"] = item.record.title
+    if job.kind in ("mesh", "points"):
+        options["origin"] = False  # the place on Earth stays at home
     return Request(KINDS[job.kind].command, options)
 
 

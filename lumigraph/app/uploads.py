@@ -22,6 +22,7 @@ from pathlib import Path, PurePosixPath
 from ..errors import LumigraphError
 from ..files import explained, refuse_link, remove
 from ..files.names import counted
+from ..files.reading import reason_of
 
 MAX_PIECE_BYTES = 16 << 20  # bytes of one request
 MAX_FILE_BYTES = {"photograph": 1 << 30, "video": 32 << 30}
@@ -350,7 +351,7 @@ def fault_of(path: Path, name: str) -> str | None:
 def fault_of_photograph(path: Path, name: str) -> str | None:
     from PIL import Image
 
-    from ..capture.pictures import describe, reads_heic
+    from ..capture.pictures import reads_heic
     from ..capture.raw.library import RAW_SUFFIXES
 
     if PurePosixPath(name).suffix.lower() in RAW_SUFFIXES:
@@ -360,4 +361,4 @@ def fault_of_photograph(path: Path, name: str) -> str | None:
         with Image.open(path):  # refuses pictures of more pixels than memory holds, before anything is decoded
             return None
     except Exception as fault:  # image libraries raise anything for a damaged file
-        return f"{name} is no photograph that can be read ({describe(fault)}); copy it again, or leave it out"
+        return f"{name} is no photograph that can be read ({reason_of(fault)}); copy it again, or leave it out"

@@ -23,6 +23,7 @@ from ..files import exists, expanded
 from ..files.names import natural
 from ..files.ranges import typed
 from ..files.readers import LISTED, NAMES
+from ..files.reading import reads
 from . import meshes, minecraft, single_image
 from .assemble import Before as Before
 from .assemble import assemble as assemble
@@ -56,6 +57,7 @@ def synthetic() -> Any:
 KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection, BlockWorld, Words)}
 
 
+@reads()
 def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options: Any) -> Dataset:
     """Open a source of any kind as a dataset.
 
@@ -86,6 +88,7 @@ def only_of_photographs(source: str | Path, kind: type[Any], options: dict[str, 
         raise LumigraphError(f"{source} holds {kind.kind}, and --{name} is about photographs; leave it out")
 
 
+@reads()
 def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     """Kind of dataset that `open_dataset` makes of a source, without opening it.
 
@@ -139,6 +142,7 @@ def members_of(folder: Path) -> dict[str, Path]:
     return {path.stem if path.is_file() else path.name: path for path in found}
 
 
+@reads()
 def open_scene(
     source: str | Path,
     downscale: int | None = None,
@@ -202,6 +206,7 @@ def confirm(source: str | Path) -> None:
         choose_reader(path)
 
 
+@reads()
 def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     """Photographs with poses as a reader finds them, without pixels. source, reader: as of `open_scene`"""
     if (request := requested(source)) is not None:
@@ -213,6 +218,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     return with_inner_depth(with_raw(with_masks(capture, path), path))
 
 
+@reads()
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     """The reader that recognises a folder. Raises LumigraphError if none does."""
     if not exists(folder):

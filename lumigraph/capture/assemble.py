@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..datasets.scene import Scene
 from ..datasets.world import BlockWorld
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
+from ..files.ranges import typed
 from ..geometry import Similarity
 from ..system.progress import counting
 from .beside import make_about, make_layers
@@ -72,6 +73,9 @@ def assemble(
     for shot in shots:
         if (fault := shot.lens.fault()) is not None:
             raise LumigraphError(f"{capture.source}: the lens of {shot.name} has a fault: its {fault}; correct it")
+    for extra in (*capture.tracks, capture.skeleton, capture.origin):
+        if extra is not None:
+            typed(type(extra), asdict(extra), capture.source)
     capture, lost = without_stray_points(capture)
     told += capture.notes + lost + oddities(capture, shots, poses)
     with counting("Looking at photographs", len(shots)) as done:

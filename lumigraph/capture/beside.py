@@ -19,6 +19,7 @@ from ..datasets.images import ImageStore, Layer, LayerSource, in_parallel, resiz
 from ..datasets.images.layer import known
 from ..depth_maps import back_project
 from ..errors import LumigraphError
+from ..files.reading import reading
 from ..geometry import evenly
 from .capture import Capture, PixelPlane, Shot
 from .numbers import kind_of, read_numbers
@@ -125,7 +126,8 @@ def read_plane(
                     f"its shape {values.shape[1]}x{values.shape[0]} is not the photograph's {size[0]}x{size[1]}"
                 )
     else:
-        values = plane.values if isinstance(plane.values, np.ndarray) else plane.values()
+        with reading(f"{name} of a photograph"):
+            values = plane.values if isinstance(plane.values, np.ndarray) else plane.values()
     values = values.astype(dtype)
     if plane.encoding == "direction":
         values = (values @ turn.T).astype(dtype)

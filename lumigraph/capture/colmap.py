@@ -14,6 +14,7 @@ from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
 from ..files import exists, read_bytes, read_text
 from ..files.names import natural
+from ..files.reading import reading, reads
 from ..system.library import pycolmap
 from ..system.memory import free_memory
 from .capture import Capture, Shot
@@ -68,25 +69,20 @@ def read(folder: Path) -> Capture:
     return Capture(str(folder), shots, missing=missing, **vars(read_points(place, model)))
 
 
+@reads("holds no readable COLMAP model", "make or copy it again")
 def read_model(place: Path) -> pycolmap.Reconstruction:
     """Raises LumigraphError for what is no whole model."""
-    try:
-        if (place / "images.bin").is_file():
-            check_whole(place)
-            read_points3d(place / "points3D.bin")
-        else:
-            check_text(place / "images.txt")
-        model = pycolmap.Reconstruction(place)
-        if (place / "cameras.bin").is_file():
-            wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
-            if (place / "cameras.bin").stat().st_size < wanted:
-                raise ValueError("cameras.bin ends early")
-        return model
-    except LumigraphError:
-        raise
-    except Exception as fault:
-        reason = " ".join(str(fault).split()) or type(fault).__name__
-        raise LumigraphError(f"{place} holds no readable COLMAP model ({reason}); make or copy it again") from fault
+    if (place / "images.bin").is_file():
+        check_whole(place)
+        read_points3d(place / "points3D.bin")
+    else:
+        check_text(place / "images.txt")
+    model = pycolmap.Reconstruction(place)
+    if (place / "cameras.bin").is_file():
+        wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+        if (place / "cameras.bin").stat().st_size < wanted:
+            raise ValueError("cameras.bin ends early")
+    return model
 
 
 def check_whole(place: Path) -> None:
@@ -100,11 +96,9 @@ def check_whole(place: Path) -> None:
         if not exists(path):
             continue
         data = read_bytes(path, free_memory())
-        try:
+        with reading(path, "is truncated", "make or copy the model again"):
             if walk(data, path) > len(data):
                 raise ValueError("it ends early")
-        except (struct.error, ValueError) as fault:
-            raise LumigraphError(f"{path} is truncated; make or copy the model again") from fault
 
 
 def walk_images(data: bytes, path: Path) -> int:

@@ -107,7 +107,7 @@ def inner_depth(path: Path) -> InnerDepth | None:
             return None
         with open(path, "rb") as file:
             told = b"Depth:" in file.read(HEAD_BYTES)
-    return of_jpeg(read_bytes(path)) if told else None
+        return of_jpeg(read_bytes(path)) if told else None
 
 
 def of_heic(path: Path) -> InnerDepth | None:

@@ -24,6 +24,7 @@ from ..datasets.scene import GeographicOrigin
 from ..datasets.tracks import BoxTrack
 from ..errors import LumigraphError
 from ..files import read_text
+from ..files.reading import reading
 from ..geometry import to_quaternion
 from .capture import Capture, Shot
 from .pictures import list_images
@@ -31,7 +32,9 @@ from .pictures import list_images
 EXPECTED_FILES = "image_02, label_02 and calib (KITTI's tracking benchmark)"
 PICTURES, LABELS, CALIBRATION, INERTIAL = "image_02", "label_02", "calib", "oxts"
 IGNORED_TYPE = "DontCare"
+MAX_NUMBER = 1e9  # in any file, whatever its unit
 LABEL_COLUMNS, OXTS_COLUMNS = 17, 6  # that are read, of a line
+MAX_LATITUDE = 89.0  # degrees, of Mercator's projection
 EARTH_RADIUS = 6378137.0  # metres, WGS 84's equator
 REACH = 80.0  # metres from the middle of what is looked at, within which the street is modelled
 NEAR = 2.0  # metres in front of the camera, within which there is nothing
@@ -54,7 +57,8 @@ def read(folder: Path) -> Capture:
     projection = matrices["P2"]
     fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     lens = Pinhole(torch.tensor([[fx, fy]]), torch.tensor([[cx + 0.5, cy + 0.5]]))
-    aside = -np.linalg.solve(projection[:, :3], projection[:, 3])  # camera 2 in the frame of camera 0
+    with reading(root / CALIBRATION / f"{name}.txt", "has a P2 that is no projection", "restore the file"):
+        aside = -np.linalg.solve(projection[:, :3], projection[:, 3])  # camera 2 in the frame of camera 0
     shots = []
     for path in pictures:
         frame = frame_number(path)
@@ -90,14 +94,10 @@ def read_rows(path: Path, columns: int, words: tuple[int, ...] = ()) -> list[lis
     """Words of the lines of a file. words: columns that hold no numbers"""
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     for row in rows:
-        try:
+        with reading(path, f"holds {' '.join(row)[:120]!r}, where {columns} columns were looked for", "correct it"):
             numbers = [float(x) for i, x in enumerate(row[:columns]) if i not in words]
-        except ValueError:
-            numbers = []
-        if len(numbers) != columns - len(words) or not all(map(math.isfinite, numbers)):
-            raise LumigraphError(
-                f"{path} holds {' '.join(row)[:120]!r}, where {columns} columns were looked for; correct it"
-            )
+            if len(numbers) != columns - len(words) or not all(abs(number) <= MAX_NUMBER for number in numbers):
+                raise ValueError("a number is missing, not finite or too large")
     return rows
 
 
@@ -106,13 +106,13 @@ def read_calibration(path: Path) -> dict[str, np.ndarray]:
     found = {}
     for line in read_text(path).splitlines():
         name, *numbers = line.replace(":", " ").split() or [""]
-        try:
+        with reading(path, f"has {name[:20]} with something besides numbers", "correct it"):
             values = np.array([float(x) for x in numbers])
-        except ValueError as fault:
-            raise LumigraphError(f"{path}: {name} holds something besides numbers; correct it") from fault
+            if not (np.abs(values) <= MAX_NUMBER).all():
+                raise ValueError("a number is not finite or too large")
         if len(values) in (9, 12):
             found[name.replace("R0_rect", "R_rect").replace("_to_", "_")] = values.reshape(3, -1)
-    if "P2" not in found:
+    if found.get("P2", np.zeros((3, 3))).shape != (3, 4):
         raise LumigraphError(f"{path} has no P2, the left colour camera's projection; restore the file")
     return found
 
@@ -125,7 +125,11 @@ def read_drive(path: Path, matrices: dict[str, np.ndarray]) -> tuple[list[np.nda
                 f"{path} gives the path of the inertial unit, and the calibration lacks {name}; restore it"
             )
     camera_from_imu = whole(matrices["R_rect"]) @ whole(matrices["Tr_velo_cam"]) @ whole(matrices["Tr_imu_velo"])
+    with reading(path, "needs a calibration of rotations and places", "restore that file"):
+        imu_from_camera = np.linalg.inv(camera_from_imu)
     rows = [[float(x) for x in row[:OXTS_COLUMNS]] for row in read_rows(path, OXTS_COLUMNS)]
+    if not rows or not all(abs(row[0]) < MAX_LATITUDE for row in rows):
+        raise LumigraphError(f"{path} has no line, or a latitude beyond {MAX_LATITUDE:g} degrees; restore the file")
     scale = EARTH_RADIUS * math.cos(math.radians(rows[0][0]))
     poses, first = [], None
     for latitude, longitude, altitude, roll, pitch, yaw in rows:  # Mercator's projection, as the benchmark has it
@@ -135,7 +139,7 @@ def read_drive(path: Path, matrices: dict[str, np.ndarray]) -> tuple[list[np.nda
         pose = np.eye(4)
         pose[:3, :3] = about(2, yaw) @ about(1, pitch) @ about(0, roll)
         pose[:3, 3] = place - first
-        poses.append(pose @ np.linalg.inv(camera_from_imu))
+        poses.append(pose @ imu_from_camera)
     return poses, GeographicOrigin(*rows[0][:3])
 
 

@@ -25,6 +25,7 @@ from ..camera.lens import Pinhole
 from ..errors import LumigraphError
 from ..files import read_json, read_text
 from ..files.ranges import Positive, between
+from ..files.reading import reading
 from .capture import Capture, Shot
 from .pictures import list_images, measure
 
@@ -100,17 +101,13 @@ def read(folder: Path) -> Capture:
 def lens_of(folder: Path, found: dict[Path, tuple[float, float]]) -> tuple[float, float, float]:
     """Length of a unit of the positions, focal length in longer sides of a picture, distance of the focal plane."""
     if (folder / PARAMETERS).is_file():
-        try:
+        fault = "lacks focal_length_mm, sensor_size_mm, baseline_mm or focus_distance_m"
+        with reading(folder / PARAMETERS, fault, "restore it from the data set"):
             said = configparser.ConfigParser()
             said.read_string(read_text(folder / PARAMETERS))
             lens, rig = said["intrinsics"], said["extrinsics"]
             focal = float(lens["focal_length_mm"]) / float(lens["sensor_size_mm"])
             return float(rig["baseline_mm"]) / 1000, focal, float(rig["focus_distance_m"])
-        except (configparser.Error, KeyError, ValueError) as fault:
-            raise LumigraphError(
-                f"{folder / PARAMETERS} lacks focal_length_mm, sensor_size_mm, baseline_mm or focus_distance_m; "
-                "restore it from the data set"
-            ) from fault
     about = read_json(folder / ABOUT, GridAbout) if (folder / ABOUT).is_file() else GridAbout()
     width = max(np.ptp([*found.values()], 0))
     return 1.0, 0.5 / math.tan(math.radians(about.field_of_view / 2)), about.plane_distance or PLANE_DISTANCE * width

@@ -15,6 +15,7 @@ import torch
 
 from ..camera.lens import Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
+from ..files.reading import reading
 from .capture import Capture, Shot
 from .numbers import load_array
 from .pictures import list_images, reductions, versions
@@ -34,15 +35,11 @@ def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError where the array is no such table or its rows are not as many as
     there are images."""
     path = folder / "poses_bounds.npy"
-    try:
+    with reading(path, "is not LLFF's table of 17 numbers for each image", "make or copy it again"):
         table = np.array(load_array(path))
         if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f":
             raise ValueError(f"it has shape {table.shape} of {table.dtype}")
         table = table.astype(np.float64)
-    except Exception as fault:  # np.load keeps no list of what it raises
-        raise LumigraphError(
-            f"{path} is not LLFF's table of 17 numbers for each image; make or copy it again"
-        ) from fault
     folders = reductions(folder / "images")
     listed = {place: list_images(place) for place in folders.values()}
     names = next((names for names in listed.values() if len(names) == len(table)), None)

@@ -17,6 +17,7 @@ from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import natural
 from ..files.ply import columns, plain_names, read_header
+from ..files.reading import reads
 from ..system.memory import ask_for, free_memory
 from ..system.progress import track
 from .points import colours_of as ply_colours
@@ -60,27 +61,23 @@ def read_shapes(path: Path, partial: bool = False) -> Shapes:
     return shapes
 
 
+@reads("cannot be read as a shape", "export it once more")
 def read_shape(path: Path, name: str) -> Shape:
     """All that one file holds, as one shape. Raises LumigraphError if that is nothing."""
     made, up = read_mesh(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP
     return normalised(name, made, None if len(made.faces) else normals_of(path), up)
 
 
+@reads("cannot be read as a mesh", "export it once more")
 def read_mesh(path: Path) -> Mesh:
     """All triangles of a file, or all its points, in its own frame. Raises LumigraphError if that is nothing."""
     import trimesh  # which takes a while
 
     if path.stat().st_size > free_memory():
         raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
-    try:
-        own = path.suffix.lower() == ".ply" and not has_texture(path)
-        loaded: Any = read_ply(path) if own else trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
-        parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
-    except LumigraphError:
-        raise
-    except Exception as error:  # readers of many formats fail in many ways
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise LumigraphError(f"{path} cannot be read as a mesh ({reason}); export it once more") from error
+    own = path.suffix.lower() == ".ply" and not has_texture(path)
+    loaded: Any = read_ply(path) if own else trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
+    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
     if not meshes and not clouds:

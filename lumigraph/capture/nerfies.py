@@ -18,6 +18,7 @@ from ..camera.lens import OpenCV
 from ..errors import LumigraphError
 from ..files import is_file, read_json
 from ..files.ranges import Coordinate, Name, Point, Positive, Side, between, typed
+from ..files.reading import reading
 from .capture import Capture, Shot
 from .numbers import load_array
 from .pictures import find_file
@@ -131,10 +132,8 @@ def read_points(path: Path) -> np.ndarray | None:
     """Points of the background; None where there is no such file. Raises LumigraphError for other arrays."""
     if not is_file(path):
         return None
-    try:
+    with reading(path, "is no array of 3 numbers to a point", "restore or remove it"):
         points = np.array(load_array(path)).astype(np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"it has shape {points.shape}")
-    except Exception as fault:  # np.load keeps no list of what it raises
-        raise LumigraphError(f"{path} is no array of 3 numbers to a point ({fault}); restore or remove it") from fault
-    return points
+        return points

@@ -21,6 +21,7 @@ from ..errors import LumigraphError
 from ..files import read_json, read_text
 from ..files.names import natural
 from ..files.ranges import Positive, Side
+from ..files.reading import reading
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
 from .numbers import read_numbers
@@ -85,10 +86,8 @@ def read_replica(folder: Path) -> Capture:
     lens, shots, missing = pinhole(said.fx, said.fy, said.cx, said.cy), [], []
     lines = [line.split() for line in read_text(folder / "traj.txt").splitlines() if line.strip()]
     for i, words in enumerate(lines):
-        try:
+        with reading(f"{folder / 'traj.txt'}, line {i + 1},", "is no 4x4 matrix", "correct it"):
             pose = np.array(words, np.float64).reshape(4, 4)
-        except ValueError as fault:
-            raise LumigraphError(f"{folder / 'traj.txt'}, line {i + 1}, is no 4x4 matrix; correct it") from fault
         picture, depth = find_file(folder / "results" / f"frame{i:06d}"), folder / "results" / f"depth{i:06d}.png"
         name = f"results/frame{i:06d}"
         if not picture.is_file():

@@ -21,6 +21,7 @@ from ..errors import LumigraphError
 from ..files import read_bytes, read_json
 from ..files.names import natural
 from ..files.ranges import Coordinate, Positive, Side
+from ..files.reading import reading
 from ..geometry import to_matrix
 from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file
@@ -137,9 +138,6 @@ def unpacked(path: Path, shape: tuple[int, int]) -> np.ndarray:
         raise LumigraphError(
             f"{path} is compressed by LZFSE; install what unpacks it: pip install 'lumigraph[record3d]'"
         ) from fault
-    try:
-        found = np.frombuffer(liblzfse.decompress(read_bytes(path)), np.float32)
-        return found.reshape(shape)
-    except (liblzfse.error, ValueError) as fault:
-        height, width = shape
-        raise LumigraphError(f"{path} holds no {width}x{height} numbers ({fault}); export it again") from fault
+    height, width = shape
+    with reading(path, f"holds no {width}x{height} numbers", "export it again"):
+        return np.frombuffer(liblzfse.decompress(read_bytes(path)), np.float32).reshape(shape)

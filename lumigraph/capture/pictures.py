@@ -17,6 +17,7 @@ from PIL import Image, ImageOps
 from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
+from ..files.reading import reading
 from .capture import PixelPlane, Shot
 from .numbers import (
     DECODING_COPIES,
@@ -130,7 +131,8 @@ def choose(shot: Shot, downscale: int | None) -> Chosen:
     size = smaller(own, wanted)
 
     def make() -> np.ndarray:
-        made = pixels if isinstance(pixels, np.ndarray) else pixels()
+        with reading(shot.name):
+            made = pixels if isinstance(pixels, np.ndarray) else pixels()
         return np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
 
     identity = shot.identity if shot.mask is None and shot.alpha is None else None
@@ -340,18 +342,5 @@ def readable(path: Path) -> Iterator[None]:
     """Context in which any fault that an image library raises for a file becomes one sentence."""
     if path.suffix.lower() in HEIC_SUFFIXES and not reads_heic():
         raise LumigraphError(f"{path} {NO_HEIC}")
-    try:
+    with reading(path, "cannot be read as an image", "restore it, or delete it so that it is skipped"):
         yield
-    except LumigraphError:
-        raise
-    except Exception as fault:
-        raise LumigraphError(
-            f"{path} cannot be read as an image ({describe(fault)}); restore it, or delete it so that it is skipped"
-        ) from fault
-
-
-def describe(fault: Exception) -> str:
-    if isinstance(fault, OSError) and fault.strerror:
-        return fault.strerror.lower()
-    text = " ".join(str(fault).split()).rstrip(".")
-    return "unknown format" if "cannot identify" in text else text or type(fault).__name__

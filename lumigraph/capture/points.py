@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from ..errors import LumigraphError
 from ..files import read_bytes
 from ..files.ply import columns, plain_names, read_header, read_rows
+from ..files.reading import reads
 from ..system.memory import free_memory
 
 COLOURS = ["red", "green", "blue"]
@@ -56,22 +57,20 @@ def colours_of(rows: np.ndarray) -> UInt8[np.ndarray, "row 3"] | None:
     return found.clip(0, 255).astype(np.uint8)
 
 
+@reads("is truncated", "restore or remove it")
 def read_points3d(path: Path) -> SparsePoints:
     """COLMAP's points3D.bin by itself: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
     data = read_bytes(path, free_memory())
-    try:
-        (count,), offset = struct.unpack_from("<Q", data), 8
-        positions, colours, sightings = [], [], []
-        for _ in range(count):
-            _, x, y, z, r, g, b, _, track = struct.unpack_from("<Q3d3BdQ", data, offset)
-            positions.append((x, y, z))
-            colours.append((r, g, b))
-            sightings.append(track)
-            offset += 51 + 8 * track
-            if offset > len(data):
-                raise ValueError("it ends early")
-    except (struct.error, ValueError) as fault:
-        raise LumigraphError(f"{path} is truncated; restore or remove it") from fault
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    positions, colours, sightings = [], [], []
+    for _ in range(count):
+        _, x, y, z, r, g, b, _, track = struct.unpack_from("<Q3d3BdQ", data, offset)
+        positions.append((x, y, z))
+        colours.append((r, g, b))
+        sightings.append(track)
+        offset += 51 + 8 * track
+        if offset > len(data):
+            raise ValueError("it ends early")
     return SparsePoints(
         np.array(positions).reshape(-1, 3), np.array(colours, np.uint8).reshape(-1, 3), np.array(sightings)
     )

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from ..camera.lens import Pinhole
-from ..errors import LumigraphError
 from ..files import read_text
+from ..files.reading import reading
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, measure
@@ -59,10 +59,8 @@ def read(folder: Path) -> Capture:
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
-    try:
-        lines = read_text(path).splitlines()
-        matrix = np.array([line.split() for line in lines if line.strip()], np.float64)
-        assert matrix.shape == (size, size)
-    except (ValueError, AssertionError) as fault:
-        raise LumigraphError(f"{path} holds no {size}x{size} matrix; correct or remove it") from fault
-    return matrix
+    with reading(path, f"holds no {size}x{size} matrix", "correct or remove it"):
+        rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+        if [len(row) for row in rows] != [size] * size:
+            raise ValueError(f"it has {len(rows)} rows")
+        return np.array(rows, np.float64)

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import tempfile
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,15 +23,21 @@ from ..camera import Camera
 from ..camera.lens import Lens, Pinhole
 from ..depth_maps import back_project
 from ..errors import LumigraphError
+from ..files.reading import reads
 from ..geometry import evenly
-from ..system.memory import ask_for
+from ..system.children import start_python
+from ..system.memory import ask_for, free_memory
 from . import meshes
-from .capture import Capture, PixelPlane, Shot
+from .capture import MAX_COORDINATE, Capture, PixelPlane, Shot
 from .pictures import stat, upright_size
 
 CLOUD_SUFFIXES = (".las", ".laz", ".e57")
 SUFFIXES = (*CLOUD_SUFFIXES, *meshes.SUFFIXES)
 POINT_BYTES = 200  # of memory for each point while a photograph sees the cloud
+WORKER = Path(__file__).with_name("cloud_worker.py")
+MIN_MEMORY, MAX_RATIO = 1 << 28, 200  # bytes of a worker for any file; bytes for each byte of a file
+MIN_SECONDS, BYTES_PER_SECOND = 10, 1_000_000  # of a worker's processor, and of a file
+FEW_THREADS = {"RAYON_NUM_THREADS": "4", "MALLOC_ARENA_MAX": "1"}  # each thread reserves addresses
 LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
 CELL = 3  # pixels along a square whose nearest point hides what is behind it
 HIDDEN = 0.03  # of the distance of the nearest point around, behind which a point is hidden
@@ -59,6 +71,7 @@ def with_surveyed(capture: Capture, path: Path) -> Capture:
     return replace(capture, shots=[with_depth(shot) for shot in capture.shots])
 
 
+@reads("cannot be read as a cloud", "export it once more")
 def read_surveyed(path: Path) -> Surveyed:
     """Points or triangles of a file. Raises LumigraphError, with what to install where a library is missing."""
     suffix = path.suffix.lower()
@@ -66,24 +79,12 @@ def read_surveyed(path: Path) -> Surveyed:
         raise LumigraphError(f"{path} is neither a cloud nor a mesh; name a file of {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise LumigraphError(f"{path} does not exist; check the path")
-    none = np.zeros((0, 3), np.int64)
-    try:
-        if suffix == ".e57":
-            found = Surveyed(read_e57(path), none)
-        elif suffix in CLOUD_SUFFIXES:
-            found = Surveyed(read_las(path), none)
-        else:
-            mesh = meshes.read_mesh(path)
-            found = Surveyed(mesh.vertices, mesh.faces)
-    except ImportError as fault:
-        raise LumigraphError(
-            f"{path} needs {LIBRARIES[suffix]} to be read; install it: pip install 'lumigraph[lidar]'"
-        ) from fault
-    except LumigraphError:
-        raise
-    except Exception as fault:  # readers of several formats fail in many ways
-        raise LumigraphError(f"{path} cannot be read as a cloud ({fault}); export it once more") from fault
-    finite = np.isfinite(found.points).all(-1)
+    if suffix in CLOUD_SUFFIXES:
+        found = Surveyed(read_cloud(path), np.zeros((0, 3), np.int64))
+    else:
+        mesh = meshes.read_mesh(path)
+        found = Surveyed(mesh.vertices, mesh.faces)
+    finite = (np.abs(found.points) <= MAX_COORDINATE).all(-1)
     if not len(found.faces):
         found = replace(found, points=found.points[finite])
     if not finite.any():
@@ -97,19 +98,29 @@ def read_surveyed(path: Path) -> Surveyed:
     return found
 
 
-def read_las(path: Path) -> Float[np.ndarray, "point 3"]:
-    import laspy
-
-    return np.asarray(laspy.read(path).xyz, np.float64)
-
-
-def read_e57(path: Path) -> Float[np.ndarray, "point 3"]:
-    """Points of all scans in a file, at their poses."""
-    import pye57
-
-    with pye57.E57(str(path)) as file:
-        scans = [file.read_scan(i, ignore_missing_fields=True) for i in range(file.scan_count)]
-    return np.concatenate([np.stack([scan[f"cartesian{axis}"] for axis in "XYZ"], -1) for scan in scans])
+def read_cloud(path: Path) -> Float[np.ndarray, "point 3"]:
+    """Points of a LiDAR's file, read by `cloud_worker.py` within limits of memory and time that follow from its size.
+    Raises ValueError with the reason where that fails."""
+    library, size = LIBRARIES[path.suffix.lower()], path.stat().st_size
+    if find_spec(library) is None:
+        raise LumigraphError(f"{path} needs {library} to be read; install it: pip install 'lumigraph[lidar]'")
+    memory = min(max(MIN_MEMORY, MAX_RATIO * size), free_memory())
+    seconds = MIN_SECONDS + size // BYTES_PER_SECOND
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder) / "points.npy"
+        words = [str(WORKER), str(path.absolute()), str(result), str(memory), str(seconds)]
+        pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        environment = os.environ | FEW_THREADS
+        with start_python(words, signal.SIGKILL, **pipes, text=True, errors="replace", env=environment) as worker:
+            try:
+                said = worker.communicate()[1].splitlines()
+            except BaseException:
+                worker.kill()
+                raise
+        if worker.returncode:
+            reason = said[-1] if said and worker.returncode > 0 else "its numbers contradict its size"
+            raise ValueError(reason)
+        return np.load(result, allow_pickle=False)
 
 
 def check_frame(capture: Capture, found: Surveyed, path: Path) -> None:

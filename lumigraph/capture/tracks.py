@@ -27,6 +27,7 @@ from ..camera import Camera
 from ..datasets.tracks import BoxTrack, check_names
 from ..errors import LumigraphError
 from ..files.ranges import typed
+from ..files.reading import reads
 from ..geometry import Similarity
 from .capture import Capture
 
@@ -42,6 +43,7 @@ class TracksRecord:
     format: str = FORMAT
 
 
+@reads()
 def read_tracks(path: Path) -> tuple[BoxTrack, ...]:
     """The tracks in a file. Raises LumigraphError for a file that holds none, and for a track that is none."""
     said = files.read_json(path)

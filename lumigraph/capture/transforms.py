@@ -19,6 +19,7 @@ from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
 from ..files import is_file, read_json
 from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
+from ..files.reading import reading
 from . import colmap
 from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, reductions, upright_size, versions
@@ -198,10 +199,8 @@ def called(frame: Json, number: int = 0) -> str:
 
 def fact(value: Any, name: str, where: str) -> np.ndarray:
     """Fact of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
-    try:
+    with reading(where, f'has "{name}", which is no number and no array of them', "correct it"):
         numbers = np.asarray(value, np.float64)
-    except (ValueError, TypeError, OverflowError) as fault:
-        raise LumigraphError(f'{where} has "{name}", which is no number and no array of them; correct it') from fault
     if numbers.size > MAX_FACT_NUMBERS:
         raise LumigraphError(f'{where} has "{name}" of {numbers.size} numbers; {MAX_FACT_NUMBERS} are the most')
     return numbers

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from ..camera.lens import Lens, OpenCV, Pinhole
-from ..errors import LumigraphError
 from ..files import is_file, read_text
+from ..files.reading import reading
 from ..geometry import to_matrix
 from .beside import with_depth_points
 from .capture import Capture, PixelPlane, Shot
@@ -77,18 +77,14 @@ def read(folder: Path) -> Capture:
 def read_rows(path: Path, columns: int) -> list[list[str]]:
     """The words of each line that is no comment."""
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()[:1] not in ("", "#")]
-    try:
-        for row in rows:
+    for row in rows:
+        fault = f"holds {' '.join(row)[:200]!r}, where {columns} columns were looked for"
+        with reading(path, fault, "correct that line"):
             numbers = [float(x) for x in (row[:columns] if columns > 2 else row[:1])]
             if len(row) < columns or not all(map(math.isfinite, numbers)):
                 raise ValueError("a number is missing or not finite")
             if columns == POSE_COLUMNS and not any(numbers[4:]):
                 raise ValueError("a quaternion of zero is no rotation")
-    except ValueError as fault:
-        raise LumigraphError(
-            f"{path} holds {' '.join(row)[:200]!r}, where {columns} columns were looked for ({fault}); "
-            "correct that line"
-        ) from fault
     return [row[:columns] for row in rows]
 
 
@@ -104,13 +100,11 @@ def read_lens(folder: Path) -> Lens:
         (c for name, c in CAMERAS.items() if name in folder.resolve().name), DEFAULT_INTRINSICS
     )
     if path.is_file():
-        try:
+        remedy = "write fx fy cx cy, and where it bends k1 k2 p1 p2 k3, as OpenCV has them"
+        with reading(path, "is no camera", remedy):
             numbers = tuple(float(x) for x in read_text(path).split())
-            assert len(numbers) in (4, 9)
-        except (ValueError, AssertionError) as fault:
-            raise LumigraphError(
-                f"{path} is no camera: write fx fy cx cy, and where it bends k1 k2 p1 p2 k3, as OpenCV has them"
-            ) from fault
+            if len(numbers) not in (4, 9):
+                raise ValueError(f"it has {len(numbers)} numbers")
     fx, fy, cx, cy, *bends = numbers
     focal, centre = torch.tensor([[fx, fy]]), torch.tensor([[cx + 0.5, cy + 0.5]])
     return OpenCV(focal, centre, torch.tensor([[*bends, 0.0, 0.0, 0.0]])) if bends else Pinhole(focal, centre)

@@ -21,6 +21,7 @@ from ..camera.lens import OpenCV
 from ..datasets.skeleton import BonePose, Skeleton, posed, rigid_product
 from ..errors import LumigraphError
 from ..files import is_file
+from ..files.reading import reading
 from ..geometry import rotated
 from .capture import Capture, Shot
 from .numbers import load_array
@@ -29,6 +30,7 @@ from .pictures import readable, stat
 
 EXPECTED_FILES = "annots.npy and new_params/ or params/ (ZJU-MoCap)"
 MILLIMETRES = 1000.0
+MAX_NUMBER = 1e9  # in any file, whatever its unit
 TEST_INTERVAL = 30  # frames between those of cameras that test (Peng 2021)
 PARAMS = "new_params", "params"
 MASKS = "mask_cihp", "mask"
@@ -45,18 +47,16 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError for damaged files, and where joints at rest are missing."""
-    said = load_pickled(folder / "annots.npy")
-    try:
+    path = folder / "annots.npy"
+    said = load_pickled(path)
+    with reading(path, "does not hold cameras as ZJU-MoCap's does"):
         cameras = said["cams"]
-        matrices, bends, turns, shifts = (np.array(cameras[name], float) for name in "KDRT")
-        lists = [[str(name) for name in one["ims"]] for one in said["ims"]]
+        matrices, bends, turns, shifts = (finite(cameras[name], name) for name in "KDRT")
+        lists = [list(map(text, one["ims"])) for one in said["ims"]]
         count = len(matrices)
         matrices, turns = matrices.reshape(count, 3, 3), turns.reshape(count, 3, 3)
         bends, shifts = bends.reshape(count, -1)[:, :5], shifts.reshape(count, 3) / MILLIMETRES
-    except (KeyError, TypeError, ValueError, IndexError) as fault:
-        raise LumigraphError(
-            f"{folder / 'annots.npy'} does not hold cameras as ZJU-MoCap's does ({fault}); restore it"
-        ) from fault
+        bends = np.pad(bends, ((0, 0), (0, 8 - bends.shape[1])))
     shots, missing, frames = [], [], set()
     for names in lists:
         for camera, name in enumerate(names[:count]):
@@ -68,10 +68,9 @@ def read(folder: Path) -> Capture:
                 continue
             frames.add(frame)
             pose = np.concatenate([turns[camera].T, -turns[camera].T @ shifts[camera][:, None]], 1)
-            numbers = *bends[camera, :4], bends[camera, 4] if bends.shape[1] > 4 else 0.0, 0.0, 0.0, 0.0
             k = matrices[camera]
-            values = (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), numbers
-            lens = OpenCV(*(torch.tensor([x], dtype=torch.float32) for x in values))
+            values = (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), bends[camera]
+            lens = OpenCV(*(torch.from_numpy(np.array([x])).float() for x in values))
             with readable(folder / name), Image.open(folder / name) as image:
                 size = image.size
             mask = next(
@@ -89,9 +88,21 @@ def read(folder: Path) -> Capture:
                     identity=None if mask is None else f"masked {folder / name} {stat(folder / name)} {stat(mask)}",
                 )
             )
-    return Capture(
-        str(folder), shots, missing=missing, up=(0.0, 0.0, 1.0), skeleton=skeleton_of(folder, sorted(frames))
-    )
+    skeleton = skeleton_of(folder, sorted(frames)) if frames else None
+    return Capture(str(folder), shots, missing=missing, up=(0.0, 0.0, 1.0), skeleton=skeleton)
+
+
+def text(name: Any) -> str:
+    """A name, which Python 2 wrote as bytes."""
+    return name.decode("latin-1") if isinstance(name, bytes) else str(name)
+
+
+def finite(values: Any, name: str) -> np.ndarray:
+    """Numbers in double precision. Raises ValueError for others."""
+    found = np.array(values, float)
+    if not (np.abs(found) <= MAX_NUMBER).all():
+        raise ValueError(f"{name} has numbers that are not finite or beyond {MAX_NUMBER:g}")
+    return found
 
 
 def masked(photograph: Path, mask: Path) -> np.ndarray:
@@ -100,6 +111,8 @@ def masked(photograph: Path, mask: Path) -> np.ndarray:
         rgb = np.asarray(image.convert("RGB"))
     with readable(mask), Image.open(mask) as image:
         labels = np.asarray(image)
+        if labels.shape[:2] != rgb.shape[:2]:
+            raise ValueError(f"its size is not that of {photograph.name}")
     body = labels.reshape(*labels.shape[:2], -1)[..., :3].any(-1)
     return np.concatenate([rgb, np.where(body, 255, 0)[..., None].astype(np.uint8)], -1)
 
@@ -126,10 +139,13 @@ def skeleton_of(folder: Path, frames: list[int]) -> Skeleton:
             f"{folder} has a skeleton without a bind pose, for lbs/joints.npy or lbs/parents.npy is missing; copy the "
             "folder lbs of Animatable NeRF's release beside annots.npy"
         )
-    joints, parents = (np.array(load_array(file)) for file in files)
-    if joints.shape != (len(JOINTS), 3) or parents.shape != (len(JOINTS),):
-        raise LumigraphError(f"{files[0]} has {joints.shape} numbers, and 24 joints of 3 are expected; restore it")
-    above = tuple(-1 if number == 0 else int(parent) for number, parent in enumerate(parents))
+    with reading(files[0], "does not hold 24 joints of 3 coordinates"):
+        joints = finite(load_array(files[0]), "the array").reshape(len(JOINTS), 3)
+    with reading(files[1], "does not hold the parents of 24 joints"):
+        parents = np.array(load_array(files[1]), int).reshape(len(JOINTS)).tolist()
+        above = (-1, *parents[1:])  # the file has a number for the root, too
+        if not all(0 <= parent < number for number, parent in enumerate(above) if number):
+            raise ValueError("a joint comes before its parent, or has none")
     local = np.concatenate([np.broadcast_to(np.eye(3), (24, 3, 3)), joints[:, :, None]], -1)
     local[1:, :, 3] -= joints[list(above[1:])]
     poses, first = [], None
@@ -150,11 +166,9 @@ def skeleton_of(folder: Path, frames: list[int]) -> Skeleton:
 def body_pose(file: Path) -> tuple[torch.Tensor, torch.Tensor]:
     """From the body to the world (3, 4), and rotations of joints in their parents (joint, 3, 3)."""
     said: Any = load_pickled(file)
-    try:
-        turns = torch.from_numpy(np.array(said["poses"], float).reshape(24, 3))
-        rh, th = (torch.from_numpy(np.array(said[name], float).reshape(1, 3)) for name in ("Rh", "Th"))
-    except (KeyError, TypeError, ValueError, IndexError) as fault:
-        raise LumigraphError(f"{file} does not hold a pose as ZJU-MoCap's files do ({fault}); restore it") from fault
+    with reading(file, "does not hold a pose as ZJU-MoCap's files do"):
+        turns = torch.from_numpy(finite(said["poses"], "poses").reshape(24, 3))
+        rh, th = (torch.from_numpy(finite(said[name], name).reshape(1, 3)) for name in ("Rh", "Th"))
     return torch.cat([matrices_of(rh)[0], th.T], -1), matrices_of(turns)
 
 

@@ -22,6 +22,7 @@ from .. import files
 from ..camera.crop import Crop, CropBox
 from ..camera.rays import Rays
 from ..errors import LumigraphError
+from ..files.reading import reading
 from ..geometry import Similarity, Vector
 from ..selection.cutting import UNKNOWN_COLOUR
 
@@ -103,12 +104,9 @@ def mask_of(
 
 def read_mask(path: Path) -> VoxelMask:
     """Read a mask's file. Raises LumigraphError for a file that is none."""
-    with files.explained(path):
-        try:
-            arrays = safetensors.numpy.load(path.read_bytes())
-            part, observed, lower, edge = (arrays[name] for name in ("object", "observed", "lower", "edge"))
-        except (safetensors.SafetensorError, KeyError) as error:
-            raise LumigraphError(f"{path} is no mask of voxels; `lumigraph segment` makes one") from error
+    with reading(path, "is no mask of voxels", "`lumigraph segment` makes one"):
+        arrays = safetensors.numpy.load(path.read_bytes())
+        part, observed, lower, edge = (arrays[name] for name in ("object", "observed", "lower", "edge"))
     sound = part.ndim == 3 and part.shape == observed.shape and 0 < min(part.shape) and max(part.shape) <= MAX_CELLS
     sound = sound and part.dtype == observed.dtype == np.uint8 and lower.shape == (3,) and edge.shape == (1,)
     if not (sound and np.isfinite(lower).all() and np.isfinite(edge).all() and edge[0] > 0):

@@ -72,7 +72,8 @@ class Skeleton:
         return len(self.names)
 
     def check(self) -> None:
-        """Raises LumigraphError for a skeleton without bones, poses of other bones, and times that go back."""
+        """Raises LumigraphError for a skeleton without bones, poses of other bones, joints all in one
+        place, and times that go back."""
         count = len(self.names)
         if not count or len(self.parents) != count:
             raise LumigraphError(f"A skeleton has {count} names and {len(self.parents)} parents; give one of each bone")
@@ -97,6 +98,8 @@ class Skeleton:
                 )
             if not all(any(rotation) for rotation in pose.rotations):
                 raise LumigraphError(f"{what} has a rotation of four zeros; give a quaternion (w, x, y, z)")
+        if count > 1 and len(set(self.rest.positions)) == 1:
+            raise LumigraphError("The joints of a skeleton at rest are all in one place; give the pose of a body")
 
     def transformed(self, frame: Similarity) -> Skeleton:
         """The same skeleton in another frame."""

@@ -8,8 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..files import claim, claim_folder, exists, expanded, explained
+from ..files import claim, claim_folder, exists, expanded
 from ..files.ply import read_header
+from ..files.reading import reading
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
 from ..system.progress import counting
@@ -40,7 +41,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     path = place_of(expanded(path))
     layout = layout_of(path)
     suffix = "" if layout else check_ending(path)
-    with explained(path):
+    with reading(path, "is truncated or damaged", "copy or download it again"):
         if not layout:
             _check_file(path)
         with counting(f"Reading {path.name}"):
@@ -90,7 +91,7 @@ def is_splat_file(path: Path | str) -> bool:
     if path.is_dir():
         return layout_of(path) is not None
     if path.name.lower().endswith(".glb") and path.is_file():
-        with explained(path):
+        with reading(path):
             return glb.recognises(path)
     return path.name.lower().endswith(SUFFIXES)
 

@@ -22,6 +22,7 @@ from .. import files
 from ..datasets.skeleton import Skeleton, retargeted, turned_joints
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, typed
+from ..files.reading import reads
 from ..geometry import Similarity
 from . import skinned_gltf
 
@@ -44,6 +45,7 @@ class AnglesRecord:
     format: str = FORMAT
 
 
+@reads()
 def read_bones(path: Path) -> Skeleton:
     """The skeleton in a bones.json. Raises LumigraphError for a file that holds none."""
     said = _said(path)
@@ -58,6 +60,7 @@ def write_bones(path: Path, skeleton: Skeleton) -> None:
     files.write_json(path, {"format": FORMAT} | asdict(skeleton))
 
 
+@reads()
 def read_motion(path: Path, onto: Skeleton, to_scene: Similarity) -> Skeleton:
     """Poses in a file for the bones of a skeleton: a bones.json, joint angles, or a glTF file's first animation.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import torch
 
 from ..errors import LumigraphError
 from ..files.ranges import shown
+from ..files.reading import reading
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
 
@@ -78,10 +78,8 @@ class Bundle:
             return
         data = path.read_bytes()
         self.size = len(data)
-        try:
+        with reading(path, "is no archive, or a part of one", "copy it again"):
             self._archive = zipfile.ZipFile(io.BytesIO(data))
-        except (zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as fault:
-            raise LumigraphError(f"{path} is no archive, or a part of one ({fault}); copy it again") from fault
 
     def read(self, name: str) -> bytes:
         """A file at the top. Raises LumigraphError if it is not there, is damaged or unpacks beyond belief."""
@@ -90,17 +88,15 @@ class Bundle:
             if Path(name).name != name or file.is_symlink() or not file.is_file():
                 raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy the whole folder again")
             return file.read_bytes()
-        try:
+        if name not in self._archive.namelist():
+            raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again")
+        with reading(f"{self.path}: {shown(name)}", "is damaged", "download it again"):
             about = self._archive.getinfo(name)
             if about.file_size > max(SMALL_BYTES, MAX_RATIO * self.size):
                 size = f"{about.file_size:,} bytes"
                 raise LumigraphError(f"{self.path}: {shown(name)} would unpack to {size}; download it again")
             with self._archive.open(about) as stream:
                 return stream.read(about.file_size)  # no more, whatever is there
-        except KeyError as fault:
-            raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again") from fault
-        except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError) as fault:
-            raise LumigraphError(f"{self.path}: {shown(name)} is damaged ({fault}); download it again") from fault
 
 
 def zipped(files: dict[str, bytes]) -> bytes:

@@ -24,7 +24,8 @@ from jaxtyping import Float, Int
 
 from .. import __version__
 from ..errors import LumigraphError
-from ..files import exists, expanded, explained, write_bytes
+from ..files import exists, expanded, write_bytes
+from ..files.reading import reading
 from ..gaussians.cloud import BAND_0
 from ..gaussians.moving import MovingGaussians
 from ..system.progress import counting
@@ -224,13 +225,8 @@ def read_moving(path: Path | str) -> MovingGaussians:
     path = expanded(path)
     if exists(path) and not path.is_file():
         raise LumigraphError(f"{path} is no ordinary file; name a file that ends in {SUFFIX}")
-    with explained(path):
-        data = path.read_bytes()
-    try:
-        with counting(f"Reading {path.name}"):
-            found = _read(path, data)
-    except (struct.error, zlib.error, ValueError, IndexError, KeyError, OverflowError, UnicodeDecodeError) as fault:
-        raise LumigraphError(f"{path} is damaged ({fault}); copy or download it again") from fault
+    with reading(path, "is damaged", "copy or download it again"), counting(f"Reading {path.name}"):
+        found = _read(path, path.read_bytes())
     checked(found.cloud, str(path), "restore it from a copy")
     return found
 

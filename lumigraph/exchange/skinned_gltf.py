@@ -19,6 +19,7 @@ from PIL import Image
 from ..color.srgb import srgb_from_linear
 from ..datasets.skeleton import ROOT, BonePose, Skeleton
 from ..errors import LumigraphError
+from ..files.reading import reads
 from . import gltf
 from .glb import node_matrix
 
@@ -121,6 +122,7 @@ class _Nodes:
         return rigid(self.worlds(clip, seconds))
 
 
+@reads("is damaged", "export it again")
 def read_character(path: Path) -> SkinnedCharacter:
     """The first skinned mesh of a file with its bones and animations. Raises LumigraphError for a file without one."""
     file = gltf.File(path)

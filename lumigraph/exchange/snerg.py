@@ -28,12 +28,13 @@ import msgspec
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from ..errors import LumigraphError
 from ..files import claim_folder, from_json, replacing_folder
 from ..files.ranges import Coordinate, Positive, Row, between, typed
+from ..files.reading import reading, reads
 from ..system.memory import free_memory, gigabytes
 from ..system.progress import track
 from .baked import Atlas, ViewNetwork
@@ -215,6 +216,7 @@ def params(atlas: Atlas, blocks: tuple[int, int, int]) -> dict[str, Any]:
 # Reading
 
 
+@reads("is damaged", "copy the whole folder again")
 def read(folder: Path) -> Atlas:
     """The atlas that such a folder holds, its axes those of the scene. Raises LumigraphError, in one sentence, where a
     slice is missing, cut or of another size, and for numbers that contradict each other."""
@@ -274,17 +276,17 @@ def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
 def picture(bundle: Bundle, name: str, size: tuple[int, int], mode: str) -> UInt8[np.ndarray, "row column channel"]:
     """Pixels of a PNG of a size. Raises LumigraphError where it is missing, cut, or something else."""
     data = bundle.read(name)
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            if image.size != size or image.mode != mode:
-                raise LumigraphError(
-                    f"{bundle.path}: {name} is {image.width} x {image.height} {image.mode}, and should be "
-                    f"{size[0]} x {size[1]} {mode}; copy the whole folder again"
-                )
-            return np.asarray(image)
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as fault:
-        reason = "it is no PNG" if isinstance(fault, UnidentifiedImageError) else str(fault).rstrip(".")
-        raise LumigraphError(f"{bundle.path}: {name} is damaged ({reason}); copy the whole folder again") from fault
+    remedy = "copy the whole folder again"
+    with (
+        reading(f"{bundle.path}: {name}", "is damaged", remedy),
+        Image.open(io.BytesIO(data), formats=("PNG",)) as image,
+    ):
+        if image.size != size or image.mode != mode:
+            raise LumigraphError(
+                f"{bundle.path}: {name} is {image.width} x {image.height} {image.mode}, and should be "
+                f"{size[0]} x {size[1]} {mode}; {remedy}"
+            )
+        return np.asarray(image)
 
 
 def turned(atlas: Atlas, turn: np.ndarray) -> Atlas:

@@ -27,11 +27,12 @@ import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..errors import LumigraphError
 from ..files import from_json, read_bytes, replacing_folder, write_bytes
 from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
+from ..files.reading import reading
 from ..gaussians import Gaussians
 from .checks import Bundle, check_room, zipped
 from .codes import (
@@ -228,17 +229,16 @@ class _Pictures:
     def whole(self, name: str, least: int) -> UInt8[np.ndarray, "row column 4"]:
         """A picture of at least so many pixels. Raises LumigraphError if it is none, or smaller, or absurdly large."""
         path, data = self.bundle.path, self.bundle.read(name)
-        try:
-            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                pixels = image.width * image.height
-                if pixels < least:
-                    found = f"{shown(name)} has {pixels:,} pixels where {least:,} are needed"
-                    raise LumigraphError(f"{path}: {found}; get it again")
-                check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
-                return np.asarray(image.convert("RGBA"))
-        except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as fault:
-            why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
-            raise LumigraphError(f"{path}: {shown(name)} cannot be read as a picture ({why}); get it again") from fault
+        with (
+            reading(f"{path}: {shown(name)}", "cannot be read as a picture", "get it again"),
+            Image.open(io.BytesIO(data), formats=FORMATS) as image,
+        ):
+            pixels = image.width * image.height
+            if pixels < least:
+                found = f"{shown(name)} has {pixels:,} pixels where {least:,} are needed"
+                raise LumigraphError(f"{path}: {found}; get it again")
+            check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
+            return np.asarray(image.convert("RGBA"))
 
     def means(self, about: QuantizedMeans) -> Vectors:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)

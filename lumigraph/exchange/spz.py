@@ -16,13 +16,10 @@ takes 20 bytes and 3 (K - 1) of harmonics.
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import io
 import math
 import struct
-import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -69,25 +66,14 @@ def read(path: Path) -> Gaussians:
     data = path.read_bytes()
     stream: io.BufferedIOBase
     if data[:8] == MAGIC + struct.pack("<I", NEWEST_VERSION):
-        with _damage_reported(path):
-            return _decode_tabled(path, data)
+        return _decode_tabled(path, data)
     if data[:4] == MAGIC:  # earlier ones, before gzip
         stream = io.BytesIO(data)
     elif data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
     else:
         raise LumigraphError(f"{path} is no .spz file, for it does not begin like one; name another one")
-    with _damage_reported(path):
-        return _decode(path, stream, MAX_DEFLATE_RATIO * len(data))
-
-
-@contextlib.contextmanager
-def _damage_reported(path: Path) -> Iterator[None]:
-    """Raise faults of unpacking as a LumigraphError of one sentence."""
-    try:
-        yield
-    except (EOFError, zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as fault:
-        raise LumigraphError(f"{path} is truncated or damaged ({fault}); copy or download it again") from fault
+    return _decode(path, stream, MAX_DEFLATE_RATIO * len(data))
 
 
 def write(path: Path, gaussians: Gaussians) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from ..errors import LumigraphError
+from .reading import reading
 
 
 def flatten(value: Any, tensors: dict[str, Tensor], name: str = "optimizers") -> Any:
@@ -42,16 +41,9 @@ def unflatten(value: Any, tensors: dict[str, Tensor]) -> Any:
     return value
 
 
-@contextlib.contextmanager
-def understood(path: Path) -> Iterator[None]:
-    """Turn the ways in which a file can fail to hold what was expected into one sentence."""
-    try:
-        yield
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError) as error:
-        raise LumigraphError(
-            f"{path} does not hold what it should ({type(error).__name__}: {error}); it was edited, "
-            f"or written by another version"
-        ) from error
+def understood(path: Path) -> AbstractContextManager[None]:
+    """`reading` of a file that Lumigraph wrote."""
+    return reading(path, "does not hold what it should", "it was edited, or written by another version")
 
 
 def alike(a: Any, b: Any, tolerance: float = 1e-4) -> bool:

@@ -23,6 +23,7 @@ from .. import files
 from ..capture import CapturePart
 from ..errors import LumigraphError
 from ..files.ranges import Point, Positive, between, typed
+from ..files.reading import reads
 from ..run.settings import Source
 
 PLAN_FORMAT = "lumigraph blocks 1"
@@ -84,6 +85,7 @@ class Task:
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     @staticmethod
+    @reads()
     def read(folder: Path) -> Task:
         """The task in a block's folder. Raises LumigraphError, naming the file, where it is missing or damaged."""
         return files.read_json(folder / TASK_FILE, Task)
@@ -128,6 +130,7 @@ class Plan:
     appearance: dict[str, list[Number]] = field(default_factory=dict)
 
     @staticmethod
+    @reads()
     def read(path: Path) -> Plan:
         """The plan in a file. Raises LumigraphError, naming it, where it is foreign or damaged."""
         said = files.read_json(path)

@@ -20,8 +20,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-from .. import files
 from ..errors import LumigraphError
+from ..files.reading import reading
 
 VARIABLE = "LUMIGRAPH_LPIPS"  # names the files where no option does
 DEFINITION = "Zhang 2018: AlexNet, linear heads v0.1, pictures in [-1, 1]; 0 is equal"
@@ -118,17 +118,10 @@ def load_lpips(paths: Sequence[Path]) -> Lpips:
 
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Named tensors of a safetensors file or a PyTorch state dict. No code in it runs."""
-    with files.explained(path):
-        try:
-            if path.suffix == ".safetensors":
-                return safetensors.torch.load(path.read_bytes())
-            found = torch.load(path, map_location="cpu", weights_only=True)
-        except OSError:
-            raise
-        except Exception as error:  # what is no such file fails in many ways
-            raise LumigraphError(
-                f"{path} is no file of weights ({type(error).__name__}); give safetensors or a state dict"
-            ) from error
+    with reading(path, "is no file of weights", "give safetensors or a state dict"):
+        if path.suffix == ".safetensors":
+            return safetensors.torch.load(path.read_bytes())
+        found = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
         raise LumigraphError(f"{path} holds no state dict of tensors; give safetensors or a state dict")
     return found

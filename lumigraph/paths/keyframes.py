@@ -25,6 +25,7 @@ from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files import read_json, write_json
 from ..files.ranges import Coordinate, Row, Side, between, typed
+from ..files.reading import reads
 from ..geometry import RIGID_TOLERANCE, is_similarity, to_matrix, to_quaternion
 
 FORMAT = "lumigraph camera path 1"
@@ -108,6 +109,7 @@ class CameraPath:
         write_json(path, {"format": FORMAT, **data}, "camera path")
 
     @classmethod
+    @reads()
     def load(cls, path: Path) -> CameraPath:
         """A path that `save` wrote, or the JSON beside a film that `lumigraph render` made.
 

@@ -14,6 +14,7 @@ from PIL import Image
 from ..errors import LumigraphError
 from ..files import exists, read_json, replacing_folder, write_json
 from ..files.ranges import Point, Positive, between, typed
+from ..files.reading import reads
 from .grid import ProbeGrid
 from .harmonics import MAX_ORDER
 from .octahedral import BORDER
@@ -72,6 +73,7 @@ def write_probes(folder: Path, grid: ProbeGrid, geographic: dict[str, float] | N
         write_json(partial / INDEX, said, ours=True)
 
 
+@reads("cannot be read as probes", "export the probes again")
 def read_probes(path: Path | str) -> ProbeGrid:
     """The probes of a folder, or of its probes.json. Raises LumigraphError for anything else."""
     path = Path(path)
@@ -141,16 +143,13 @@ def save(path: Path, shares: Float[np.ndarray, "row column"]) -> None:
     Image.fromarray(values).save(path)
 
 
+@reads("cannot be read", "export the probes again, or copy it anew")
 def load(path: Path, shape: tuple[int, int]) -> np.ndarray:
     """Numbers of a grey PNG of 16 bits. Raises LumigraphError for one that is missing, cut short or of another size."""
-    try:
-        with Image.open(path) as image:
-            if image.size != shape[::-1] or not image.mode.startswith("I"):
-                raise LumigraphError(
-                    f"{path} has {image.size[0]}x{image.size[1]} pixels of mode {image.mode}, and its index promises "
-                    f"{shape[1]}x{shape[0]} of 16 bits; export the probes again"
-                )
-            return np.asarray(image, np.float64)
-    except (OSError, SyntaxError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise LumigraphError(f"{path} cannot be read ({reason}); export the probes again, or copy it anew") from error
+    with Image.open(path) as image:
+        if image.size != shape[::-1] or not image.mode.startswith("I"):
+            raise LumigraphError(
+                f"{path} has {image.size[0]}x{image.size[1]} pixels of mode {image.mode}, and its index promises "
+                f"{shape[1]}x{shape[0]} of 16 bits; export the probes again"
+            )
+        return np.asarray(image, np.float64)

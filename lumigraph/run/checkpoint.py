@@ -28,6 +28,7 @@ from ..exchange import packing
 from ..files.partials import partial
 from ..files.plain import flatten, understood, unflatten
 from ..files.ranges import Lasted, Tally, typed
+from ..files.reading import reading
 from ..method import Method
 from ..system.memory import free_memory
 
@@ -149,13 +150,10 @@ class Checkpoints:
         """Give a method the latest state's weights."""
         checkpoint = self.latest
         tensors = self._read_tensors(checkpoint, self.weights.name)
-        try:
+        with reading(checkpoint, f"does not fit the method {self.method}"):
             take_shapes(method, tensors)
             check_kinds(method.state_dict(), tensors)
             method.load_state_dict(tensors)
-        except RuntimeError as error:
-            reason = " ".join(str(error).split())
-            raise LumigraphError(f"{checkpoint} does not fit the method {self.method}: {reason}") from error
 
     def load_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
         """Give optimizers and random numbers the latest state."""
@@ -197,10 +195,8 @@ class Checkpoints:
             raise LumigraphError(f"{path} is damaged: its checksum is not the one it was saved with; restore a copy")
         if name == PACKED_FILE:
             return packing.read(data, path)
-        try:
+        with reading(path, "holds no tensors"):
             return safetensors.torch.load(data)
-        except Exception as error:  # of a library that keeps no list of them
-            raise LumigraphError(f"{path} holds no tensors ({error}); restore it from a copy") from error
 
 
 def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:

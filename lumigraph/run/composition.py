@@ -66,6 +66,7 @@ from ..datasets.scene import Frame
 from ..datasets.tracks import TrackEdit, TrackEdits
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
+from ..files.reading import reads
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
@@ -270,6 +271,7 @@ class CompositionRecord:
     format: str = FORMAT
 
 
+@reads()
 def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     """The parts that a file names, and the number of the one that leads. Opens none of them."""
     said = files.read_json(path)

@@ -25,6 +25,7 @@ from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
 from ..files.ranges import Count, Lasted, Name, Seed, Share, Tally, typed
+from ..files.reading import reads
 from ..method import Method
 from ..method.capabilities import CanPrune, needs
 from ..method.prior import Prior
@@ -47,6 +48,7 @@ class Record:
         files.write_json(folder / self.file, asdict(self), ours=True)
 
     @classmethod
+    @reads()
     def read(cls, folder: Path) -> Any:
         """The record in a run's folder; None in other runs. Raises LumigraphError for a damaged record."""
         return files.read_json(folder / cls.file, cls) if files.is_file(folder / cls.file) else None

@@ -116,8 +116,8 @@ class Run(Trained):
 
     @contextlib.contextmanager
     def kept_if_learnt(self) -> Iterator[None]:
-        """A block in which a new run is trained. Where a fault ends it that a user can mend, before anything was kept,
-        the run is taken back, so that the same command may name the same folder again."""
+        """A block in which a new run is trained. Where a fault ends it before anything was kept, the run is taken
+        back, so that the same command may name the same folder again."""
         with taken_back(self.folder, lambda: not self.has_state):
             yield
 
@@ -334,10 +334,10 @@ def build(
 
 @contextlib.contextmanager
 def taken_back(folder: Path, useless: Callable[[], bool]) -> Iterator[None]:
-    """A block after whose fault, such as a full disk, nothing of a run is left in its folder, if it is useless."""
+    """A block after whose fault, such as a full disk or want of memory, nothing of a useless run is left."""
     try:
         yield
-    except (LumigraphError, OSError):
+    except Exception:
         if useless():
             for preview in (folder / "previews").glob("*.png"):
                 files.remove(preview)

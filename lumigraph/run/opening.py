@@ -19,6 +19,7 @@ from ..exchange import fourdgs, is_splat_file, place_of, read_gaussians, snerg
 from ..exchange.baked import Atlas
 from ..files import is_file, read_json
 from ..files.ranges import changed
+from ..files.reading import reads
 from ..gaussians import Gaussians
 from ..geometry import Similarity
 from ..method import Method
@@ -33,6 +34,7 @@ VOXEL_MARGIN = 0.02  # beyond [-1, 1]^3, that a voxel may reach
 WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
 
+@reads()
 def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
     one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
@@ -55,6 +57,7 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     return SnergFolder(path) if snerg.recognises(path) and not is_block_run(path) else open_run(path)
 
 
+@reads()
 def open_run(path: Path | str) -> Trained:
     """A run, of one field or in blocks. Raises LumigraphError for a folder that is neither."""
     if not is_block_run(Path(path)):

@@ -18,6 +18,7 @@ from ..datasets.scene import Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted
 from ..files.ranges import Coordinate, Lasted, Row, Side, Tally, typed
+from ..files.reading import reads
 from ..geometry import RIGID_TOLERANCE
 from ..metrics import Score
 
@@ -109,6 +110,7 @@ class EvaluationRecord(Means):
     evaluated_on: str = "unknown"
 
 
+@reads()
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl; those that are damaged, as one that a kill cut short, are passed over."""
     if not path.exists():
@@ -125,6 +127,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+@reads()
 def read_evaluation(path: Path) -> dict[str, Any]:
     """Read eval.json. Raises LumigraphError, naming the file, if it is invalid."""
     said = files.read_json(path)
@@ -174,6 +177,7 @@ def warn_of_changes(known: Mapping[str, str], data: Scene, run: Path) -> None:
         )
 
 
+@reads()
 def read_cameras(path: Path) -> CamerasRecord:
     """Read cameras.json. Raises LumigraphError, naming it, if its rows are inconsistent."""
     said = files.read_json(path, CamerasRecord)

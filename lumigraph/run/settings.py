@@ -14,6 +14,7 @@ from ..capture import CapturePart, Unposed
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, typed, value_of
+from ..files.reading import reads
 from ..method import Method
 from ..system.memory import ask_for, free_on
 
@@ -78,6 +79,7 @@ class Settings:
     said: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @staticmethod
+    @reads()
     def read(file: Path) -> Settings:
         """Read a config.json. Raises LumigraphError, naming the file, if it is foreign or damaged."""
         said = files.read_json(file)

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, normalize, relu
 
-from .. import files
 from ..errors import LumigraphError
+from ..files.reading import reading
 from .descriptors import describe
 
 COMPONENTS = 12  # of the features, in which points are matched
@@ -72,15 +72,11 @@ def raw_features(maps: Maps, rgb: Float[Tensor, "height width 3"]) -> Float[Tens
 
 def convolution_maps(path: Path) -> Maps:
     """Maps of a plain convolutional network whose weights a safetensors file holds."""
-    with files.explained(path):
-        if not path.exists():
-            raise LumigraphError(f"{path} does not exist; name a file of weights, .safetensors or .onnx")
-        try:
-            with safe_open(path, "pt") as held:
-                weights = {name: held.get_tensor(name) for name in held.keys()}  # no dictionary
-                said = (held.metadata() or {}).get("strides", "")
-        except SafetensorError as error:
-            raise LumigraphError(f"{path} is no safetensors file; give one, or a network as .onnx") from error
+    if not path.exists():
+        raise LumigraphError(f"{path} does not exist; name a file of weights, .safetensors or .onnx")
+    with reading(path, "is no safetensors file", "give one, or a network as .onnx"), safe_open(path, "pt") as held:
+        weights = {name: held.get_tensor(name) for name in held.keys()}  # no dictionary
+        said = (held.metadata() or {}).get("strides", "")
     names = sorted((x[: -len(".weight")] for x in weights if x.endswith(".weight")), key=numbers_in)
     layers = [(weights[f"{name}.weight"].float(), weights.get(f"{name}.bias")) for name in names]
     channels = 3
@@ -116,14 +112,8 @@ def onnx_maps(path: Path) -> Maps:
         runtime = importlib.import_module("onnxruntime")
     except ImportError as error:
         raise LumigraphError(f"{path} needs onnxruntime; pip install 'lumigraph[onnx]'") from error
-    with files.explained(path):
-        try:
-            session = runtime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
-        except OSError:
-            raise
-        except Exception as error:  # onnxruntime has an exception for each fault of a file
-            reason = str(error).partition("\n")[0]
-            raise LumigraphError(f"{path} is no ONNX network that runs here ({reason}); export it anew") from error
+    with reading(path, "is no ONNX network that runs here", "export it anew"):
+        session = runtime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
     (taken, *others), given = session.get_inputs(), session.get_outputs()[0]
     if others or len(taken.shape) != 4 or taken.shape[1] != 3:
         raise LumigraphError(f"{path} should take one input of shape (1, 3, height, width); export it so")

@@ -11,10 +11,10 @@ from jaxtyping import Bool, Int
 from PIL import Image
 from torch import Tensor
 
-from .. import files
 from ..camera import Camera
 from ..datasets.images.layer import UNKNOWN_INDEX
 from ..errors import LumigraphError
+from ..files.reading import reading
 
 WANTED, UNWANTED = (0, 255, 0), (255, 0, 0)  # sRGB bytes: green and red
 TOLERANCE = 64  # per channel, for brushes with soft edges
@@ -42,14 +42,8 @@ def read_strokes(path: Path, camera: Camera, name: str) -> Strokes:
     camera: of the view they were drawn on; its name is for messages
     Raises LumigraphError for a file that is no picture, a picture of another size, and one without strokes.
     """
-    with files.explained(path):
-        try:
-            with Image.open(path) as image:
-                rgba = np.asarray(image.convert("RGBA"))
-        except OSError as error:
-            if not path.exists():
-                raise
-            raise LumigraphError(f"{path} is no picture that opens; give a PNG with green and red strokes") from error
+    with reading(path, "is no picture that opens", "give a PNG with green and red strokes"), Image.open(path) as image:
+        rgba = np.asarray(image.convert("RGBA"))
     height, width = rgba.shape[:2]
     if [width, height] != camera.size[0].tolist():
         expected = "x".join(map(str, camera.size[0].tolist()))
@@ -76,7 +70,7 @@ def read_segments(folder: Path, name: str, camera: Camera) -> Int[Tensor, "heigh
     )
     if found is None:
         raise LumigraphError(f"None of the masks in {folder} is named after {name}; call it {Path(name).stem}.png")
-    with files.explained(found), Image.open(found) as image:
+    with reading(found, "is no picture that opens", "give a PNG of whole numbers"), Image.open(found) as image:
         values = np.asarray(image)
     values = values[..., :3] @ np.array([1, 256, 65536]) if values.ndim == 3 else values
     if [values.shape[1], values.shape[0]] != camera.size[0].tolist():

@@ -17,9 +17,10 @@ from PIL import Image
 from ...errors import LumigraphError
 from ...files import exists, explained
 from ...files.names import counted, natural
+from ...files.reading import reason_of
 from ...system.memory import threads_for
 from ..masks import MASKS, OBJECT_MASKS, find_mask
-from ..pictures import HEIC_SUFFIXES, NO_HEIC, describe, reads_heic
+from ..pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
 from ..raw import Developed, is_raw
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
 from .exif import read_facts
@@ -208,7 +209,7 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
     except LumigraphError:
         raise
     except Exception as fault:  # image libraries raise anything for a damaged file
-        return "it is cut short or damaged" if heic and not getattr(fault, "strerror", None) else describe(fault)
+        return "it is cut short or damaged" if heic and not getattr(fault, "strerror", None) else reason_of(fault)
     known = facts.device, facts.focal, facts.gps, facts.time
     photo = Photo(name, upright_file, size, *known, found.sharpness, found.brightness, mask_beside(path))
     return Candidate(photo, found.signature, path.stat().st_size)

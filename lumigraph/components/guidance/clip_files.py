@@ -17,12 +17,12 @@ from typing import Annotated, Any
 
 import safetensors.torch
 import torch
-from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from ... import files
 from ...errors import LumigraphError
 from ...files.ranges import between
+from ...files.reading import reading, reads
 from .clip import (
     ACTIVATIONS,
     DEVIATION,
@@ -96,6 +96,7 @@ NAMES = (
 PROJECTIONS = "visual_projection.weight", "text_projection.weight"  # transposed in Hugging Face's layout
 
 
+@reads("cannot be read as a CLIP")
 def read_clip(path: Path) -> tuple[Clip, Tokenizer]:
     """A model and its tokenizer from a folder, or from a file of weights beside their config and vocabulary.
 
@@ -127,11 +128,10 @@ def first(folder: Path, names: tuple[str, ...]) -> Path | None:
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Tensors of a safetensors file as float32."""
-    with files.explained(path):
-        try:
-            found = safetensors.torch.load_file(path)
-        except SafetensorError as error:
-            raise LumigraphError(f"{path} is no safetensors file; give the weights of CLIP as .safetensors") from error
+    with reading(path, "is no safetensors file", "give the weights of CLIP as .safetensors"):
+        found = safetensors.torch.load_file(path)
+    if broken := next((name for name, x in found.items() if x.is_floating_point() and not x.isfinite().all()), None):
+        raise LumigraphError(f"{path}: {broken[:80]} has numbers that are not finite; download the weights again")
     return {name: x.float() if x.is_floating_point() else x for name, x in found.items()}
 
 
@@ -151,7 +151,8 @@ def named_as_here(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def sizes_of(tensors: dict[str, Tensor], record: ConfigRecord, path: Path) -> ClipSizes:
     """Sizes that the tensors' shapes and the config say. Raises LumigraphError where these are of no CLIP."""
-    try:
+    remedy = "give a CLIP with a vision transformer or a residual network, such as ViT-B/32"
+    with reading(path, "holds the weights of another architecture than CLIP's", remedy):
         text = tower_of(tensors, "transformer.", record, "text")
         vocabulary, context = tensors["token_embedding.weight"], tensors["positional_embedding"]
         embedding = tensors["text_projection"].shape[1]
@@ -165,11 +166,6 @@ def sizes_of(tensors: dict[str, Tensor], record: ConfigRecord, path: Path) -> Cl
             plain = tower_of(tensors, "visual.transformer.", record, "vision")
             patch = tensors["visual.conv1.weight"].shape[-1]
             vision, places = VisionSizes(**vars(plain), patch=patch), len(tensors["visual.positional_embedding"])
-    except (KeyError, ValueError, IndexError) as error:
-        raise LumigraphError(
-            f"{path} holds the weights of another architecture than CLIP's ({error} is not among them); give a CLIP "
-            "with a vision transformer or a residual network, such as ViT-B/32"
-        ) from error
     return ClipSizes(vision, text, round((places - 1) ** 0.5) * patch, len(vocabulary), len(context), embedding)
 
 
@@ -214,7 +210,7 @@ def read_tokenizer(folder: Path) -> Tokenizer:
         pairs = [tuple(line.split(" ")) for line in lines if line != MERGES_VERSION]
         merges = [(pair[0], pair[1]) for pair in pairs if len(pair) == 2]
     elif (folder / PUBLISHED).is_file():
-        with files.explained(folder / PUBLISHED):
+        with reading(folder / PUBLISHED, "is no vocabulary"):
             lines = gzip.decompress(files.read_bytes(folder / PUBLISHED)).decode("utf-8").split("\n")
         pairs = [tuple(line.split()) for line in lines[1 : MAX_MERGES + 1]]
         merges = [(pair[0], pair[1]) for pair in pairs if len(pair) == 2]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ... import files
 from ...errors import LumigraphError
+from ...files.reading import reading
 from ...metrics import Score
 from .clip import TextTransformer
 from .clip_files import ConfigRecord, TowerRecord, load, named_as_here, read_tensors, read_tokenizer, tower_of
@@ -138,11 +139,8 @@ def part_of(path: Path, name: str, kind: str) -> Any:
             f"{path} is a diffusion model and needs diffusers; pip install 'lumigraph[words]'"
         ) from error
     weights = {} if name == "scheduler" else {"use_safetensors": True}
-    try:
+    with reading(path / name, f"holds no {kind} that can be read", "download it again"):
         found = getattr(library, kind).from_pretrained(path, subfolder=name, local_files_only=True, **weights)
-    except Exception as error:  # of a library that keeps no list of them
-        reason = str(error).strip().partition("\n")[0]
-        raise LumigraphError(f"{path / name} holds no {kind} that can be read ({reason}); download it again") from error
     return found if name == "scheduler" else found.eval().requires_grad_(False)
 
 
@@ -153,11 +151,9 @@ def read_text_encoder(folder: Path) -> TextTransformer:
         raise LumigraphError(f"{folder} holds no {TEXT_WEIGHTS}; download the model as safetensors")
     tensors = named_as_here(read_tensors(weights))
     record = ConfigRecord(text_config=files.read_json(folder / "config.json", TowerRecord))
-    try:
+    with reading(weights, "holds no text encoder of CLIP", "give such a model"):
         sizes = tower_of(tensors, "transformer.", record, "text")
         vocabulary, context = len(tensors["token_embedding.weight"]), len(tensors["positional_embedding"])
-    except (KeyError, ValueError) as error:
-        raise LumigraphError(f"{weights} holds no text encoder of CLIP ({error}); give such a model") from error
     encoder = TextTransformer(sizes, vocabulary, context)
     load(encoder, tensors, weights)
     return encoder

@@ -27,6 +27,7 @@ from ...depth_maps import DepthMap
 from ...depth_maps.flat_view import GREY, flat_view
 from ...depth_maps.multi_view import multi_view_depth
 from ...errors import LumigraphError, LumigraphWarning
+from ...files.reading import reading
 from ..fields.level_set import level_set
 from ..sampling.occupancy import visual_hull
 
@@ -171,11 +172,10 @@ def proxy_mesh(file: str, frame: Frame) -> tuple[Float[Tensor, "vertex 3"], Tens
     """Vertices in the scene's frame and faces of a mesh in the frame of the photographs."""
     if not file:
         raise LumigraphError("--geometry mesh needs a mesh in the frame of the photographs; name it by --mesh-file")
-    try:
+    with reading(file, "cannot be read as a mesh of triangles", "export it once more"):
         mesh: Any = trimesh.load(Path(file).expanduser(), force="mesh", process=False)
-        assert len(mesh.faces)
-    except Exception as error:  # readers of many formats fail in many ways
-        raise LumigraphError(f"{file} cannot be read as a mesh of triangles; export it once more") from error
+        if not len(mesh.faces):
+            raise ValueError("it has none")
     vertices = torch.from_numpy(np.asarray(mesh.vertices, np.float32))
     matrix = frame.to_source.inverse.matrix.float()
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], torch.from_numpy(np.asarray(mesh.faces, np.int32))

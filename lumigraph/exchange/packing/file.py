@@ -17,13 +17,13 @@ from typing import Annotated
 
 import numpy as np
 import torch
-import zstandard
 from jaxtyping import Shaped
 from torch import Tensor
 
 from ...errors import LumigraphError
 from ...files import from_json
 from ...files.ranges import Coordinate, Name, between, typed
+from ...files.reading import reading
 from ...system.memory import free_memory, gigabytes
 from .forms import FORMS
 from .streams import Extent, Number, Stream, kind_of, unpacked
@@ -107,14 +107,12 @@ def read(data: bytes, path: Path) -> dict[str, Tensor]:
         raise LumigraphError(f"{path} holds no packed tensors; restore it from a copy")
     head = typed(Head, from_json(data[HEAD.size : HEAD.size + length], path), path)
     check_sizes(head, len(data) - HEAD.size - length, path)
-    try:
+    with reading(path, "does not hold the tensors that it declares", "restore a copy"):
         at, arrays = HEAD.size + length, list[np.ndarray]()
         for stream in head.streams:
             arrays.append(unpacked(stream, data[at : at + stream.bytes]))
             at += stream.bytes
         return {name: tensor_of(entry, arrays) for name, entry in head.tensors.items()}
-    except (ValueError, IndexError, KeyError, RuntimeError, EOFError, zstandard.ZstdError) as error:
-        raise LumigraphError(f"{path} does not hold the tensors that it declares ({error}); restore a copy") from error
 
 
 def check_sizes(head: Head, there: int, path: Path) -> None:
