@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -19,12 +18,14 @@ from numpy.lib.recfunctions import repack_fields, structured_to_unstructured
 
 from ..errors import LumigraphError
 from ..system.memory import ask_for
-from .atomic import Kind, explained, replacing, without_waiting
+from .atomic import Kind, replacing, without_waiting
 from .ranges import shown
+from .reading import reading, reads
 
 MAX_HEADER_BYTES = 1 << 20  # headers of Gaussians have about 1500
 LIST_BYTES = 200  # of memory for each list of a column whose lists have different lengths
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+COPY_AGAIN = "copy or download it again"
 NAMES = {  # by the type of numpy; the first is written
     "i1": ["char", "int8"],
     "u1": ["uchar", "uint8"],
@@ -82,9 +83,10 @@ class Header:
         return {name: [p.name for p in one.properties if p.length is None] for name, one in self.elements.items()}
 
 
+@reads("is no PLY file that can be read", COPY_AGAIN)
 def read_header(path: Path) -> Header:
     """Raises LumigraphError if the file is no PLY file, or is shorter than its header declares."""
-    with explained(path), open(path, "rb", opener=without_waiting) as file:
+    with open(path, "rb", opener=without_waiting) as file:
         data = file.read(MAX_HEADER_BYTES)
         size = file.seek(0, 2)
     first = re.match(rb"ply[ \t]*(\r\n|\r|\n)", data)
@@ -93,17 +95,14 @@ def read_header(path: Path) -> Header:
     line_end = b"\r" if first[1] == b"\r" else b"\n"  # behind \r, a \n belongs to the first row
     end = re.search(rb"(?<=%b)[ \t]*end_header[ \t\r]*?%b" % (line_end, line_end), data)
     if end is None:
-        raise LumigraphError(f"{path} ends within its header; copy or download it again")
-    try:
+        raise LumigraphError(f"{path} ends within its header; {COPY_AGAIN}")
+    with reading(path, "has a header that cannot be understood", "write it again"):
         header = parsed(data[: end.end()])
-    except ValueError as fault:
-        raise LumigraphError(f"{path} has a header that cannot be understood ({fault}); write it again") from fault
     there, least = size - header.size, sum(element.min_bytes(header.text) for element in header.elements.values())
     if least > there:
         rows = ", ".join(f"{count} x {shown(name)[1:-1]}" for name, count in header.counts.items())
         raise LumigraphError(
-            f"{path} ends early: its header promises {rows}, at least {least} bytes, and {there} follow; "
-            "copy or download it again"
+            f"{path} ends early: its header promises {rows}, at least {least} bytes, and {there} follow; {COPY_AGAIN}"
         )
     return header
 
@@ -145,6 +144,7 @@ def add_property(known: list[Property], kinds: list[str], name: str, order: str)
     known.append(Property(name, np.dtype(order + code), length))
 
 
+@reads("cannot be read as a PLY file", COPY_AGAIN)
 def read_rows(path: Path, wanted: Collection[str], header: Header | None = None) -> dict[str, np.ndarray]:
     """Rows of elements by name, as structured arrays; those that the file lacks are left out.
 
@@ -154,21 +154,10 @@ def read_rows(path: Path, wanted: Collection[str], header: Header | None = None)
     header = header or read_header(path)
     names = [*header.elements]
     last = max((names.index(name) + 1 for name in wanted if name in names), default=0)
-    with understood(path), open(path, "rb", opener=without_waiting) as file:
+    with open(path, "rb", opener=without_waiting) as file:
         read = text_reader(file, header, path) if header.text else BinaryReader(file, header, path).rows
         found = {name: rows_of(header.elements[name], read) for name in names[:last]}
     return {name: rows for name, rows in found.items() if name in wanted}
-
-
-@contextmanager
-def understood(path: Path) -> Iterator[None]:
-    """Turn faults of rows into one sentence."""
-    try:
-        with explained(path):
-            yield
-    except (ValueError, OverflowError, StopIteration) as fault:
-        reason = " ".join(str(fault).split())[:200] or "a row ends early"
-        raise LumigraphError(f"{path} cannot be read as a PLY file ({reason}); copy or download it again") from fault
 
 
 def rows_of(element: Element, read: Callable[[Element], np.ndarray]) -> np.ndarray:
