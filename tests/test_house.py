@@ -72,10 +72,14 @@ def floor(name: str) -> int:
 
 
 def imported(source: str, module: str, is_package: bool) -> Iterator[str]:
-    """Everything of the house that a source file imports, at its top or inside a function."""
+    """Everything of the house that a source file imports, at its top, inside a function, or by its name as text."""
     around = module.split(".") if is_package else module.split(".")[:-1]
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
+        if isinstance(node, ast.Call) and (text := named_import(node)):
+            level = len(text) - len(text.lstrip("."))
+            above = around[: len(around) + 1 - level] if level else []
+            names = [".".join([*above, *filter(None, text.lstrip(".").split("."))])]
+        elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = around[: len(around) + 1 - node.level] if node.level else []
@@ -84,6 +88,15 @@ def imported(source: str, module: str, is_package: bool) -> Iterator[str]:
         else:
             continue
         yield from (name for name in names if name.split(".")[0] == "lumigraph")
+
+
+def named_import(call: ast.Call) -> str:
+    """Name of the module that a call imports: a literal, or the constant beginning of a formatted text."""
+    function = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    if function not in ("import_module", "__import__") or not call.args:
+        return ""
+    name = call.args[0].values[0] if isinstance(call.args[0], ast.JoinedStr) else call.args[0]
+    return str(name.value) if isinstance(name, ast.Constant) else ""
 
 
 def faults(source: str, module: str, is_package: bool = False) -> list[str]:
@@ -118,6 +131,9 @@ def test_arrows_point_one_way():
         ("lumigraph.export.film", "def later():\n    from ..methods import find"),
         ("lumigraph.components.grid", "from ..training import fit"),
         ("lumigraph.method", "from .components import perceptron"),
+        ("lumigraph.run.opened", "importlib.import_module('..commands.calls', __package__)"),
+        ("lumigraph.run.opened", "import_module(f'..commands.{name}', __package__)"),
+        ("lumigraph.volume", "__import__('lumigraph.methods')"),
     ],
 )
 def test_an_arrow_the_wrong_way_is_noticed(module, line):
@@ -132,6 +148,7 @@ def test_an_arrow_the_wrong_way_is_noticed(module, line):
         ("lumigraph.methods.instant_ngp", "from .. import kernels\nfrom ..components import perceptron"),
         ("lumigraph.commands.cli", "from lumigraph import Scene, __version__, fit"),
         ("lumigraph.volume", "import torch\nfrom os import path"),
+        ("lumigraph.methods", "import_module(f'.{name}', __package__)\nimportlib.import_module('diffusers')"),
     ],
 )
 def test_an_arrow_the_right_way_is_not(module, line):
