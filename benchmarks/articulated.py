@@ -21,12 +21,12 @@ import tyro
 from PIL import Image
 
 from lumigraph import methods
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Scene
 from lumigraph.figures import to_bytes
 from lumigraph.files import write_json
 from lumigraph.method import Method
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.synthetic.characters import ROUNDS
 from lumigraph.system.signals import go_on_unless

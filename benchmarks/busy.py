@@ -185,7 +185,7 @@ def learner(method: str, scene: str) -> None:
     from lumigraph import methods  # ahead of PyTorch, as the command line does; isort: skip
     import torch
 
-    from lumigraph.capture import open_scene
+    from lumigraph.opening import open_scene
     from lumigraph.run import build
     from lumigraph.training import Descent, set_learning_rate
 

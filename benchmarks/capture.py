@@ -28,10 +28,10 @@ from PIL import Image, ImageOps
 from rich.table import Table
 
 from lumigraph import files
-from lumigraph.capture.motion.agreement import agreement
-from lumigraph.capture.motion.diagnosis import read_matches
-from lumigraph.capture.pictures import list_images
 from lumigraph.geometry import evenly
+from lumigraph.readers.pictures import list_images
+from lumigraph.sfm.agreement import agreement
+from lumigraph.sfm.diagnosis import read_matches
 from lumigraph.system.console import console
 
 VIDEO_FRAMES = 10

@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from lumigraph.capture import choose_reader
+from lumigraph.readers import choose_reader
 
 
 def poses(folder: Path) -> dict[str, Float[np.ndarray, "3 4"]]:

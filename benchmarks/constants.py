@@ -19,10 +19,10 @@ import tyro
 from rich.table import Table
 
 from lumigraph import methods
-from lumigraph.capture import open_dataset
 from lumigraph.evaluation import evaluate
 from lumigraph.files import read_json, write_json
 from lumigraph.files.ranges import changed
+from lumigraph.opening import open_dataset
 from lumigraph.run import build, processor
 from lumigraph.system.console import console
 from lumigraph.system.signals import go_on_unless

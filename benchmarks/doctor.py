@@ -24,12 +24,13 @@ from PIL import Image, ImageFilter, ImageOps
 
 from lumigraph import methods
 from lumigraph.budget import Budget
-from lumigraph.capture import Capture, Shot, assemble, read_capture
-from lumigraph.capture.doctor import Finding, findings, label
-from lumigraph.capture.pictures import list_images
 from lumigraph.evaluation.photographs import compare_all
 from lumigraph.geometry import evenly
+from lumigraph.opening import read_capture
+from lumigraph.readers import Capture, Shot, assemble
+from lumigraph.readers.pictures import list_images
 from lumigraph.run import build
+from lumigraph.sfm.doctor import Finding, findings, label
 from lumigraph.system.signals import exit_code
 from lumigraph.training import fit
 

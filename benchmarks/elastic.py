@@ -18,13 +18,13 @@ import tyro
 from torch import Tensor
 
 from lumigraph import methods
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation import evaluate
 from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import write_bytes
 from lumigraph.geometry import evenly
 from lumigraph.methods.nerfies import Nerfies
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit

@@ -32,8 +32,8 @@ from lumigraph.files import write_json
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import BAND_0, EXTENT_OPACITY, joined
 from lumigraph.geometry import evenly
+from lumigraph.large import open_any
 from lumigraph.metrics import psnr
-from lumigraph.run import open_any
 from lumigraph.system.console import console
 
 FREE_DEVIATIONS = 2.0  # of a blob, between its centre and the nearest solid Gaussian, at least

@@ -18,9 +18,9 @@ from rich.table import Table
 from lumigraph.exchange import SUFFIXES, read_gaussians, write_gaussians
 from lumigraph.gaussians.splatting import render
 from lumigraph.geometry import evenly
+from lumigraph.large import open_any
 from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
-from lumigraph.run import open_any
 from lumigraph.system.console import console
 
 BLACK = (0.0, 0.0, 0.0)

@@ -34,7 +34,7 @@ from lumigraph import kernels
 from lumigraph.commands.view import subject_of
 from lumigraph.figures import to_bytes
 from lumigraph.files import write_json
-from lumigraph.run import open_any
+from lumigraph.large import open_any
 from lumigraph.viewer import Viewer, choose_address
 from lumigraph.viewer.cameras import ViewRequest
 from lumigraph.viewer.visitor import Visitor

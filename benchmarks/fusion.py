@@ -25,13 +25,13 @@ import tyro
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from lumigraph.capture import open_scene
 from lumigraph.datasets.images import cosines
 from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.files import write_json
 from lumigraph.kernels.fuse_depth import CHANNELS
 from lumigraph.methods.tsdf_fusion import TSDFFusion
+from lumigraph.opening import open_scene
 from lumigraph.synthetic import scenes, signed_distance
 from lumigraph.system.console import console
 

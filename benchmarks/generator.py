@@ -27,8 +27,6 @@ import tyro
 from torch import Tensor
 
 from lumigraph.camera import Camera
-from lumigraph.capture import open_dataset
-from lumigraph.capture.views import with_fewer_views
 from lumigraph.commands.draw import magnified, turned
 from lumigraph.components.fields.kept_photographs import square
 from lumigraph.datasets.collection import Collection
@@ -41,6 +39,8 @@ from lumigraph.geometry import evenly
 from lumigraph.methods.eg3d import EG3D
 from lumigraph.metrics import psnr
 from lumigraph.metrics.distribution import RandomFeatures, distances, features_of
+from lumigraph.opening import open_dataset
+from lumigraph.readers.views import with_fewer_views
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 

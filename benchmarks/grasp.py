@@ -24,12 +24,12 @@ from torch import Tensor
 
 from lumigraph import methods
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import open_scene
 from lumigraph.figures import ramp, to_bytes
 from lumigraph.files import write_json
 from lumigraph.geometry import Similarity
 from lumigraph.methods.articulated_splatting import ArticulatedSplatting
 from lumigraph.methods.articulated_splatting.contact import SOLID_OPACITY, gaps
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.synthetic import SyntheticStage, World, scenes, signed_distance, trace
 from lumigraph.synthetic.scenes.grasp import CAN, CAN_HALF, CAN_RADIUS

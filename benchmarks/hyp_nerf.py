@@ -15,10 +15,10 @@ from typing import Any
 
 import tyro
 
-from lumigraph.capture.views import with_fewer_views
 from lumigraph.evaluation import evaluate
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.geometry import evenly
+from lumigraph.readers.views import with_fewer_views
 from lumigraph.run import Run
 
 NOTHING = {"code_steps": 0, "tune_steps": 0, "denoise_steps": 0}

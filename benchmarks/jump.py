@@ -19,11 +19,11 @@ from torch import Tensor
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import OmnidirectionalStereo
-from lumigraph.capture import open_scene
 from lumigraph.depth_maps.stereo import as_bytes, semi_global
 from lumigraph.export import jump
 from lumigraph.figures import Row, contact_sheet
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
 from lumigraph.synthetic import render, scenes
 
 LATITUDE = 48.0  # degrees

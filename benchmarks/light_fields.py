@@ -19,8 +19,6 @@ import torch
 import tyro
 
 from lumigraph import methods
-from lumigraph.capture import open_scene
-from lumigraph.capture.views import with_fewer_views
 from lumigraph.datasets.scene import Scene
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.figures.charts import Series, line_chart, standalone
@@ -28,6 +26,8 @@ from lumigraph.files import scene_name, write_bytes, write_json
 from lumigraph.geometry import evenly
 from lumigraph.method import Method
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
+from lumigraph.readers.views import with_fewer_views
 from lumigraph.run import build
 from lumigraph.system.console import console
 from lumigraph.system.signals import go_on_unless

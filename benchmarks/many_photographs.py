@@ -87,7 +87,7 @@ def apart(part: Callable[[Path, Options], dict[str, float]], folder: Path, optio
 
 def listed(folder: Path, options: Options) -> dict[str, float]:
     """Poses and lenses, without a look at pixels."""
-    from lumigraph.capture import choose_reader
+    from lumigraph.readers import choose_reader
 
     before, begin = peak(), time.perf_counter()
     capture = choose_reader(folder).read(folder)
@@ -98,7 +98,7 @@ def listed(folder: Path, options: Options) -> dict[str, float]:
 
 def drawn(folder: Path, options: Options) -> dict[str, float]:
     """Opening, and random rays."""
-    from lumigraph.capture import open_scene
+    from lumigraph.opening import open_scene
 
     before, begin = peak(), time.perf_counter()
     scene = open_scene(folder, options.downscale, memory=int(options.memory_gb * GIGABYTE), cache=folder.parent)

@@ -32,7 +32,6 @@ from scipy.spatial import cKDTree
 
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import open_scene
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.shapes.triangles import Triangles
 from lumigraph.evaluation import evaluate
@@ -40,6 +39,7 @@ from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
 from lumigraph.method import Method
+from lumigraph.opening import open_scene
 from lumigraph.run import Run
 from lumigraph.synthetic import scenes, signed_distance, trace
 from lumigraph.system.console import console

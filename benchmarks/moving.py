@@ -29,13 +29,13 @@ from torch import Tensor
 
 from lumigraph import methods
 from lumigraph import synthetic as procedural
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation import evaluate
 from lumigraph.figures import to_bytes
 from lumigraph.files import write_json
 from lumigraph.method import Method
 from lumigraph.method.capabilities import HasMotion, can
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.synthetic import SyntheticStage
 from lumigraph.synthetic.stage import told

@@ -26,9 +26,9 @@ from lumigraph.export.page import moving_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import BAND_0
 from lumigraph.gaussians.splatting import render
+from lumigraph.large import open_any
 from lumigraph.metrics import psnr
 from lumigraph.paths.opening import opening_of_scene
-from lumigraph.run import open_any
 
 SHARES = 0.07, 0.29, 0.5, 0.71, 0.93  # of the time
 FRAMES, SIZE, VIEWS = 90, 400, 3

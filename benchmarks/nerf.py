@@ -20,7 +20,6 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from lumigraph.capture import open_scene
 from lumigraph.components.fields import layers
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
@@ -30,6 +29,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
 from lumigraph.methods.nerf import Config, NeRF
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
 from lumigraph.run import Run, build, processor
 
 RAYS, SIDE = 1024, 100  # of a step, and of a frame

@@ -33,14 +33,15 @@ from skimage.graph import MCP_Geometric
 
 from lumigraph import methods
 from lumigraph import synthetic as procedural
-from lumigraph.capture import open_scene
 from lumigraph.color.srgb import srgb_from_linear
 from lumigraph.composition import PickedCloud
 from lumigraph.exchange import read_gaussians
 from lumigraph.figures import Row, contact_sheet
 from lumigraph.gaussians import joined
 from lumigraph.geometry import Similarity, evenly
-from lumigraph.run import build, open_any
+from lumigraph.large import open_any
+from lumigraph.opening import open_scene
+from lumigraph.run import build
 from lumigraph.selection import Selection, Strokes, describe, distil_features, feature_network
 from lumigraph.synthetic.stage import told
 from lumigraph.system.signals import go_on_unless

@@ -29,7 +29,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.files import write_json
 from lumigraph.geometry import evenly
-from lumigraph.run import open_any
+from lumigraph.large import open_any
 
 SIZE, ANGLE = 400, 40.0  # pixels, degrees
 WINDOWS = {"desktop": (1280, 800, 1), "phone": (390, 844, 2)}

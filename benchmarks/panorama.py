@@ -23,7 +23,6 @@ from torch import Tensor
 from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, OmnidirectionalStereo
-from lumigraph.capture import open_scene
 from lumigraph.export.panorama import (
     level_camera,
     panorama,
@@ -35,6 +34,7 @@ from lumigraph.export.panorama import (
 )
 from lumigraph.files import write_json
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
 from lumigraph.run import Run, build
 from lumigraph.synthetic import render, scenes, trace
 from lumigraph.system.console import console

@@ -21,10 +21,10 @@ import tyro
 from rich.table import Table
 
 from lumigraph import methods
-from lumigraph.capture import open_dataset
 from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
 from lumigraph.files import write_json
 from lumigraph.files.ranges import changed, holds
+from lumigraph.opening import open_dataset
 from lumigraph.run import build, processor
 from lumigraph.system.console import console
 from lumigraph.system.signals import go_on_unless

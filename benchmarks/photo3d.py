@@ -22,11 +22,11 @@ from PIL import Image
 from textured import rendered
 from viewer_drag import browser
 
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Scene
 from lumigraph.export.photo3d import photo3d
 from lumigraph.figures import Row, contact_sheet
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
 
 PLACES = {"middle": (0.5, 0.5), "left": (0.05, 0.5), "right": (0.95, 0.5), "top": (0.5, 0.05), "bottom": (0.5, 0.95)}
 WIDTH, HEIGHT = 800, 540  # of a window, pixels

@@ -20,9 +20,9 @@ import trimesh
 import tyro
 from PIL import Image
 
-from lumigraph.capture.meshes import read_shape
 from lumigraph.color.srgb import srgb_from_linear
 from lumigraph.geometry import look_at
+from lumigraph.readers.meshes import read_shape
 from lumigraph.system.progress import track
 
 DISTANCE, ANGLE = 3.2, 0.69  # of the cameras from the origin; of view, radians

@@ -21,13 +21,13 @@ import tyro
 from rich.table import Table
 
 from lumigraph import methods
-from lumigraph.capture import open_scene
 from lumigraph.components.training.pose_refinement import PoseRefinement
 from lumigraph.datasets.alignment import moves
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation import evaluate
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.system.console import console
 from lumigraph.system.signals import go_on_unless

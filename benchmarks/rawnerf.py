@@ -23,8 +23,6 @@ from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 from torch import Tensor
 
 from lumigraph.camera.rays import Rendering
-from lumigraph.capture import open_scene
-from lumigraph.capture.raw.photo import demosaiced
 from lumigraph.components.fields.development import decoded, encoded
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation.views import LIGHT_LAYER, in_light
@@ -32,6 +30,8 @@ from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
 from lumigraph.methods import find
 from lumigraph.metrics import psnr, ssim_map
+from lumigraph.opening import open_scene
+from lumigraph.readers.raw.photo import demosaiced
 from lumigraph.run import build
 from lumigraph.synthetic.sensor import BLACK_LEVEL, DN_PER_PHOTON, READ_NOISE, WHITE_LEVEL
 from lumigraph.system.signals import go_on_unless

@@ -24,14 +24,15 @@ import tyro
 from torch import Tensor
 
 from lumigraph.camera import Camera
-from lumigraph.capture import open_scene
 from lumigraph.components.fields.development import encoded
 from lumigraph.datasets.scene import Scene
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
+from lumigraph.large import open_any
 from lumigraph.light import EnvironmentLight
 from lumigraph.methods.nerfactor import NeRFactor
-from lumigraph.run import Run, State, build, open_any
+from lumigraph.opening import open_scene
+from lumigraph.run import Run, State, build
 from lumigraph.synthetic import lit, scenes
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit

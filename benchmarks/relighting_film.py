@@ -18,8 +18,9 @@ import torch
 import tyro
 
 from lumigraph.figures import Row, contact_sheet, save_picture
+from lumigraph.large import open_any
 from lumigraph.methods.nerfactor import NeRFactor
-from lumigraph.run import Run, State, build, open_any
+from lumigraph.run import Run, State, build
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 

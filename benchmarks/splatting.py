@@ -20,12 +20,12 @@ import tyro
 from rich.table import Table
 
 from lumigraph import kernels, methods
-from lumigraph.capture import open_scene
 from lumigraph.files import write_json
 from lumigraph.files.ranges import changed
 from lumigraph.gaussians import Gaussians, splatting
+from lumigraph.opening import open_scene
 from lumigraph.run import build
-from lumigraph.run.opening import SplatFile
+from lumigraph.run.files import SplatFile
 from lumigraph.system.console import console
 
 PARTS = ("batch", "forward and loss", "backward", "optimiser", "after")

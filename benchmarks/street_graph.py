@@ -29,7 +29,6 @@ from torch import Tensor
 from lumigraph import methods
 from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Scene
 from lumigraph.datasets.tracks import GraphNode, TrackEdit, TrackEdits, nodes_of
 from lumigraph.evaluation import evaluate
@@ -38,6 +37,7 @@ from lumigraph.files import write_json
 from lumigraph.files.ranges import changed
 from lumigraph.method import Method
 from lumigraph.methods.neural_scene_graph.nodes import PoseTable, crossings
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.synthetic.rendering import photograph
 from lumigraph.synthetic.scenes.traffic import with_edits

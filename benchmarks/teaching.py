@@ -16,9 +16,9 @@ from dataclasses import replace
 import torch
 
 from lumigraph import methods
-from lumigraph.capture import open_scene
 from lumigraph.evaluation import evaluate
 from lumigraph.method.depth import DepthNumbers
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit

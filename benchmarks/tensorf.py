@@ -20,10 +20,10 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Batch, Scene
 from lumigraph.files import write_json
 from lumigraph.methods.tensorf import Config, TensoRF
+from lumigraph.opening import open_scene
 from lumigraph.run import build, processor
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit

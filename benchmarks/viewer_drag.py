@@ -28,9 +28,9 @@ from tyro.conf import Positional
 from lumigraph.camera import Camera
 from lumigraph.commands.view import subject_of
 from lumigraph.files import write_json
+from lumigraph.large import open_any
 from lumigraph.method import Method
 from lumigraph.method.capabilities import HasGaussians, can, needs
-from lumigraph.run import open_any
 from lumigraph.viewer import Subject, Viewer, choose_address
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

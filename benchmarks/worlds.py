@@ -27,11 +27,11 @@ from lumigraph.datasets.world import LABELS, BlockWorld
 from lumigraph.evaluation.walks import colours_by_label, warped_difference
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.geometry import evenly
+from lumigraph.methods.gancraft.landscapes import landscape
 from lumigraph.methods.gancraft.spade import channels
 from lumigraph.run import Run
 from lumigraph.synthetic import block_stage
 from lumigraph.synthetic.cameras import pinhole
-from lumigraph.synthetic.landscapes import landscape
 from lumigraph.synthetic.rendering import photograph, trace
 
 SHOWN = 8  # frames of a strip

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from .camera.rays import Rays as Rays
     from .camera.rays import Rendering as Rendering
     from .camera.rays import Samples as Samples
-    from .capture import open_dataset as open_dataset
-    from .capture import open_scene as open_scene
     from .commands.calls import call as call
     from .commands.calls import capture as capture
     from .commands.calls import open as open
@@ -30,11 +28,13 @@ if TYPE_CHECKING:
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
     from .gaussians.rasterization import rasterization as rasterization
+    from .large import open_any as open_any
     from .method import Method as Method
     from .method import RayMethod as RayMethod
+    from .opening import open_dataset as open_dataset
+    from .opening import open_scene as open_scene
     from .run import Opened as Opened
     from .run import Run as Run
-    from .run import open_any as open_any
     from .training import fit as fit
     from .volume import composite as composite
 
@@ -60,13 +60,13 @@ _homes = {
     "Scene": "datasets.scene",
     "Shapes": "datasets.shapes",
     "call": "commands.calls",
-    "capture": "capture",  # the package itself can be called
+    "capture": "commands.calls",
     "composite": "volume",
     "fit": "training",
     "open": "commands.calls",
-    "open_any": "run",
-    "open_dataset": "capture",
-    "open_scene": "capture",
+    "open_any": "large",
+    "open_dataset": "opening",
+    "open_scene": "opening",
     "rasterization": "gaussians.rasterization",
     "train": "commands.calls",
 }
@@ -78,7 +78,7 @@ def __getattr__(name: str) -> Any:
     if name not in _homes:
         raise AttributeError(f"module 'lumigraph' has no attribute {name!r}")
     home = importlib.import_module(f".{_homes[name]}", __name__)
-    value = home if _homes[name] == name else getattr(home, name)
+    value = getattr(home, name)
     globals()[name] = value
     return value
 

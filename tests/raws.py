@@ -9,7 +9,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from lumigraph.capture.raw.photo import repeated, srgb_from_camera
+from lumigraph.readers.raw.photo import repeated, srgb_from_camera
 
 BLACK, WHITE, GAINS = 500, 12_500, (2.0, 1.0, 1.5)
 MATRIX = [[0.9020, -0.2890, -0.0715], [-0.4535, 1.2436, 0.2348], [-0.0934, 0.1919, 0.7086]]

@@ -13,11 +13,11 @@ from budgets import budget
 
 from lumigraph import methods
 from lumigraph.benchmark.shapes import measure
-from lumigraph.capture import open_dataset
 from lumigraph.commands.cli import main
 from lumigraph.datasets.scene import Photograph
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.evaluation.completion import CLOUD_POINTS, Retrieval, known_of
+from lumigraph.opening import open_dataset
 from lumigraph.run import Run, State, build
 
 pytestmark = budget("runs", 10)

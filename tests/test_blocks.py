@@ -26,7 +26,6 @@ from streets import crossing_streets, write_street
 
 from lumigraph import methods
 from lumigraph.budget import Budget
-from lumigraph.capture import Places, open_scene, places_of, read_capture
 from lumigraph.commands.cli import main
 from lumigraph.components.training.pose_refinement import PoseRefinement
 from lumigraph.composition import Placed
@@ -34,14 +33,16 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import held_out_poses
 from lumigraph.geometry import Similarity, rotated
-from lumigraph.large import BlockRun, InBlocks, layout, monitor, planning, training, worker
+from lumigraph.large import BlockRun, InBlocks, layout, monitor, open_any, planning, training, worker
 from lumigraph.large.plan import Plan, Task
 from lumigraph.large.training import Workers
 from lumigraph.method import Method
 from lumigraph.methods import find
 from lumigraph.metrics import psnr
-from lumigraph.run import Run, open_any
-from lumigraph.run.opening import SplatFile
+from lumigraph.opening import open_scene, read_capture
+from lumigraph.readers import Places, places_of
+from lumigraph.run import Run
+from lumigraph.run.files import SplatFile
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 25)

@@ -15,8 +15,6 @@ from bodies import BEND, bent, skeleton, write_bar
 from budgets import budget
 from PIL import Image
 
-from lumigraph.capture import open_scene, read_capture
-from lumigraph.capture.pickled import load_pickled
 from lumigraph.datasets.skeleton import (
     Skeleton,
     between_moments,
@@ -32,6 +30,8 @@ from lumigraph.errors import LumigraphError
 from lumigraph.exchange.bones import read_bones, read_motion, write_bones
 from lumigraph.exchange.skinned_gltf import read_character, subdivided
 from lumigraph.geometry import Similarity, to_matrix
+from lumigraph.opening import open_scene, read_capture
+from lumigraph.readers.pickled import load_pickled
 from lumigraph.synthetic import scenes
 from lumigraph.synthetic.shapes import triangle_of
 from lumigraph.synthetic.skinned import THICKNESS, SkinnedBody

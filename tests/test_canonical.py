@@ -13,7 +13,6 @@ from budgets import budget
 from canonical_errors import about_vertical, rotation_errors
 
 from lumigraph import kernels
-from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.composition import standing
 from lumigraph.datasets.alignment import angles
@@ -32,7 +31,9 @@ from lumigraph.derive.canonical.harmonics import (
 from lumigraph.derive.canonical.network import Canonicaliser, drawn, learn, losses, rotations_of
 from lumigraph.errors import LumigraphError
 from lumigraph.geometry import Similarity
-from lumigraph.run import Run, State, open_any
+from lumigraph.large import open_any
+from lumigraph.opening import open_scene
+from lumigraph.run import Run, State
 from lumigraph.synthetic import categories, signed_distance
 from lumigraph.synthetic.members import member_stage, members_of
 
@@ -324,7 +325,7 @@ def test_exports_and_compositions_honour_them(runs, dense, tmp_path, monkeypatch
 
 
 def open_mesh(path: Path) -> torch.Tensor:
-    from lumigraph.capture.meshes import read_shape
+    from lumigraph.readers.meshes import read_shape
 
     shape = read_shape(path, "mesh")
     return shape.frame.to_source.points(torch.from_numpy(shape.mesh.vertices)).float()

@@ -33,13 +33,14 @@ from PIL import Image
 
 from lumigraph.camera.lens import Equirectangular, Fisheye, OpenCV, Pinhole
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import Capture, Shot, assemble, choose_reader, open_scene
-from lumigraph.capture.hull import farthest
-from lumigraph.capture.normalise import power_of_two
-from lumigraph.capture.points import similarity
-from lumigraph.capture.up import turn_onto_z
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.opening import open_scene
+from lumigraph.readers import Capture, Shot, assemble, choose_reader
+from lumigraph.readers.hull import farthest
+from lumigraph.readers.normalise import power_of_two
+from lumigraph.readers.points import similarity
+from lumigraph.readers.up import turn_onto_z
 
 pytestmark = budget("capture", 10)
 

@@ -22,25 +22,25 @@ from PIL import Image
 from scipy.spatial import KDTree
 from views import FOCAL, WIDTH, draw, look_at, panorama, pattern, pinhole, spoil, write_views
 
-from lumigraph.capture import open_scene
-from lumigraph.capture.colmap import read as read_colmap
-from lumigraph.capture.coverage import use_of
-from lumigraph.capture.motion import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
-from lumigraph.capture.motion.agreement import Agreement, agreement
-from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
-from lumigraph.capture.motion.georeference import georeference, upright
-from lumigraph.capture.motion.lenses import group_by_lens, prior, write_database
-from lumigraph.capture.motion.pairs import aggregated, alike, choose_matching, exhaustive, sequential
-from lumigraph.capture.motion.pairs import near as near_by
-from lumigraph.capture.motion.reconstruction import Reconstruction
-from lumigraph.capture.motion.stages import WORKER, Stages, key_of
-from lumigraph.capture.oddities import jumps
-from lumigraph.capture.photos import Intake, Photo
-from lumigraph.capture.transforms import read as read_transforms
 from lumigraph.commands import capture as command
 from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
 from lumigraph.export.video import open_video
+from lumigraph.opening import open_scene
+from lumigraph.readers.colmap import read as read_colmap
+from lumigraph.readers.oddities import jumps
+from lumigraph.readers.transforms import read as read_transforms
+from lumigraph.sfm import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
+from lumigraph.sfm.agreement import Agreement, agreement
+from lumigraph.sfm.coverage import use_of
+from lumigraph.sfm.diagnosis import Matches, coverage, folds, read_matches, why_not
+from lumigraph.sfm.georeference import georeference, upright
+from lumigraph.sfm.lenses import group_by_lens, prior, write_database
+from lumigraph.sfm.pairs import aggregated, alike, choose_matching, exhaustive, sequential
+from lumigraph.sfm.pairs import near as near_by
+from lumigraph.sfm.photos import Intake, Photo
+from lumigraph.sfm.reconstruction import Reconstruction
+from lumigraph.sfm.stages import WORKER, Stages, key_of
 
 pytestmark = budget("capture", 45)  # 43 s measured, with captures of two scenes, a sphere and turned photographs
 

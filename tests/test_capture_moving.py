@@ -13,15 +13,15 @@ import pytest
 import torch
 from budgets import budget
 
-from lumigraph.capture import open_scene
-from lumigraph.capture.motion import capture_rig, is_rig
-from lumigraph.capture.motion.moving import MovingFeatures, check_still, check_times, leave_out_moving
-from lumigraph.capture.motion.reconstruction import MotionOptions, nothing_fits
-from lumigraph.capture.motion.rig import CLOCKS_FILE, common_moments, films_of
-from lumigraph.capture.photos import Intake, Photo
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.export.video import open_video
+from lumigraph.opening import open_scene
+from lumigraph.sfm import capture_rig, is_rig
+from lumigraph.sfm.moving import MovingFeatures, check_still, check_times, leave_out_moving
+from lumigraph.sfm.photos import Intake, Photo
+from lumigraph.sfm.reconstruction import MotionOptions, nothing_fits
+from lumigraph.sfm.rig import CLOCKS_FILE, common_moments, films_of
 
 pytestmark = budget("capture", 5)
 STILL, MOVING, VIEWS, FOCAL = 60, 20, 4, 300.0

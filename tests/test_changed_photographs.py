@@ -13,10 +13,10 @@ import tiny
 from budgets import budget
 from PIL import Image
 
-from lumigraph.capture import open_scene
-from lumigraph.capture.pictures import digest_of
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphWarning
+from lumigraph.opening import open_scene
+from lumigraph.readers.pictures import digest_of
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 6)

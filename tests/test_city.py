@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lumigraph import synthetic as procedural
-from lumigraph.capture import open_scene
 from lumigraph.datasets.images import ImageSource, load
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene
 from lumigraph.synthetic import Lamp, Material, Object, Pose, World, scenes
 from lumigraph.synthetic.rendering import render, signed_distance
 from lumigraph.synthetic.scenes.city import Drive, plan

@@ -27,7 +27,8 @@ from lumigraph.files.ply import read_header, read_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import cleaned, extent, joined, unwanted
 from lumigraph.geometry import Similarity, to_matrix
-from lumigraph.run import Run, open_any
+from lumigraph.large import open_any
+from lumigraph.run import Run
 from lumigraph.training import fit
 from lumigraph.viewer.cameras import ViewRequest
 

@@ -21,9 +21,10 @@ from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import Similarity, to_matrix
+from lumigraph.large import open_any
 from lumigraph.method.capabilities import HasDensity, HasGaussians, HasLooks, can
 from lumigraph.method.controls import Control
-from lumigraph.run import open_any, opening
+from lumigraph.run import opening
 from lumigraph.run.composition import (
     CompositionPart,
     place_from_json,

@@ -14,13 +14,13 @@ from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph import methods
-from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.commands.compress import bytes_in, verdict
 from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.compress import bytes_of, decibels, rendered, squared_error
 from lumigraph.derive.compression.model import RUNG_POSITIONS, Model, rung_at
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene
 from lumigraph.run import Run, build
 from lumigraph.run.derived import Compressed
 from lumigraph.training import fit

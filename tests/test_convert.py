@@ -30,10 +30,11 @@ from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
+from lumigraph.large import open_any
 from lumigraph.method import RayMethod
 from lumigraph.method.capabilities import FromField, HasField, HasGaussians, can
 from lumigraph.metrics import psnr
-from lumigraph.run import Run, build, open_any
+from lumigraph.run import Run, build
 from lumigraph.run.derived import Converted, MeasuredModel
 from lumigraph.system.signals import Stopped
 from lumigraph.training import fit

@@ -26,23 +26,24 @@ from PIL import Image
 
 from lumigraph import files
 from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole, mix
-from lumigraph.capture import blender, open_scene
-from lumigraph.capture import transforms as transforms_reader
-from lumigraph.capture.assemble import checked_pose
-from lumigraph.capture.capture import Capture, Shot
-from lumigraph.capture.meshes import read_shape
-from lumigraph.capture.motion.folder import claim
-from lumigraph.capture.motion.stages import Stages
-from lumigraph.capture.oddities import oddities
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation.report import header
 from lumigraph.exchange import read_gaussians
 from lumigraph.files.ranges import hints
 from lumigraph.metrics import scores_of
+from lumigraph.opening import open_scene
 from lumigraph.paths.keyframes import CameraPath
+from lumigraph.readers import blender
+from lumigraph.readers import transforms as transforms_reader
+from lumigraph.readers.assemble import checked_pose
+from lumigraph.readers.capture import Capture, Shot
+from lumigraph.readers.meshes import read_shape
+from lumigraph.readers.oddities import oddities
 from lumigraph.run import Run
 from lumigraph.run.composition import read_composition
+from lumigraph.sfm.folder import claim
+from lumigraph.sfm.stages import Stages
 
 pytestmark = budget("capture", 10)
 
@@ -509,7 +510,7 @@ def test_colmap_models_that_cannot_be(fault, text, tmp_path):
 
 
 def test_a_list_longer_than_its_file_takes_no_time(tmp_path):
-    from lumigraph.capture.colmap import walk_frames
+    from lumigraph.readers.colmap import walk_frames
 
     assert walk_frames(struct.pack("<Q", 0), tmp_path) == 8
     with pytest.raises(struct.error):

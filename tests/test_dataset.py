@@ -15,7 +15,6 @@ import torch
 import trimesh
 
 from lumigraph import methods
-from lumigraph.capture import kind_of, meshes, open_dataset
 from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.dataset import Dataset
@@ -23,6 +22,8 @@ from lumigraph.datasets.scene import Scene
 from lumigraph.datasets.shapes import PointBatch, Shapes
 from lumigraph.datasets.shapes.triangles import Triangles
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.opening import kind_of, open_dataset
+from lumigraph.readers import meshes
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 

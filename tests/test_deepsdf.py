@@ -12,7 +12,6 @@ import trimesh
 from budgets import budget
 from PIL import Image
 
-from lumigraph.capture import open_dataset
 from lumigraph.commands.cli import main
 from lumigraph.components.fields.instance_codes import FOUND
 from lumigraph.components.training.shape_points import PointNumbers, sampled
@@ -21,6 +20,7 @@ from lumigraph.datasets.shapes import PointBatch, Shape, Shapes, normalised
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.deepsdf import Config, DeepSDF
 from lumigraph.metrics import intersection_over_union
+from lumigraph.opening import open_dataset
 from lumigraph.run import Run, State
 
 pytestmark = budget("methods", 12)

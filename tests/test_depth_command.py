@@ -9,10 +9,10 @@ from PIL import Image
 from test_dense_start import RADIUS, ball
 from test_multi_view import matched
 
-from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.export.depth import write_depth
+from lumigraph.opening import open_scene
 
 pytestmark = budget("exports", 6)
 

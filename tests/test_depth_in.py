@@ -17,10 +17,10 @@ from PIL import Image
 from test_depth_readers import SIZE, picture, poses, write_scannet
 
 from lumigraph.camera.lens import Pinhole
-from lumigraph.capture import open_scene, read_capture
-from lumigraph.capture.inner_depth import InnerDepth, inner_depth, of_heic, of_jpeg
-from lumigraph.capture.surveyed import Surveyed, registered, seen_depth, with_surveyed
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene, read_capture
+from lumigraph.readers.inner_depth import InnerDepth, inner_depth, of_heic, of_jpeg
+from lumigraph.readers.surveyed import Surveyed, registered, seen_depth, with_surveyed
 
 pytestmark = budget("capture", 8)
 LENS = Pinhole(torch.tensor([[20.0, 20.0]]), torch.tensor([[20.0, 15.0]]))  # half a right angle to each side

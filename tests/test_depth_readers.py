@@ -12,8 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
-from lumigraph.capture import choose_reader, open_scene, read_capture
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.opening import open_scene, read_capture
+from lumigraph.readers import choose_reader
 
 SIZE = (40, 30)
 OPENGL = np.diag([1.0, -1, -1, 1])

@@ -13,8 +13,8 @@ from budgets import budget
 
 from lumigraph import methods
 from lumigraph.budget import Budget
-from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Batch
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.system.console import console
 from lumigraph.training import fit

@@ -17,13 +17,13 @@ from PIL import Image, ImageFilter, ImageOps
 from views import FOCAL, HEIGHT, WALL, WIDTH, between, look_at, pattern, write_views
 
 from lumigraph import methods
-from lumigraph.capture import read_capture
-from lumigraph.capture.coverage import coverage
-from lumigraph.capture.doctor import LACKING, Finding, Residual, deviations, findings, grouped, of_residuals
 from lumigraph.commands.cli import main
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.photographs import RESULT_FILE, compare_all, examine, examined, rendered
 from lumigraph.evaluation.report import write_report
+from lumigraph.opening import read_capture
+from lumigraph.sfm.coverage import coverage
+from lumigraph.sfm.doctor import LACKING, Finding, Residual, deviations, findings, grouped, of_residuals
 from lumigraph.training import fit
 
 pytestmark = budget("capture", 8)

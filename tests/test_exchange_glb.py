@@ -20,8 +20,8 @@ from lumigraph.exchange import is_splat_file, read_gaussians, write_gaussians
 from lumigraph.exchange.glb import EXTENSION
 from lumigraph.gaussians.splatting import render
 from lumigraph.geometry import to_matrix
+from lumigraph.large import open_any
 from lumigraph.metrics import psnr
-from lumigraph.run import open_any
 
 TURN = torch.diag(torch.tensor([1.0, -1, -1, 1]))
 

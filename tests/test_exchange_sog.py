@@ -23,8 +23,8 @@ from lumigraph.exchange.checks import zipped
 from lumigraph.exchange.codes import levels, nearest_level
 from lumigraph.exchange.sog import encode
 from lumigraph.gaussians.splatting import render
+from lumigraph.large import open_any
 from lumigraph.metrics import psnr
-from lumigraph.run import open_any
 
 MEANS = ("means_l.webp", "means_u.webp")
 

@@ -9,10 +9,10 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph.capture import open_scene
-from lumigraph.capture.views import spread_out, with_fewer_views
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene
+from lumigraph.readers.views import spread_out, with_fewer_views
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 8)

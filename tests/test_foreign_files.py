@@ -17,9 +17,6 @@ from listing import names
 from PIL import Image
 
 from lumigraph import methods
-from lumigraph.capture.motion.folder import WRITTEN_FILES, claim_results, copy_photographs
-from lumigraph.capture.photos import Photo
-from lumigraph.capture.photos.photo import untracked
 from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import atomic as files
@@ -28,6 +25,9 @@ from lumigraph.method import Method
 from lumigraph.methods.plenoctrees.baking import fill
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, State, build
+from lumigraph.sfm.folder import WRITTEN_FILES, claim_results, copy_photographs
+from lumigraph.sfm.photos import Photo
+from lumigraph.sfm.photos.photo import untracked
 
 pytestmark = budget("runs", 15)
 
@@ -297,7 +297,7 @@ def test_what_a_command_reads_stays_even_where_it_may_overwrite(home, capsys):
 
 def test_saving_in_the_viewer_replaces_nothing(home):
     from lumigraph.commands.view import saver, subject_of
-    from lumigraph.run import open_any
+    from lumigraph.large import open_any
 
     opened = open_any(home / "gs")
     assert subject_of(opened).part_ending == ""  # a new run, with cameras and background

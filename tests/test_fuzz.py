@@ -20,7 +20,6 @@ from budgets import budget
 from fuzzing import flags, templates
 from fuzzing.bend import bend
 
-from lumigraph.capture import open_dataset
 from lumigraph.commands.cli import main
 from lumigraph.commands.info_tree import run_tree
 from lumigraph.errors import LumigraphError
@@ -28,8 +27,10 @@ from lumigraph.evaluation.report import write_report
 from lumigraph.exchange import SUFFIXES, packing, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import Similarity
+from lumigraph.large import open_any
+from lumigraph.opening import open_dataset
 from lumigraph.paths.keyframes import CameraPath
-from lumigraph.run import Run, open_any
+from lumigraph.run import Run
 from lumigraph.run.composition import CompositionPart, write_composition
 
 pytestmark = budget("capture", 20)

@@ -17,9 +17,9 @@ from lumigraph.camera.rays import Rays
 from lumigraph.datasets.world import LABELS
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.gancraft import BlockGrid, bordered
+from lumigraph.methods.gancraft.landscapes import STYLES
 from lumigraph.methods.gancraft.networks import BORDER, FIRST_DENSITY, NeuralRenderer, StyleEncoder, divergence, drawn
 from lumigraph.methods.gancraft.spade import Adversary, LabelPainter, channels
-from lumigraph.synthetic.landscapes import STYLES
 
 pytestmark = budget("methods", 6)
 GRASS, STONE = LABELS.index("grass"), LABELS.index("stone")

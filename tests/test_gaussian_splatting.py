@@ -21,7 +21,7 @@ from lumigraph.gaussians.splatting import render
 from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build
-from lumigraph.run.opening import SplatFile
+from lumigraph.run.files import SplatFile
 from lumigraph.system import memory
 from lumigraph.training import fit
 

@@ -16,7 +16,6 @@ from lumigraph import methods
 from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.components.fields.development import decoded, encoded
 from lumigraph.components.training.photometric import brighter, gain_between, spread_of_exposure
@@ -30,6 +29,7 @@ from lumigraph.export.film import animated
 from lumigraph.files.ranges import changed
 from lumigraph.method.controls import Control, moment
 from lumigraph.methods.instant_ngp import Config, InstantNGP
+from lumigraph.opening import open_scene
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, build
 from lumigraph.synthetic.scenes import swing

@@ -17,13 +17,14 @@ from PIL import Image
 
 from lumigraph import synthetic as procedural
 from lumigraph.camera.lens import Pinhole
-from lumigraph.capture import READERS, assemble, multiscale, open_scene
-from lumigraph.capture.capture import Capture, PixelPlane, Shot
 from lumigraph.color.blending import before, over
 from lumigraph.datasets.images import ImageStore, Layer, LayerSource, resized
 from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.files.readers import LISTED, NAMES
+from lumigraph.opening import open_scene
+from lumigraph.readers import READERS, assemble, multiscale
+from lumigraph.readers.capture import Capture, PixelPlane, Shot
 from lumigraph.synthetic import rendering
 
 WHERE = pytest.mark.parametrize("memory", [None, 0], ids=["memory", "file"])

@@ -14,8 +14,6 @@ from budgets import budget
 from lumigraph import kernels
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
-from lumigraph.capture import open_scene
-from lumigraph.capture.views import with_fewer_views
 from lumigraph.components.image_based.depth import completed, depth_camera
 from lumigraph.components.image_based.surface import consensus
 from lumigraph.components.image_based.warping import behind, soft_splat
@@ -25,6 +23,8 @@ from lumigraph.export.light_field import grid_of, quilt, write_light_field
 from lumigraph.methods.lumigraph import Lumigraph
 from lumigraph.methods.view_interpolation import ViewInterpolation
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
+from lumigraph.readers.views import with_fewer_views
 
 pytestmark = budget("methods", 8)
 

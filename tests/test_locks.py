@@ -15,12 +15,12 @@ import tiny
 from budgets import budget
 from shape_checks import PACKAGE
 
-from lumigraph.capture.motion import reconstruct
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import locks
 from lumigraph.files.locks import held
 from lumigraph.run import Run
+from lumigraph.sfm import reconstruct
 from lumigraph.training import fit
 
 pytestmark = budget("runs")

@@ -14,16 +14,16 @@ from listing import names
 from PIL import Image
 from test_gaussian_splatting import new
 
-from lumigraph.capture import open_scene
-from lumigraph.capture.motion.folder import copy_masks
-from lumigraph.capture.objects import doubts, mask_object
-from lumigraph.capture.objects.segment import segment
-from lumigraph.capture.objects.view import ObjectView, find_table
-from lumigraph.capture.photos import gather
-from lumigraph.capture.photos.photo import untracked
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
+from lumigraph.opening import open_scene
+from lumigraph.readers.objects import doubts, mask_object
+from lumigraph.readers.objects.segment import segment
+from lumigraph.readers.objects.view import ObjectView, find_table
+from lumigraph.sfm.folder import copy_masks
+from lumigraph.sfm.photos import gather
+from lumigraph.sfm.photos.photo import untracked
 
 
 def write_masks(folder: Path, names: list[str], times: int = 1) -> None:
@@ -129,7 +129,7 @@ def write_ball(folder: Path) -> dict[str, np.ndarray]:
 
 
 def test_an_object_before_a_wall_is_found_and_learnt_alone(tmp_path):
-    from lumigraph.capture import choose_reader
+    from lumigraph.readers import choose_reader
 
     folder = tmp_path / "scene"
     truth = write_ball(folder)

@@ -10,11 +10,11 @@ import pytest
 import torch
 from budgets import budget
 
-from lumigraph.capture import open_scene
 from lumigraph.color.srgb import linear_from_srgb
 from lumigraph.errors import LumigraphError
 from lumigraph.light import EnvironmentLight, direction
 from lumigraph.methods.nerfactor.shading import microfacet
+from lumigraph.opening import open_scene
 from lumigraph.synthetic import Material, Object, Pose, Sky, World, lit, scenes, trace, unoccluded
 from lumigraph.synthetic.cameras import look_at, pinhole
 from lumigraph.synthetic.shapes import Ball, Cuboid

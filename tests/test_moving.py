@@ -12,13 +12,13 @@ from budgets import budget
 from captures import Tiny, write_nerfies, write_ngp, write_nr_nerf
 
 from lumigraph import synthetic as procedural
-from lumigraph.capture import open_scene
-from lumigraph.capture.hull import Silhouette, hull_box
 from lumigraph.components.sampling.occupancy import visual_hull
 from lumigraph.errors import LumigraphWarning
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.held_out import held_out_kinds
 from lumigraph.metrics import psnr
+from lumigraph.opening import open_scene
+from lumigraph.readers.hull import Silhouette, hull_box
 from lumigraph.synthetic import scenes, signed_distance
 from lumigraph.synthetic.shapes import SoftCapsule
 

@@ -26,9 +26,10 @@ from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.moving import MovingGaussians, fitted
 from lumigraph.gaussians.splatting import render
 from lumigraph.geometry import multiply
+from lumigraph.large import open_any
 from lumigraph.metrics import psnr
 from lumigraph.paths.opening import Opening
-from lumigraph.run import Run, State, open_any
+from lumigraph.run import Run, State
 
 pytestmark = budget("exports", 10)
 BLACK = (0.0, 0.0, 0.0)

@@ -11,12 +11,13 @@ import torch
 from budgets import budget
 from captures import HEIGHT, WIDTH, Tiny, write_colmap, write_ngp
 
-from lumigraph.capture import multiscale, open_scene
 from lumigraph.commands.cli import main
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
+from lumigraph.opening import open_scene
+from lumigraph.readers import multiscale
 from lumigraph.run import Run, State
 
 pytestmark = budget("runs")

@@ -17,8 +17,6 @@ from PIL import Image
 
 from lumigraph import methods, synthetic
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import open_scene, read_capture
-from lumigraph.capture.tracks import read_tracks, write_tracks
 from lumigraph.commands.cli import main
 from lumigraph.components.fields.coordinate_field import NetworkNumbers
 from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
@@ -26,11 +24,14 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.tracks import BoxTrack, TrackEdit, TrackEdits, nodes_of
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.geometry import Similarity, rotated, to_matrix
+from lumigraph.large import open_any
 from lumigraph.method.field_method import FieldMethod
 from lumigraph.methods import neural_scene_graph
 from lumigraph.methods.neural_scene_graph import NeuralSceneGraph, found_in
 from lumigraph.methods.neural_scene_graph.nodes import PoseTable, crossings, exponential
-from lumigraph.run import Run, build, open_any
+from lumigraph.opening import open_scene, read_capture
+from lumigraph.readers.tracks import read_tracks, write_tracks
+from lumigraph.run import Run, build
 from lumigraph.synthetic import scenes
 from lumigraph.synthetic.scenes import traffic
 from lumigraph.training import fit

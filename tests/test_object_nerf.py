@@ -10,12 +10,12 @@ import torch
 from budgets import budget
 
 from lumigraph.camera.rays import Rendering
-from lumigraph.capture import open_scene
 from lumigraph.components.instances import Edit, edit_of, labels_of
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.object_nerf import ObjectNeRF
 from lumigraph.methods.object_nerf.fields import InstanceBoxes
+from lumigraph.opening import open_scene
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 

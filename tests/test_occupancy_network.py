@@ -11,13 +11,13 @@ from budgets import budget
 from PIL import Image
 
 from lumigraph.camera import ring
-from lumigraph.capture import single_image
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.datasets.shapes.pictures import picture_of
 from lumigraph.errors import LumigraphError
 from lumigraph.methods.occupancy_network import VALUE_SCALE, OccupancyNetwork, Warp, voxels_of
 from lumigraph.methods.occupancy_network.networks import ConditionalNorm, PointEncoder, joined
 from lumigraph.metrics import intersection_over_union
+from lumigraph.readers import single_image
 
 pytestmark = budget("methods", 12)
 BOTH = {"train": torch.tensor([0, 1]), "test": torch.tensor([0, 1])}

@@ -19,8 +19,9 @@ from lumigraph.exchange import write_gaussians
 from lumigraph.export.film import film
 from lumigraph.files import write_json
 from lumigraph.geometry import Similarity
+from lumigraph.large import open_any
 from lumigraph.paths import film_cameras
-from lumigraph.run import Run, State, open_any
+from lumigraph.run import Run, State
 from lumigraph.run.composition import CompositionPart, write_composition
 from lumigraph.run.settings import Settings
 

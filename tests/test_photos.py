@@ -20,13 +20,13 @@ import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
-from lumigraph.capture.photos import Intake, gather, is_bare, is_video
-from lumigraph.capture.photos.judge import MIN_SHARPNESS, blurred, judge, sharpness
-from lumigraph.capture.photos.overlap import MIN_SHARED, apart, details, shared
-from lumigraph.capture.photos.video import Odometer, choose, extract
-from lumigraph.capture.pictures import find_file, list_images, read_image, reads_heic, upright_size
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.export.video import open_video
+from lumigraph.readers.pictures import find_file, list_images, read_image, reads_heic, upright_size
+from lumigraph.sfm.photos import Intake, gather, is_bare, is_video
+from lumigraph.sfm.photos.judge import MIN_SHARPNESS, blurred, judge, sharpness
+from lumigraph.sfm.photos.overlap import MIN_SHARED, apart, details, shared
+from lumigraph.sfm.photos.video import Odometer, choose, extract
 
 SIZE = (480, 320)
 ORIENTATION, EXIF, GPS = 0x0112, 0x8769, 0x8825

@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
-from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene
 
 
 def write(path: Path, width: int = 40, height: int = 24, **options) -> Path:

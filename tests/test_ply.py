@@ -10,10 +10,10 @@ import pytest
 from budgets import budget
 from ply_files import KINDS, ply_file
 
-from lumigraph.capture.meshes import read_mesh, read_shape
-from lumigraph.capture.points import read_ply
 from lumigraph.errors import LumigraphError
 from lumigraph.files.ply import columns, read_header, read_rows, write_rows
+from lumigraph.readers.meshes import read_mesh, read_shape
+from lumigraph.readers.points import read_ply
 
 pytestmark = budget("exports", 4)
 

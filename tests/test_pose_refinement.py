@@ -18,10 +18,6 @@ from test_paper_presets import NAMES
 from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
-from lumigraph.capture import open_scene
-from lumigraph.capture.capture import Shot
-from lumigraph.capture.doctor import of_folds
-from lumigraph.capture.oddities import about_fold
 from lumigraph.components.clouds.initialization import random_cloud
 from lumigraph.components.clouds.moved_cloud import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
@@ -39,7 +35,11 @@ from lumigraph.files.ranges import changed, holds
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
 from lumigraph.method.capabilities import RefinesPoses, can
+from lumigraph.opening import open_scene
+from lumigraph.readers.capture import Shot
+from lumigraph.readers.oddities import about_fold
 from lumigraph.run import build
+from lumigraph.sfm.doctor import of_folds
 from lumigraph.training.verdict import cameras_moved
 
 pytestmark = budget("methods", 10)

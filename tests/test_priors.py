@@ -14,13 +14,13 @@ from budgets import budget
 from PIL import Image
 
 from lumigraph import methods
-from lumigraph.capture import kind_of, open_dataset
 from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import MAX_OPEN, Collection
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation.views import reveal
 from lumigraph.method.prior import Prior
+from lumigraph.opening import kind_of, open_dataset
 from lumigraph.run import Run, State, build
 from lumigraph.run.derived import Inferred
 from lumigraph.system import memory

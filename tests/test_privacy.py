@@ -22,7 +22,7 @@ from lumigraph.commands.export_menu import export_menu
 from lumigraph.commands.photo3d import Photo3DCommand
 from lumigraph.datasets.scene import GeographicOrigin
 from lumigraph.export import mesh_file
-from lumigraph.run import open_any
+from lumigraph.large import open_any
 
 pytestmark = budget("exports", 6)
 ORIGIN = GeographicOrigin(50.0871234, 14.4213579, 230.5)

@@ -13,8 +13,8 @@ from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, Fisheye
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import open_scene
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene
 from lumigraph.synthetic import Lamp, Material, Object, Pose, Sky, Sun, World, scenes
 from lumigraph.synthetic.cameras import look_at, pinhole
 from lumigraph.synthetic.rendering import photograph, render, signed_distance, trace

@@ -11,15 +11,15 @@ import tiny
 import torch
 from PIL import Image
 
-from lumigraph.capture import open_scene
-from lumigraph.capture.motion.reconstruction import also_unreadable
-from lumigraph.capture.photos import gather
-from lumigraph.capture.raw import RawPhoto, is_raw, open_raw
-from lumigraph.capture.raw.library import turned_pattern
-from lumigraph.capture.raw.photo import demosaiced, repeated
 from lumigraph.color.srgb import srgb_from_linear
 from lumigraph.datasets.images import resized
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.opening import open_scene
+from lumigraph.readers.raw import RawPhoto, is_raw, open_raw
+from lumigraph.readers.raw.library import turned_pattern
+from lumigraph.readers.raw.photo import demosaiced, repeated
+from lumigraph.sfm.photos import gather
+from lumigraph.sfm.reconstruction import also_unreadable
 from lumigraph.synthetic.sensor import BLACK_LEVEL, DN_PER_PHOTON, READ_NOISE, WHITE_LEVEL, Sensor
 
 

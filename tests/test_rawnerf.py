@@ -9,8 +9,6 @@ import tiny
 import torch
 
 from lumigraph.camera.rays import Rendering
-from lumigraph.capture import open_scene
-from lumigraph.capture.numbers import kind_of, read_numbers
 from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
 from lumigraph.components.fields.development import decoded, encoded, exposed, toned, white
 from lumigraph.datasets.scene import Batch
@@ -19,6 +17,8 @@ from lumigraph.evaluation.views import in_light
 from lumigraph.export.film import exr, film
 from lumigraph.files.ranges import changed
 from lumigraph.methods.rawnerf import RawNeRF, layers_of, through_lens
+from lumigraph.opening import open_scene
+from lumigraph.readers.numbers import kind_of, read_numbers
 from lumigraph.training import fit
 
 

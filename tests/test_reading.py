@@ -23,13 +23,14 @@ from test_neural_scene_graph import write_kitti
 
 import lumigraph
 from lumigraph import exchange
-from lumigraph.capture import READERS, open_scene, read_capture
-from lumigraph.capture.pickled import MAX_VALUES, load_pickled
-from lumigraph.capture.surveyed import read_surveyed
 from lumigraph.commands.cli import main
 from lumigraph.components.guidance.clip_files import read_tensors
 from lumigraph.errors import LumigraphError
 from lumigraph.files.reading import reading
+from lumigraph.opening import open_scene, read_capture
+from lumigraph.readers import READERS
+from lumigraph.readers.pickled import MAX_VALUES, load_pickled
+from lumigraph.readers.surveyed import read_surveyed
 from lumigraph.selection.strokes import read_strokes
 
 pytestmark = budget("capture", 10)

@@ -13,7 +13,6 @@ import torch
 from budgets import budget
 
 from lumigraph.camera.rays import Rays, Samples
-from lumigraph.capture.views import with_fewer_views
 from lumigraph.components.fields.coordinate_field import FrustumField
 from lumigraph.components.fields.hash_field import HashField
 from lumigraph.components.training.regularizers import (
@@ -32,6 +31,7 @@ from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.methods.regnerf import RegNeRF, clipped, field_of, joined
 from lumigraph.methods.regnerf.patch_flow import SIDE, PatchFlow, photographed
+from lumigraph.readers.views import with_fewer_views
 from lumigraph.run import build
 from lumigraph.volume import composite
 

@@ -18,7 +18,6 @@ from PIL import Image
 from scipy.sparse import csr_matrix, diags_array
 
 from lumigraph import selection
-from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.composition import Placed, VoxelMask, compose, cropped, mask_of, read_mask
 from lumigraph.datasets.scene import Photograph
@@ -26,7 +25,9 @@ from lumigraph.errors import LumigraphError
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cloud import BAND_0
 from lumigraph.geometry import Similarity
-from lumigraph.run import Run, open_any
+from lumigraph.large import open_any
+from lumigraph.opening import open_scene
+from lumigraph.run import Run
 from lumigraph.selection import Selection, Strokes, describe, distil_features, feature_network, read_strokes
 from lumigraph.selection.cutting import UNKNOWN_COLOUR, closed, cut, motion, tinted
 from lumigraph.selection.distilled import SelectionGrid, weigher_of

@@ -23,12 +23,13 @@ from lumigraph.errors import LumigraphError
 from lumigraph.exchange import snerg
 from lumigraph.files.ranges import changed
 from lumigraph.kernels.block_march import ALPHA
+from lumigraph.large import open_any
 from lumigraph.method.capabilities import HasAtlas, can
 from lumigraph.methods.snerg import ATLAS, FIELD, VOXELS, SNeRG
 from lumigraph.methods.snerg.baked_voxels import VisibilityGrid
 from lumigraph.methods.snerg.deferred_field import encoded
 from lumigraph.metrics import psnr
-from lumigraph.run import Run, State, open_any
+from lumigraph.run import Run, State
 from lumigraph.training import fit
 
 pytestmark = budget("methods", 12)

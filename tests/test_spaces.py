@@ -13,10 +13,11 @@ from captures import Tiny, look_at, write_blender, write_ngp
 
 from lumigraph.camera.lens import Equirectangular, Pinhole
 from lumigraph.camera.rays import Rays
-from lumigraph.capture import Capture, Shot, open_scene
-from lumigraph.capture.assemble import assemble
 from lumigraph.components.sampling.spaces import INFINITY, NDC, Box, Contraction, space_of
 from lumigraph.datasets.scene import Forward, Frame
+from lumigraph.opening import open_scene
+from lumigraph.readers import Capture, Shot
+from lumigraph.readers.assemble import assemble
 
 POSE = torch.from_numpy(look_at(np.array([0.3, -2.0, 0.4]), np.array([0.1, 0.5, 0.2]))[:3])
 FORWARD = Forward(tuple((a, b, c, d) for a, b, c, d in POSE.tolist()), (1.5, 2.0), 0.8)

@@ -21,12 +21,13 @@ from PIL import Image
 from test_depth_readers import write_polycam, write_record3d, write_replica, write_scannet
 
 from lumigraph import files
-from lumigraph.capture import open_scene
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import read_gaussians
 from lumigraph.files.atomic import MAX_TEXT_BYTES
+from lumigraph.large import open_any
+from lumigraph.opening import open_scene
 from lumigraph.paths.keyframes import CameraPath
-from lumigraph.run import Run, open_any
+from lumigraph.run import Run
 
 pytestmark = [budget("capture"), pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")]
 PATIENCE = 20.0  # seconds

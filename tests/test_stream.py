@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from lumigraph.capture import open_scene
 from lumigraph.datasets.images import ImageSource, ImageStream, Layer, LayerSource, stream
 from lumigraph.errors import LumigraphError
+from lumigraph.opening import open_scene
 
 WIDTH, HEIGHT = 8, 6
 

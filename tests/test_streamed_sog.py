@@ -18,7 +18,7 @@ from lumigraph.exchange import is_splat_file, read_gaussians, size_of, sog, writ
 from lumigraph.exchange.streamed_sog import Detail
 from lumigraph.gaussians import Gaussians, joined, simplified, splatting
 from lumigraph.geometry import to_matrix
-from lumigraph.run import open_any
+from lumigraph.large import open_any
 
 pytestmark = budget("exports", 8)
 

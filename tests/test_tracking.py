@@ -11,14 +11,14 @@ import torch
 from budgets import budget
 
 from lumigraph.camera.lens import Pinhole
-from lumigraph.capture import Unposed, without_poses
-from lumigraph.capture.capture import Capture, PixelPlane, Shot
 from lumigraph.components.tracking.alignment import aligned
 from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion, motion_between
 from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
 from lumigraph.components.training.shared_points import Seen
 from lumigraph.errors import LumigraphError
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
+from lumigraph.readers import Unposed, without_poses
+from lumigraph.readers.capture import Capture, PixelPlane, Shot
 
 pytestmark = budget("methods", 4)
 

@@ -12,10 +12,11 @@ from captures import HEIGHT, WIDTH, Tiny, write_nerfstudio
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
-from lumigraph.capture import Before, open_scene
-from lumigraph.capture.up import common_up
 from lumigraph.errors import LumigraphError
 from lumigraph.geometry import look_at
+from lumigraph.opening import open_scene
+from lumigraph.readers import Before
+from lumigraph.readers.up import common_up
 
 GROUND = np.random.default_rng(0).uniform([-6, -6, 0], [6, 6, 0.3], (500, 3))
 Z = np.array([0.0, 0.0, 1.0])

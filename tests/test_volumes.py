@@ -25,7 +25,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.exchange.baked import Octree, atlas_for_browser, breadth_first, clearance, octree_for_browser
 from lumigraph.export import page as pages
 from lumigraph.export.page import volume_bytes, volume_page
-from lumigraph.run import open_any
+from lumigraph.large import open_any
 from lumigraph.viewer import Viewer, choose_address
 
 pytestmark = budget("exports", 30)

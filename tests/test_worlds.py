@@ -14,14 +14,15 @@ from budgets import budget
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.camera.rays import Rendering
-from lumigraph.capture import kind_of, minecraft, open_dataset
 from lumigraph.datasets.world import LABELS, BlockWorld
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate_walk, warped_difference
 from lumigraph.evaluation.walks import colours_by_label
 from lumigraph.method import Method
+from lumigraph.methods.gancraft.landscapes import STYLES, landscape
+from lumigraph.opening import kind_of, open_dataset
+from lumigraph.readers import minecraft
 from lumigraph.synthetic import block_stage
-from lumigraph.synthetic.landscapes import STYLES, landscape
 from lumigraph.synthetic.scenes.blocks import Options, blocks
 from lumigraph.synthetic.terrain import terrain
 

@@ -34,13 +34,13 @@ def called(name: str, path: Path) -> Any:
 
     from lumigraph.camera import Camera
     from lumigraph.camera.lens import Pinhole
-    from lumigraph.capture.tracks import read_tracks
     from lumigraph.composition.voxel_mask import read_mask
     from lumigraph.exchange.bones import read_bones, read_motion
     from lumigraph.exchange.skinned_gltf import read_character
     from lumigraph.geometry import Similarity
     from lumigraph.light import EnvironmentLight
     from lumigraph.metrics.lpips import read_weights
+    from lumigraph.readers.tracks import read_tracks
     from lumigraph.selection.strokes import read_strokes
 
     if name == "strokes":

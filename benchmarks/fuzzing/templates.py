@@ -147,10 +147,10 @@ def write_alone(folder: Path) -> None:
     import test_neural_scene_graph
     import torch
 
-    from lumigraph.capture.tracks import write_tracks
     from lumigraph.composition.voxel_mask import VoxelMask
     from lumigraph.exchange.bones import write_bones
     from lumigraph.exchange.skinned_gltf import read_character
+    from lumigraph.readers.tracks import write_tracks
 
     np.save(folder / "environment.npy", np.ones((8, 16, 3), np.float32))
     strokes = np.zeros((24, 32, 3), np.uint8)

@@ -219,7 +219,7 @@ def is_alive(process: int) -> bool:
 
 def capture_request(item: Item, job: Making) -> Request | None:
     """`lumigraph capture`; None for photographs whose poses are known."""
-    from ..capture.photos import is_bare
+    from ..sfm.photos import is_bare
 
     place = input_of(item)
     if not is_bare(place):

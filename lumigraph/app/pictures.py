@@ -19,18 +19,18 @@ from typing import Any
 
 from PIL import Image, ImageOps
 
-from ..capture.masks import MASKS
-from ..capture.motion.reconstruction import BLACK, MIN_VIEWS
-from ..capture.numbers import check_pixels
-from ..capture.photos.gather import PHOTOGRAPHS, walk
-from ..capture.photos.judge import Judgement, blurred, duplicates, exposure_jumps, judge
-from ..capture.photos.overlap import Descriptors, apart, details, shared
-from ..capture.photos.video import VIDEOS
-from ..capture.pictures import reads_heic
-from ..capture.raw import is_raw
 from ..errors import LumigraphError
 from ..files import is_file
 from ..files.names import counted, natural
+from ..readers.masks import MASKS
+from ..readers.numbers import check_pixels
+from ..readers.pictures import reads_heic
+from ..readers.raw import is_raw
+from ..sfm.photos.gather import PHOTOGRAPHS, walk
+from ..sfm.photos.judge import Judgement, blurred, duplicates, exposure_jumps, judge
+from ..sfm.photos.overlap import Descriptors, apart, details, shared
+from ..sfm.photos.video import VIDEOS
+from ..sfm.reconstruction import BLACK, MIN_VIEWS
 from ..system.children import start_python
 from . import reduce
 from .folders import PAGE_SECONDS, Finder, Search

@@ -18,14 +18,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..budget import Budget
-from ..capture.motion.reconstruction import SNAPSHOTS
-from ..capture.motion.stages import StageMark
 from ..errors import LumigraphError
 from ..files import read_json
 from ..files.names import natural
 from ..files.ranges import Tally
 from ..geometry import evenly
 from ..metrics.rows import last_psnr
+from ..sfm.reconstruction import SNAPSHOTS
+from ..sfm.stages import StageMark
 from .job_record import Making
 from .jobs import log_lines, run_folder
 from .projects import SCENE, Item, changed_at, newest
@@ -193,7 +193,7 @@ def model(item: Item) -> dict[str, Any]:
 
 @lru_cache(4)
 def _model(place: Path, modified: int) -> dict[str, Any]:
-    from ..capture.colmap import poses_of, read_model
+    from ..readers.colmap import poses_of, read_model
 
     found = read_model(place)
     poses = poses_of(found)

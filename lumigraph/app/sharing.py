@@ -77,7 +77,7 @@ def kinds_for(path: Path) -> list[dict[str, Any]]:
 
 def gaussians_of(path: Path) -> int | None:
     """Number of Gaussians of a run or a splat file; None for what is no cloud."""
-    from ..run import open_run
+    from ..large import open_run
     from ..run.records import read_rows
 
     if is_splats(path):

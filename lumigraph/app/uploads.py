@@ -286,9 +286,9 @@ def safe_part(part: str) -> str:
 
 def kind_of_file(name: str) -> str | None:
     """ "photograph" or "video" by a name's ending; None for any other file."""
-    from ..capture.photos.gather import PHOTOGRAPHS
-    from ..capture.photos.video import VIDEOS
-    from ..capture.raw.library import RAW_SUFFIXES
+    from ..readers.raw.library import RAW_SUFFIXES
+    from ..sfm.photos.gather import PHOTOGRAPHS
+    from ..sfm.photos.video import VIDEOS
 
     ending = PurePosixPath(name).suffix.lower()
     if ending in VIDEOS:
@@ -351,8 +351,8 @@ def fault_of(path: Path, name: str) -> str | None:
 def fault_of_photograph(path: Path, name: str) -> str | None:
     from PIL import Image
 
-    from ..capture.pictures import reads_heic
-    from ..capture.raw.library import RAW_SUFFIXES
+    from ..readers.pictures import reads_heic
+    from ..readers.raw.library import RAW_SUFFIXES
 
     if PurePosixPath(name).suffix.lower() in RAW_SUFFIXES:
         return None  # opened by its own library, in the process of the capture

@@ -12,10 +12,10 @@ import msgspec
 
 from .. import files, methods
 from ..budget import Budget
-from ..capture import requested
 from ..errors import LumigraphError
 from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
+from ..opening import requested
 from ..run import Run
 from ..run.derived import Inferred
 from ..run.records import Protocol, ViewScores, compared_kind

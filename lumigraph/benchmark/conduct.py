@@ -19,7 +19,6 @@ from PIL import Image
 from torch import Tensor
 
 from .. import files, methods
-from ..capture.pictures import readable
 from ..errors import LumigraphError
 from ..evaluation import file_name
 from ..figures import Row as Line
@@ -27,6 +26,7 @@ from ..figures import contact_sheet, save_picture
 from ..figures.charts import line_chart, standalone
 from ..files.locks import check_place, held
 from ..metrics import scores_of
+from ..readers.pictures import readable
 from ..run import Run
 from ..system.children import start_python
 from ..system.progress import clock, counting

@@ -15,12 +15,12 @@ from pathlib import Path
 
 from .. import files, methods
 from ..budget import Budget
-from ..capture import open_scene
 from ..errors import LumigraphError
 from ..evaluation.report import jpeg, page
 from ..evaluation.views import file_name
 from ..figures import save_picture
 from ..metrics import scores_of
+from ..opening import open_scene
 from ..run import Run
 from .cell import Cell, CellSettings, Row, read_rows
 from .conduct import STOP_CODES, Launch, conduct, launch, reason

@@ -78,9 +78,9 @@ class BenchStep:
     def run(self) -> int:
         os.environ.setdefault("CUDA_LAUNCH_BLOCKING", "1")  # a GPU's work then counts where it is launched
         from ..benchmark.step import bench_step
-        from ..capture import open_dataset
         from ..figures.charts import standalone
         from ..files import write_bytes, write_json
+        from ..opening import open_dataset
         from ..run import Run, build
 
         if self.output is not None:
@@ -257,8 +257,8 @@ class BenchViews(Cells):
         """The prior's run for each method that learns from collections and each seed, and cells that train those that
         are not there."""
         from ..benchmark.cell import Cell
-        from ..capture import kind_of
         from ..datasets.collection import Collection
+        from ..opening import kind_of
         from ..run import Run
 
         there = {Run(path).method_name: path.resolve() for path in self.priors}
@@ -281,9 +281,9 @@ class BenchViews(Cells):
     def places(self, source: str) -> Iterator[Place]:
         """The source itself, or held-out members of the collection that it is."""
         from ..benchmark.cell import MEMBERS
-        from ..capture import kind_of, open_dataset, sources_of
         from ..datasets.collection import Collection
         from ..geometry import evenly
+        from ..opening import kind_of, open_dataset, sources_of
 
         if kind_of(source) is not Collection:
             yield Place(source, scene_name(source))
@@ -312,7 +312,7 @@ class BenchViews(Cells):
     def there(self, source: str) -> int:
         """Number of a scene's training photographs."""
         from ..benchmark.cell import reduced
-        from ..capture import open_scene
+        from ..opening import open_scene
 
         downscale = reduced(source, self.downscale)
         return len(open_scene(source, downscale=downscale, reader=self.reader).splits["train"])

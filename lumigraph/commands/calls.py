@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from .. import methods
-from ..capture import open_scene
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
+from ..large import open_any
 from ..method import Method
-from ..run import Opened, open_any
+from ..opening import open_scene
+from ..run import Opened
 from ..system.work import at_work
 from .capture import scene_folder
 from .cli import parse

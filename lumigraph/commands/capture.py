@@ -50,7 +50,7 @@ class CaptureCommand:
     into the scene; check that picture before you train."""
 
     def run(self) -> int:
-        from ..capture.motion import MotionOptions, capture_rig, is_rig
+        from ..sfm import MotionOptions, capture_rig, is_rig
         from ..system.progress import track
 
         if not self.what:
@@ -72,9 +72,9 @@ class CaptureCommand:
 
 def show_masks(folder: Path, onward: str) -> None:
     """Find the object of a scene, unless that was done before: results to stdout, doubts to stderr."""
-    from ..capture import choose_reader
-    from ..capture.masks import OBJECT_MASKS
-    from ..capture.objects import mask_object
+    from ..readers import choose_reader
+    from ..readers.masks import OBJECT_MASKS
+    from ..readers.objects import mask_object
 
     if (folder / OBJECT_MASKS).exists():
         show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
@@ -92,8 +92,8 @@ def show_masks(folder: Path, onward: str) -> None:
 
 def posed(scene: str) -> str:
     """The scene itself, or for bare photographs and videos the folder with their poses, which are found first."""
-    from ..capture import PROCEDURAL
-    from ..capture.photos import is_bare
+    from ..opening import PROCEDURAL
+    from ..sfm.photos import is_bare
 
     path = Path(scene).expanduser()
     if scene.startswith(PROCEDURAL) or not is_bare(path):
@@ -116,7 +116,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
 
 def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
     """reconstruct(), with bars; a message after Ctrl-C names the command to continue."""
-    from ..capture.motion import reconstruct
+    from ..sfm import reconstruct
     from ..system.progress import track
 
     try:
@@ -134,8 +134,8 @@ def show_result(folder: Path, result: dict[str, Any], onward: str | None = None)
 
 
 def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
-    from ..capture.coverage import use_of
-    from ..capture.doctor import Finding
+    from ..sfm.coverage import use_of
+    from ..sfm.doctor import Finding
 
     placed, others = len(result["registered"]), result["other_models"]
     found = {"photographs": f"{placed} of {result['given']} placed"}

@@ -42,8 +42,8 @@ class Clean:
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cloud import gone, unwanted
+        from ..large import open_any
         from ..method.capabilities import HasGaussians, needs
-        from ..run import open_any
         from ..run.derived import check_output, save_picked
 
         opened, device = open_any(self.source), choose_device(self.device)

@@ -143,7 +143,7 @@ def lines(items: Sequence[str], more: str) -> str:
 
 def finding_rows(found: Sequence[Any], more: str) -> dict[str, str]:
     """Rows of findings by fault, for `show`. more: the file that holds all of them"""
-    from ..capture.doctor import grouped
+    from ..sfm.doctor import grouped
 
     return {fault: lines(sentences, more) for fault, sentences in grouped(found).items()}
 

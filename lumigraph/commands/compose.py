@@ -81,7 +81,7 @@ class Compose:
         from ..composition import standing
         from ..datasets.tracks import nodes_of
         from ..geometry import Similarity
-        from ..run import open_any
+        from ..large import open_any
         from ..run.composition import CompositionPart, LitMeshFile, relative, write_composition
 
         if self.output.suffix.lower() != ".json":

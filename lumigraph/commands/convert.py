@@ -60,7 +60,7 @@ class Convert:
     def run(self) -> int:
         from .. import methods
         from ..derive.conversion import ConversionTarget, convert
-        from ..run import open_any
+        from ..large import open_any
 
         if self.list:
             print(listed())

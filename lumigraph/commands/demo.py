@@ -36,11 +36,11 @@ class Demo:
 
     def run(self) -> int:
         from .. import methods
-        from ..capture import open_dataset
         from ..evaluation import evaluate_run
         from ..evaluation.report import write_report
         from ..export.film import film
         from ..metrics import scores_of
+        from ..opening import open_dataset
         from ..paths import film_cameras
         from ..run import Run, build, check_new
         from ..training import fit

@@ -44,10 +44,10 @@ class Depth:
     reader: ReaderOption = None
 
     def run(self) -> int:
-        from ..capture import open_scene
         from ..depth_maps.multi_view import multi_view_depth
         from ..export.depth import SHEET, write_depth
         from ..files import claim_folder
+        from ..opening import open_scene
 
         claim_folder(self.output, "depth maps")
         scene = open_scene(self.scene, self.downscale, self.reader, whole=True)

@@ -42,12 +42,11 @@ class Eval:
 
     def run(self) -> int:
         from ..evaluation import claim_evaluation, evaluate_run, stem
-        from ..large import BlockRun
+        from ..large import BlockRun, open_run
         from ..metrics import scores_of
         from ..metrics.detail import FineDetail
         from ..metrics.lpips import load_lpips, named_files
         from ..metrics.rows import last_psnr
-        from ..run import open_run
         from .outcome import beside_training, next_commands
 
         run = open_run(self.run_folder)

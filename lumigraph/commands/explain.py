@@ -72,10 +72,11 @@ class ExplainEncodings:
             raise LumigraphError("A curve over scales needs two or more of them; for example --scales 1 10 100")
         from dataclasses import replace
 
-        from ..capture import open_scene, single_image
         from ..explain.encodings import compare
         from ..explain.encodings_page import claim_page, write_page
         from ..methods.fourier_features import FourierFeatures
+        from ..opening import open_scene
+        from ..readers import single_image
         from ..system.progress import counting
 
         if not single_image.recognises(self.picture.expanduser()):
@@ -110,11 +111,11 @@ class ExplainFitting:
     seed: SeedOption = 0
 
     def run(self) -> int:
-        from ..capture import open_dataset
         from ..datasets.scene import Scene
         from ..datasets.shapes import Shapes
         from ..explain.fitting import compare, draw
         from ..files import claim
+        from ..opening import open_dataset
 
         name = scene_name(self.data)
         folder = self.output or Path("explained") / f"{name}-fitting"

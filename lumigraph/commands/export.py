@@ -107,7 +107,7 @@ class ExportMesh:
 
     def _sequence(self, count: int) -> int:
         """Write a mesh of each of some moments."""
-        from ..run import open_any
+        from ..large import open_any
 
         times = open_any(self.source).frame.times
         if times is None:
@@ -245,8 +245,8 @@ class ExportSplats:
     def _moving(self) -> int:
         """Write every moment of a run or file that moves."""
         from ..exchange.fourdgs import write_moving
+        from ..large import open_any
         from ..method.capabilities import HasMovingGaussians, needs
-        from ..run import open_any
 
         if self.detail.given or self.detail.lod:
             raise LumigraphError("A .4dgs has no levels of detail; leave out --lod and its options")
@@ -275,9 +275,9 @@ class ExportSplats:
         """Write a cloud as it is at one moment."""
         from ..exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ..exchange.streamed_sog import Detail
+        from ..large import open_any
         from ..method.capabilities import HasGaussians, needs
-        from ..run import open_any
-        from ..run.opening import frame_of
+        from ..run.files import frame_of
 
         output = self.detail.output(self.output)
         check_ending(output)
@@ -333,8 +333,8 @@ class ExportOctree:
             raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
         claim(self.output, "octree", self.overwrite, [self.source])
         from ..exchange.baked import write_octree
+        from ..large import open_any
         from ..method.capabilities import HasOctree, needs
-        from ..run import open_any
 
         opened = open_any(self.source)
         octree = needs(controlled(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
@@ -533,8 +533,8 @@ class ExportSnerg:
     def run(self) -> int:
         from ..exchange import size_of, snerg
         from ..files import claim_folder
+        from ..large import open_any
         from ..method.capabilities import HasAtlas, needs
-        from ..run import open_any
 
         claim_folder(self.output, "atlas")
         atlas = needs(open_any(self.source).method(), HasAtlas).atlas()

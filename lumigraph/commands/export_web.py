@@ -196,7 +196,7 @@ def can_be_baked(opened: Any, method: Any) -> bool:
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
     """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
     from ..derive.conversion import ConversionTarget, convert
-    from ..run import open_any
+    from ..large import open_any
 
     begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:

@@ -69,13 +69,14 @@ class Infer:
 
     def _inferred(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
         """The run of a scene, and rows about it to print."""
-        from ..capture import PROCEDURAL, kind_of, open_dataset, single_image, sources_of
-        from ..capture.assemble import HOLD_OUT
-        from ..capture.photos import is_bare
         from ..datasets.collection import Collection
         from ..datasets.dataset import check_kind
         from ..datasets.scene import Scene
+        from ..opening import PROCEDURAL, kind_of, open_dataset, sources_of
+        from ..readers import single_image
+        from ..readers.assemble import HOLD_OUT
         from ..run.derived import infer
+        from ..sfm.photos import is_bare
 
         assert self.scene is not None
         name, path = made_by.method_name, Path(self.scene).expanduser()
@@ -110,10 +111,11 @@ class Infer:
 
     def _completed(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
         """The run of a shape, and rows about it to print."""
-        from ..capture import open_dataset, single_image
         from ..datasets.dataset import check_kind
         from ..datasets.scene import Photograph
         from ..datasets.shapes import CUBE, Shapes
+        from ..opening import open_dataset
+        from ..readers import single_image
         from ..run.derived import Pictured, infer
 
         assert self.scene is not None

@@ -26,12 +26,12 @@ class Info:
     reader: ReaderOption = None
 
     def run(self) -> int:
-        from ..capture import open_dataset, read_capture
-        from ..capture.doctor import findings
         from ..datasets.scene import Scene
         from ..exchange import is_splat_file, read_gaussians, snerg
         from ..large import BlockRun
+        from ..opening import open_dataset, read_capture
         from ..run import is_block_run
+        from ..sfm.doctor import findings
         from . import info_tree
 
         if is_block_run(Path(self.what)):
@@ -43,14 +43,14 @@ class Info:
         elif is_splat_file(self.what):
             tree = info_tree.cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and Path(self.what).is_file():
-            from ..run import open_any
+            from ..large import open_any
             from ..run.composition import Canonicalised
 
             opened = open_any(self.what)
             made = info_tree.canonical_tree if isinstance(opened, Canonicalised) else info_tree.composition_tree
             tree = made(opened)
         elif snerg.recognises(Path(self.what)):
-            from ..run.opening import SnergFolder
+            from ..run.files import SnergFolder
 
             tree = info_tree.atlas_tree(SnergFolder(self.what))
         else:

@@ -10,7 +10,6 @@ from rich.text import Text
 from rich.tree import Tree
 
 from ..budget import Budget
-from ..capture.doctor import Finding, grouped
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..datasets.shapes import Shapes
@@ -26,6 +25,7 @@ from ..metrics import scores_of
 from ..metrics.rows import last_psnr
 from ..run import Run
 from ..run.derived import Compressed, Converted, Inferred
+from ..sfm.doctor import Finding, grouped
 from ..system.console import bold, dim
 from ..training.display import extent, pixel_sizes
 from ..training.verdict import cameras_moved

@@ -38,10 +38,10 @@ class Jump:
     def run(self) -> int:
         import torch
 
-        from ..capture import open_scene
         from ..export.jump import stereo_panorama
         from ..export.panorama import picture_format, save_sphere
         from ..files import claim
+        from ..opening import open_scene
 
         picture_format(self.output)
         claim(self.output, "panorama", self.overwrite)

@@ -64,7 +64,7 @@ def open_method(
 ) -> tuple[Any, Any, Any]:
     """The opened run or file, its method with the controls of --set, and the cameras of its photographs by split, as
     the method has refined them. scaling: of --scale-by, which a run remembers"""
-    from ..run import open_any
+    from ..large import open_any
     from .common import choose_device
 
     opened = open_any(source)

@@ -30,10 +30,10 @@ NEXT = {"eval": "compare with held-out views", "view": "open in the browser", "e
 
 def show_outcome(run: Any, outcome: Any, method: Method, data: Any, turn: Any = nullcontext) -> None:
     """Print the state of a Run after an Outcome, and the next commands. turn: see `examine`"""
-    from ..capture.doctor import FOLDED
     from ..evaluation.photographs import RESULT_FILE
     from ..evaluation.tracking import tracks
     from ..metrics.rows import last_psnr
+    from ..sfm.doctor import FOLDED
     from ..training.verdict import cameras_moved, loss_trend
 
     if tracks(method):
@@ -124,7 +124,7 @@ def memorised(gap: float, run: Any, method: Method, worst: Sequence[str]) -> str
     gap:   dB by which training photographs are better
     worst: names of held-out photographs, lowest PSNR first
     """
-    from ..capture.doctor import label
+    from ..sfm.doctor import label
 
     priors = [name for part in method.parts for name in part.few_view_priors]
     applied = f"although priors were on ({', '.join(priors)})" if priors else "and no prior for few photographs was on"

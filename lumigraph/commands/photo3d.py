@@ -42,10 +42,10 @@ class Photo3DCommand:
     overwrite: Overwrite = False
 
     def run(self) -> int:
-        from ..capture import open_scene
         from ..export.mesh_file import write_mesh
         from ..export.photo3d import photo3d, write_page
         from ..files import claim
+        from ..opening import open_scene
 
         page = self.output.suffix.lower() == ".html"
         if not page and self.output.suffix.lower() != ".glb":

@@ -61,8 +61,8 @@ class Segment:
 
     def run(self) -> int:
         from ..figures import save_picture
+        from ..large import open_any
         from ..method.capabilities import HasGaussians, can
-        from ..run import open_any
         from ..selection import Selection
 
         if len(self.strokes) != len(self.view) or not self.strokes:
@@ -237,7 +237,7 @@ def before_and_after(
 
     from ..camera.rays import Rendering
     from ..figures import Row, contact_sheet
-    from ..run import open_any
+    from ..large import open_any
 
     after = None if result is None else open_any(result)
     to_result = None if after is None else after.frame.to_source.inverse @ opened.frame.to_source

@@ -60,7 +60,7 @@ class Track:
     token: ViewerToken = ""
 
     def run(self) -> int:
-        from ..capture import confirm, open_scene
+        from ..opening import confirm, open_scene
         from ..run import Run, build, check_new
         from ..training import fit
         from .outcome import show_tracking
@@ -96,7 +96,7 @@ class Track:
 
 def tracked_downscale(recording: str, reader: str | None) -> int:
     """Whole number by which the frames of a recording are reduced for tracking."""
-    from ..capture import read_capture
+    from ..opening import read_capture
 
     sizes = [max(shot.size) for shot in read_capture(recording, reader).shots[:1] if shot.size]
     return max(1, round(max(sizes, default=TRACKED_SIDE) / TRACKED_SIDE))

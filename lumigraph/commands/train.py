@@ -66,10 +66,10 @@ class BlockOptions:
 
         train: the command's other options, a `Train`
         """
-        from ..capture import kind_of
         from ..datasets.scene import Scene
         from ..large.layout import MIN_LARGE_VIEWS
         from ..large.planning import survey
+        from ..opening import kind_of
 
         if self.into is not None:
             return self._again(train, self.into)
@@ -249,8 +249,8 @@ class Train:
 
     def run(self, watch: Any = None) -> int:
         """Train, and print the outcome. watch: who looks on, in place of the viewer of --view; see `fit`"""
-        from ..capture import confirm, kind_of, open_dataset
         from ..datasets.dataset import check_kind
+        from ..opening import confirm, kind_of, open_dataset
         from ..run import Run, build, check_new
         from ..training import fit
         from .outcome import show_outcome

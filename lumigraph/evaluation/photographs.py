@@ -17,8 +17,6 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..capture import read_capture
-from ..capture.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
 from ..composition.floaters import STRENGTH, evidence
 from ..datasets.scene import Photograph, Scene
 from ..depth_maps import DepthMap, free
@@ -29,7 +27,9 @@ from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasGaussians, can, needs
 from ..metrics import psnr
+from ..opening import read_capture
 from ..run import Run
+from ..sfm.doctor import MIN_JUDGED, Finding, Residual, findings, label, of_residuals
 from ..system.progress import track
 
 PIXEL_BUDGET = 800_000  # rendered pixels of all photographs together, so that the check takes seconds

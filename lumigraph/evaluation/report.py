@@ -16,16 +16,16 @@ from PIL import Image
 
 from .. import __version__, methods
 from ..budget import Budget
-from ..capture.doctor import grouped
-from ..capture.pictures import readable
 from ..errors import LumigraphError
 from ..figures.charts import STYLE as CHARTS
 from ..figures.charts import Series, bar_chart, line_chart
 from ..files import claim, write_bytes
 from ..metrics import scores_of
 from ..metrics.rows import last_psnr, of_final_size
+from ..readers.pictures import readable
 from ..run import Run
 from ..run.records import compared_kind
+from ..sfm.doctor import grouped
 from ..system.progress import clock, short
 from ..training.display import extent, pixel_sizes
 from ..training.verdict import cameras_moved

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..capture.views import with_fewer_views
 from ..components.fields.development import decoded, encoded
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
@@ -31,6 +30,7 @@ from ..method.depth import DEPTH_LAYER
 from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.detail import FineDetail, detail
 from ..metrics.lpips import DEFINITION, Lpips
+from ..readers.views import with_fewer_views
 from ..system.progress import counting, track
 from ..system.work import at_work
 from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half

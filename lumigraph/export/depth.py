@@ -11,13 +11,13 @@ import torch
 from PIL import Image
 
 from ..camera import Camera
-from ..capture.transforms import OPENCV_FROM_OPENGL
 from ..datasets.scene import Scene
 from ..depth_maps import DepthMap
 from ..depth_maps.stereo import Disparity, RectifiedPair
 from ..errors import LumigraphError
 from ..figures import Row, colour_depth, contact_sheet, depth_range, save_picture, to_image
 from ..files import replacing_folder, write_json
+from ..readers.transforms import OPENCV_FROM_OPENGL
 
 MAX_LEVEL = 65534  # of 16 bits; 0 and 65535 stand for unknown depth
 SHEET = "depth.png"

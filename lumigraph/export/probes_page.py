@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Pinhole
-from ..capture.meshes import read_shape
 from ..composition.lit import MIN_SURFACE_OPACITY, ShadedMesh, surface_of
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Vector
@@ -26,6 +25,7 @@ from ..paths import film_size
 from ..paths.automatic import angle_of_view
 from ..paths.opening import opening_of_scene
 from ..probes import FREE, ProbeGrid
+from ..readers.meshes import read_shape
 from .page import page_bytes, webp
 
 PICTURE_SIDE = 960  # pixels of the picture's longer side

@@ -1,4 +1,4 @@
-"""Scenes too large for one field (Tancik 2022): blocks that train as runs and render as one.
+"""Scenes too large for one field (Tancik 2022): blocks that train as runs and render as one; opening of any run.
 
 layout               positions of blocks, at street crossings or evenly spread, and the photographs of each
 plan, planning       blocks.json, the task of each block, and the plan drawn from above, before any training
@@ -6,6 +6,7 @@ worker               train one block: a function over its folder, which may be c
 training             train all blocks, in this process or on workers, or one of them again;  monitor  their progress
 block_run            the run of all blocks as something that opens;  block_cache  blocks in memory
 compositing, weights render nearby blocks and mix their pictures; one cloud of the blocks' clouds of Gaussians
+opening              open runs, in blocks or not, and all that opens like a run
 alignment            one appearance and one exposure for all blocks
 """
 
@@ -14,4 +15,6 @@ from .block_cache import Nearby as Nearby
 from .block_run import BlockRun as BlockRun
 from .compositing import InBlocks as InBlocks
 from .compositing import merged as merged
+from .opening import open_any as open_any
+from .opening import open_run as open_run
 from .weights import Mixing as Mixing

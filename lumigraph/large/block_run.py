@@ -21,7 +21,6 @@ from torch import Tensor
 
 from .. import files, methods
 from ..camera import Camera
-from ..capture import Before, CapturePart, open_dataset
 from ..components.fields.appearance import Appearance
 from ..composition import PickedCloud, Placed
 from ..datasets.alignment import aligning
@@ -31,6 +30,8 @@ from ..files.names import natural
 from ..geometry import Similarity
 from ..method import Method
 from ..method.capabilities import HasGaussians, RefinesPoses, can
+from ..opening import open_dataset
+from ..readers import Before, CapturePart
 from ..run.checkpoint import State
 from ..run.folder import Run
 from ..run.opened import Trained

@@ -17,10 +17,10 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from ..capture import Places
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import read_json
 from ..files.ranges import Point, Positive, typed
+from ..readers import Places
 from .plan import Block
 
 MIN_LARGE_VIEWS = 200  # photographs from which on a capture is divided by default

@@ -20,10 +20,10 @@ from typing import Annotated, Any
 import msgspec
 
 from .. import files
-from ..capture import CapturePart
 from ..errors import LumigraphError
 from ..files.ranges import Point, Positive, between, typed
 from ..files.reading import reads
+from ..readers import CapturePart
 from ..run.settings import Source
 
 PLAN_FORMAT = "lumigraph blocks 1"

@@ -14,10 +14,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from .. import files
 from ..budget import Budget
-from ..capture import Places, places_of, read_capture
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files.plain import alike
+from ..opening import read_capture
+from ..readers import Places, places_of
 from ..run import check_new, processor
 from ..run.folder import versions
 from .layout import lay_out

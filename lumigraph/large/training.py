@@ -23,12 +23,12 @@ import numpy as np
 
 from .. import files, methods
 from ..budget import Budget
-from ..capture import Places
 from ..components.fields.appearance import Appearance
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
 from ..files.locks import held
 from ..method.capabilities import HasGaussians, can
+from ..readers import Places
 from ..system.signals import Interrupt
 from .alignment import align_appearance
 from .block_cache import Nearby

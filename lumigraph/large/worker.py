@@ -24,12 +24,13 @@ import torch
 
 from .. import files, methods
 from ..budget import Budget
-from ..capture import Before, open_dataset
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..files.locks import held
 from ..files.ranges import typed
 from ..method import Method
+from ..opening import open_dataset
+from ..readers import Before
 from ..run import Run, build
 from ..run.records import warn_of_changes
 from ..training import fit

@@ -8,6 +8,4 @@ from .folder import is_block_run as is_block_run
 from .folder import processor as processor
 from .opened import Opened as Opened
 from .opened import Trained as Trained
-from .opening import open_any as open_any
-from .opening import open_run as open_run
 from .settings import check_memory as check_memory

@@ -50,7 +50,6 @@ import torch
 from .. import files
 from ..camera import Camera
 from ..camera.crop import Crop, CropBox
-from ..capture.meshes import read_shape
 from ..composition import (
     Composed,
     LitComposition,
@@ -71,6 +70,7 @@ from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaterni
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
 from ..probes import read_probes
+from ..readers.meshes import read_shape
 from ..system.memory import ask_for
 from .folder import Run
 from .opened import Opened

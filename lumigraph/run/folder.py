@@ -29,7 +29,6 @@ import torch
 
 from .. import files, methods
 from ..camera import Camera
-from ..capture import KINDS, Before, open_dataset
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..datasets.world import BlockWorld
@@ -41,6 +40,8 @@ from ..files.partials import PARTIAL_NAME
 from ..files.plain import alike, understood
 from ..files.ranges import check
 from ..method import Method
+from ..opening import KINDS, open_dataset
+from ..readers import Before
 from .checkpoint import PACKED_FILE, Checkpoints, State
 from .opened import Trained
 from .records import cameras_json, cameras_of, read_cameras, read_rows, warn_of_changes

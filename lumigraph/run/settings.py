@@ -10,12 +10,12 @@ import torch
 
 from .. import files, methods
 from ..budget import Budget
-from ..capture import CapturePart, Unposed
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, typed, value_of
 from ..files.reading import reads
 from ..method import Method
+from ..readers import CapturePart, Unposed
 from ..system.memory import ask_for, free_on
 
 RUN_FORMAT = "lumigraph run 1"

@@ -37,10 +37,10 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Pinhole
-from ..capture.capture import Capture, PixelPlane, Shot
-from ..capture.raw import RawPhoto, facts, planes
 from ..datasets.world import BlockLabels
 from ..geometry import Similarity
+from ..readers.capture import Capture, PixelPlane, Shot
+from ..readers.raw import RawPhoto, facts, planes
 from ..system import kernel_cache as kernel_cache
 from . import categories as categories
 from . import scenes as scenes

@@ -14,10 +14,10 @@ from typing import Annotated
 
 import numpy as np
 
-from ..capture import meshes
 from ..errors import LumigraphError
 from ..files.names import natural
 from ..files.ranges import Seed, between
+from ..readers import meshes
 from . import categories, scenes
 from .cameras import dome, pinhole, spiral
 from .categories import FIELD_OF_VIEW, surrounded

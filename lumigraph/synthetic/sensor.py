@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..capture.raw import RawPhoto
-from ..capture.raw.photo import repeated, srgb_from_camera
+from ..readers.raw import RawPhoto
+from ..readers.raw.photo import repeated, srgb_from_camera
 
 COLOUR_MATRIX = ((0.9020, -0.2890, -0.0715), (-0.4535, 1.2436, 0.2348), (-0.0934, 0.1919, 0.7086))  # XYZ to camera
 WHITE_BALANCE = (1.949, 1.0, 1.344)  # gains of red, green and blue

@@ -18,7 +18,6 @@ from ... import kernels
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering, Samples
-from ...capture.single_image import photograph
 from ...components.fields.kept_photographs import Kept
 from ...components.training.adversarial import discriminator_loss, generator_loss, held
 from ...components.training.row_optimizers import exchange
@@ -27,9 +26,10 @@ from ...datasets.world import LABELS, BlockWorld
 from ...files.ranges import Count, LearningRate, NonNegative, Octaves, Positive, Seed, Share, Width, between
 from ...method import Method
 from ...method.controls import Control, blend
-from ...synthetic.landscapes import STYLES, landscape
+from ...readers.single_image import photograph
 from ...system.progress import track
 from ...system.work import at_work
+from .landscapes import STYLES, landscape
 from .networks import BORDER, BlockField, NeuralRenderer, SkyNetwork, StyleEncoder, StyleNetwork, divergence, drawn
 from .spade import Adversary, LabelPainter, channels, halves, perceptual
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
-from ...capture.up import common_up
 from ...components.fields.appearance import fitted
 from ...components.fields.hash_field import HashNumbers
 from ...components.fields.instance_codes import FOUND, InstanceCodes
@@ -32,6 +31,7 @@ from ...geometry import look_at, turning
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
+from ...readers.up import common_up
 from ...volume import composite
 from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
 

@@ -15,7 +15,6 @@ from torch.nn.functional import softplus
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Samples
-from ...capture.views import spread_out
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.kept_photographs import KeptPhotographs, chance, padded, photographed, rays_through
 from ...components.fields.layers import in_chunks
@@ -41,6 +40,7 @@ from ...files.ranges import (
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
+from ...readers.views import spread_out
 from ...volume import composite, weights_of
 from .networks import STRIDE, PictureEncoder, ResidualNetwork, look_up
 

@@ -13,14 +13,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from ...files.names import counted, natural
-from ...geometry import evenly
-from ...system.library import pycolmap
-from ..colmap import poses_of
-from ..coverage import Coverage, coverage
-from ..oddities import in_steps, jumps
-from ..photos import Intake, Photo
-from ..photos.judge import MAX_EXPOSURE_STOPS, exposure_jumps
+from ..files.names import counted, natural
+from ..geometry import evenly
+from ..readers.colmap import poses_of
+from ..readers.oddities import in_steps, jumps
+from ..system.library import pycolmap
+from .coverage import Coverage, coverage
+from .photos import Intake, Photo
+from .photos.judge import MAX_EXPOSURE_STOPS, exposure_jumps
 
 MIN_FEATURES = 100
 MIN_MATCHES = 15  # shared features of two photographs that COLMAP accepts

@@ -8,9 +8,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
-from ...errors import LumigraphError
-from ...system.library import pycolmap
-from ..photos import Photo
+from ..errors import LumigraphError
+from ..system.library import pycolmap
+from .photos import Photo
 
 Sharing = Literal["auto", "single", "per-device", "per-image", "spherical"]
 

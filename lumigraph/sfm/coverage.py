@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..files.names import counted
-from .normalise import where_axes_meet
+from ..readers.normalise import where_axes_meet
 
 Place = tuple[float, float, float]
 

@@ -14,8 +14,8 @@ from PIL import Image, ImageOps
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry import evenly
-from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, eight_bits
-from ..raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
+from ...readers.pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, eight_bits
+from ...readers.raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .photo import Track
 
 PROBE_VIEWS = 8  # photographs that set the common brightness

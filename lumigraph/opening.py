@@ -1,59 +1,41 @@
-"""Open files as a dataset: photographs as a Scene, meshes as Shapes, folders of either as a Collection.
-
-Each format has one reader; bounds and splits are found in one place."""
+"""Open what a user names as a dataset: photographs as a Scene, meshes as Shapes, folders of either as a Collection,
+words, worlds of blocks, and procedural scenes."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from ..datasets.collection import Collection
-from ..datasets.dataset import Dataset
-from ..datasets.scene import Scene
-from ..datasets.shapes import Shapes
-from ..datasets.words import WORDS, Words
-from ..datasets.world import BlockWorld
-from ..errors import LumigraphError
-from ..files import exists, expanded
-from ..files.names import natural
-from ..files.ranges import typed
-from ..files.readers import LISTED, NAMES
-from ..files.reading import reads
-from . import meshes, minecraft, single_image
-from .assemble import Before as Before
-from .assemble import assemble as assemble
-from .bones import with_bones
-from .capture import Capture as Capture
-from .capture import Shot as Shot
-from .inner_depth import with_inner_depth
-from .masks import with_masks
-from .part import CapturePart as CapturePart
-from .part import Places as Places
-from .part import part_of
-from .part import places_of as places_of
-from .pictures import list_images
-from .raw import with_raw
-from .surveyed import with_surveyed
-from .tracks import with_tracks
-from .unposed import Unposed as Unposed
-from .unposed import unposed as without_poses
-from .views import multiscale as multiscale
-from .views import with_all_views, with_fewer_views
+from . import synthetic
+from .datasets.collection import Collection
+from .datasets.dataset import Dataset
+from .datasets.scene import Scene
+from .datasets.shapes import Shapes
+from .datasets.words import WORDS, Words
+from .datasets.world import BlockLabels, BlockWorld
+from .errors import LumigraphError
+from .files import exists, expanded
+from .files.names import natural
+from .files.ranges import typed
+from .files.reading import reads
+from .readers import READERS, choose_reader, meshes, minecraft, single_image
+from .readers.assemble import Before, assemble
+from .readers.bones import with_bones
+from .readers.capture import Capture
+from .readers.inner_depth import with_inner_depth
+from .readers.masks import with_masks
+from .readers.part import CapturePart, part_of
+from .readers.pictures import list_images
+from .readers.raw import with_raw
+from .readers.surveyed import with_surveyed
+from .readers.tracks import with_tracks
+from .readers.unposed import Unposed
+from .readers.unposed import unposed as without_poses
+from .readers.views import multiscale, with_all_views, with_fewer_views
 
-READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"
-
-
-def synthetic() -> Any:
-    """The room of procedural scenes, imported by name: it stands above this one."""
-    return import_module("..synthetic", __package__)
-
-
 KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection, BlockWorld, Words)}
 
 
@@ -100,9 +82,9 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     if str(source).startswith(WORDS):
         return Words
     if (request := requested(source)) is not None:
-        if synthetic().is_collection(request):
+        if synthetic.is_collection(request):
             return Collection
-        return BlockWorld if synthetic().is_block_world(request) else Scene
+        return BlockWorld if synthetic.is_block_world(request) else Scene
     if not exists(path):
         raise LumigraphError(f"{path} does not exist; check the path")
     if minecraft.recognises(path):
@@ -120,7 +102,7 @@ def sources_of(collection: str | Path) -> dict[str, str]:
     """Source of each member of a collection for `open_dataset`, by its name."""
     if (request := requested(collection)) is None:
         return {name: str(place) for name, place in members_of(expanded(collection)).items()}
-    return {name: f"{PROCEDURAL}{one}" for name, one in synthetic().members_of(request).items()}
+    return {name: f"{PROCEDURAL}{one}" for name, one in synthetic.members_of(request).items()}
 
 
 def requested(source: str | Path) -> str | None:
@@ -197,7 +179,7 @@ def open_scene(
 def confirm(source: str | Path) -> None:
     """Raise LumigraphError where there is nothing at a source that could be learnt from, by whatever method."""
     if (request := requested(source)) is not None:
-        synthetic().confirm(request)
+        synthetic.confirm(request)
         return
     if str(source).startswith(WORDS):
         return
@@ -210,44 +192,11 @@ def confirm(source: str | Path) -> None:
 def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     """Photographs with poses as a reader finds them, without pixels. source, reader: as of `open_scene`"""
     if (request := requested(source)) is not None:
-        return synthetic().read(request)
+        return synthetic.read(request)
     path = expanded(source)
-    if path.is_file() and minecraft.recognises(path):
-        return minecraft.read(path)
-    capture = with_bones(with_tracks(choose_reader(path, reader).read(path), path), path)
+    chosen = minecraft if path.is_file() and minecraft.recognises(path) else choose_reader(path, reader)
+    if chosen is minecraft:  # whose pictures are traced
+        labels, notes = minecraft.read_blocks(path)
+        return replace(synthetic.block_capture(BlockLabels(labels), str(path)), notes=notes)
+    capture = with_bones(with_tracks(chosen.read(path), path), path)
     return with_inner_depth(with_raw(with_masks(capture, path), path))
-
-
-@reads()
-def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
-    """The reader that recognises a folder. Raises LumigraphError if none does."""
-    if not exists(folder):
-        raise LumigraphError(f"{folder} does not exist; check the path")
-    if not folder.is_dir():
-        raise LumigraphError(
-            f"{folder} is a file; name the folder that holds the photographs and their poses, "
-            f"or find those of a video or of photographs first: lumigraph capture {folder}"
-        )
-    if not any(folder.iterdir()):
-        raise LumigraphError(f"{folder} is empty; name a folder that holds photographs and their poses")
-    if name is not None and name not in READERS:
-        raise LumigraphError(f"there is no reader called {name}; there are {LISTED}")
-    asked = READERS if name is None else {name: READERS[name]}
-    for reader in asked.values():
-        if reader.recognises(folder):
-            return reader
-    pictures = len(list_images(folder))
-    raise LumigraphError(
-        f"{folder} holds no camera poses ({pictures} images were found): looked for "
-        f"{'; '.join(r.EXPECTED_FILES for r in asked.values())}; find the poses first: lumigraph capture {folder}"
-    )
-
-
-class CallablePackage(ModuleType):
-    """This package as `lumigraph.capture(photographs)`: a call has the name of its command, which is this package's."""
-
-    def __call__(self, *photographs: Any, **options: Any) -> Scene:
-        return import_module("..commands.calls", __package__).capture(*photographs, **options)
-
-
-sys.modules[__name__].__class__ = CallablePackage

@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ...errors import LumigraphError
-from ...files import read_json, write_json
-from ...files.ranges import Lasted
-from ...system.children import start_python
+from ..errors import LumigraphError
+from ..files import read_json, write_json
+from ..files.ranges import Lasted
+from ..system.children import start_python
 
 WORKER = Path(__file__).with_name("worker.py")
 DONE = "done\n"  # the worker's line at the end of a job

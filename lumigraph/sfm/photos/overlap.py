@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
-from ..pictures import eight_bits
+from ...readers.pictures import eight_bits
 
 SIDE, COUNT = 480, 800  # pixels of the longer side; details of a photograph
 RATIO = 0.8  # of the distances to the nearest and second nearest (Lowe 2004, section 7.1)

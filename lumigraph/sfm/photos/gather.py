@@ -18,12 +18,12 @@ from ...errors import LumigraphError
 from ...files import exists, explained
 from ...files.names import counted, natural
 from ...files.reading import reason_of
+from ...readers.exif import read_facts
+from ...readers.masks import MASKS, OBJECT_MASKS, find_mask
+from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
+from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
-from ..masks import MASKS, OBJECT_MASKS, find_mask
-from ..pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
-from ..raw import Developed, is_raw
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
-from .exif import read_facts
 from .judge import blurred, duplicates, judge
 from .photo import Intake, Photo, Track, untracked
 from .video import extract, is_video
@@ -128,7 +128,7 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
 
 def is_bare(path: Path) -> bool:
     """True for a video, or a folder with photographs but without poses that a reader recognises."""
-    from .. import READERS  # that package may import this one
+    from ...readers import READERS  # that package may import this one
 
     if not path.is_dir():
         return is_video(path)

@@ -15,15 +15,15 @@ from PIL import Image
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from ...camera.lens import Equirectangular
-from ...files import replacing
-from ...system.library import pycolmap
-from ..photos import Photo
-from ..photos.copies import save
-from ..photos.photo import Track
-from ..pictures import stem
+from ..camera.lens import Equirectangular
+from ..files import replacing
+from ..readers.pictures import stem
+from ..system.library import pycolmap
 from .folder import MASKS, remove_copies
 from .lenses import MODEL
+from .photos import Photo
+from .photos.copies import save
+from .photos.photo import Track
 
 # Right, down and forward of each view in the panorama's axes. Straight down is left out: whoever carries the camera
 # is there.

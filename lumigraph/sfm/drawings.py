@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from ...figures import RAMP, fit_into, ramp, save_picture
-from ...files.names import natural
-from ...system.library import pycolmap
-from ..photos import Intake
+from ..figures import RAMP, fit_into, ramp, save_picture
+from ..files.names import natural
+from ..system.library import pycolmap
 from .diagnosis import Diagnosis
+from .photos import Intake
 
 INK_COLOUR, FAINT_COLOUR, PAPER_COLOUR = "#1b1d22", "#6d717a", "#fbfaf8"
 LEFT_OUT_COLOUR, BLURRED_COLOUR, DUPLICATE_COLOUR = "#c0392b", "#d98200", "#3f6fb0"

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Integer
 
-from ...geometry import evenly
-from ...system.library import pycolmap
+from ..geometry import evenly
+from ..system.library import pycolmap
 from .diagnosis import MIN_MATCHES, Matches
 
 MAX_PAIRS = 4000  # pairs of photographs that are looked at

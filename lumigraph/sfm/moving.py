@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import LumigraphError
-from ...files.names import counted
-from ...system.library import pycolmap
-from ..photos import Photo
+from ..errors import LumigraphError
+from ..files.names import counted
+from ..system.library import pycolmap
 from .diagnosis import MIN_MATCHES
+from .photos import Photo
 
 MIN_PAIRS = 2  # pairs in which a feature is matched before it can be found to move
 MAX_STILL_SHARE = 0.5  # share of these pairs that agree with the camera's motion; what has less moves

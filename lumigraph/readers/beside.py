@@ -22,8 +22,8 @@ from ..errors import LumigraphError
 from ..files.reading import reading
 from ..geometry import evenly
 from .capture import Capture, PixelPlane, Shot
+from .exif import exposure
 from .numbers import kind_of, read_numbers
-from .photos.exif import exposure
 from .pictures import HEIC_SUFFIXES, Chosen, read_image, readable, same_shape, stat
 
 EXPOSURE_SUFFIXES = (".jpg", ".jpeg", *HEIC_SUFFIXES)  # files with an exposure time

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ...camera import Camera
-from ...camera.lens import Pinhole
-from ...system.library import pycolmap
-from ..photos import Photo
-from ..up import common_up, turn_onto_z
+from ..camera import Camera
+from ..camera.lens import Pinhole
+from ..readers.up import common_up, turn_onto_z
+from ..system.library import pycolmap
+from .photos import Photo
 
 MAX_GPS_ERROR = 10.0  # metres; a position with a larger error is an outlier
 MAX_RELATIVE_ERROR = 0.25  # typical error of positions, as a share of their spread along the longest axis

@@ -21,10 +21,10 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from ...files import replacing
-from ...geometry import evenly
-from ...system.library import pycolmap
-from ..pictures import read_image
+from ..files import replacing
+from ..geometry import evenly
+from ..readers.pictures import read_image
+from ..system.library import pycolmap
 from .diagnosis import MIN_MATCHES, calibration, deviation_from_turn
 
 MAX_WIDTH = 6000  # pixels of a whole turn

@@ -11,11 +11,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ...budget import lasting
-from ...errors import LumigraphError
-from ...system.memory import MAX_THREADS, free_memory, gigabytes
-from ..photos import Photo
+from ..budget import lasting
+from ..errors import LumigraphError
+from ..system.memory import MAX_THREADS, free_memory, gigabytes
 from .pairs import LOOP_CANDIDATES, RETRIEVED_VIEWS, SEQUENTIAL_NEIGHBOURS, Matching, exhaustive, sequential
+from .photos import Photo
 
 PROCESS_BYTES = 400_000_000  # of this process and COLMAP's before the first photograph
 DECODED_BYTES = 8  # per pixel of the file, in each thread

@@ -26,7 +26,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from ...color.srgb import linear_from_srgb
-from ..pictures import eight_bits, same_shape
+from ...readers.pictures import eight_bits, same_shape
 
 JUDGED_SIDE = 640  # pixels, the longer side of the judged picture
 SHORT_STEP, LONG_STEP = 2, 8  # pixels; along diagonals half as many steps, each √2 long

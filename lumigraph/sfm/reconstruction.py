@@ -13,22 +13,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...errors import LumigraphError
-from ...files import claim as claim_file
-from ...files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
-from ...files.locks import held
-from ...files.names import counted, natural
-from ...files.ranges import typed
-from ...system.library import pycolmap
-from ...system.memory import free_memory
-from ...system.progress import counting, tell
-from ..colmap import poses_of
-from ..doctor import FOLDED, findings
-from ..photos import Intake, Photo, gather
-from ..photos.photo import Track, untracked
-from ..raw import RAW_FILE, Remembered
-from ..transforms import Made
-from ..transforms import read as read_transforms
+from ..errors import LumigraphError
+from ..files import claim as claim_file
+from ..files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
+from ..files.locks import held
+from ..files.names import counted, natural
+from ..files.ranges import typed
+from ..readers.colmap import poses_of
+from ..readers.raw import RAW_FILE, Remembered
+from ..readers.transforms import Made
+from ..readers.transforms import read as read_transforms
+from ..system.library import pycolmap
+from ..system.memory import free_memory
+from ..system.progress import counting, tell
 from .agreement import Agreement, agreement
 from .demand import demand_of, fitted, reduced_pixels
 from .diagnosis import (
@@ -41,6 +38,7 @@ from .diagnosis import (
     read_matches,
     triangulation_angle,
 )
+from .doctor import FOLDED, findings
 from .drawings import draw_capture, draw_photographs
 from .folder import (
     DRAWING_FILES,
@@ -58,6 +56,8 @@ from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens, prior, write_database
 from .moving import MovingFeatures, check_still, check_times, leave_out_moving
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
+from .photos import Intake, Photo, gather
+from .photos.photo import Track, untracked
 from .sphere import flat_views
 from .stages import Stages, key_of
 from .stitching import stitch

@@ -1,8 +1,7 @@
-"""open_any(): opens runs, splat files, SNeRG's folders and compositions, with cameras around those that have none."""
+"""Files that open like runs: splat files, moving ones and folders of SNeRG's viewer, with cameras around them."""
 
 from __future__ import annotations
 
-import importlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -15,55 +14,19 @@ from .. import methods
 from ..composition import PlayedCloud
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..exchange import fourdgs, is_splat_file, place_of, read_gaussians, snerg
+from ..exchange import fourdgs, read_gaussians, snerg
 from ..exchange.baked import Atlas
-from ..files import is_file, read_json
 from ..files.ranges import changed
-from ..files.reading import reads
 from ..gaussians import Gaussians
 from ..geometry import Similarity
 from ..method import Method
-from .composition import CANONICAL_FORMAT, Canonicalised, Composition, Nesting
-from .folder import Run, is_block_run
-from .opened import Opened, Trained
+from .opened import Opened
 
 BOX_SHARE = 0.96  # of visible Gaussians inside the box of interest, along each axis
 # Splat files have y pointing down by custom, as the cameras they were learnt from; scenes stand upright.
 UPRIGHT_ROTATION = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 VOXEL_MARGIN = 0.02  # beyond [-1, 1]^3, that a voxel may reach
 WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
-
-
-@reads()
-def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
-    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
-    one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
-
-    within: what it is opened as a part of
-    Raises LumigraphError, in one sentence, for anything else.
-    """
-    path = Path(path)
-    if fourdgs.is_moving_file(path):
-        return MovingFile(path)
-    if is_splat_file(path):
-        return SplatFile(place_of(path))
-    if path.suffix.lower() == ".json" and not path.is_dir():
-        said = read_json(path)
-        if isinstance(said, dict) and said.get("format") == CANONICAL_FORMAT:
-            return Canonicalised(path)
-        return Composition(path, open_any, within)
-    if is_file(path):
-        raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
-    return SnergFolder(path) if snerg.recognises(path) and not is_block_run(path) else open_run(path)
-
-
-@reads()
-def open_run(path: Path | str) -> Trained:
-    """A run, of one field or in blocks. Raises LumigraphError for a folder that is neither."""
-    if not is_block_run(Path(path)):
-        return Run(path)
-    large = importlib.import_module("..large", __package__)  # by name, for that room stands above this one
-    return large.BlockRun(path)
 
 
 class SplatFile(Opened):

@@ -15,15 +15,15 @@ from PIL import Image, ImageOps
 from ..datasets.images import in_parallel
 from ..files import read_json
 from ..geometry import evenly
-from . import colmap
-from .capture import Capture, Shot
+from ..readers import colmap
+from ..readers.capture import Capture, Shot
+from ..readers.oddities import fold, in_steps
+from ..readers.pictures import eight_bits
+from ..readers.points import similarity
+from ..readers.transforms import Made
 from .coverage import coverage
-from .oddities import fold, in_steps
 from .photos import Photo
 from .photos.judge import JUDGED_SIDE, Judgement, blurred, exposure_jumps, judge
-from .pictures import eight_bits
-from .points import similarity
-from .transforms import Made
 
 MIN_JUDGED = 4  # photographs; fewer have no usual value to compare with
 MAX_OBSERVATIONS = 500  # of sparse points, measured in each photograph

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from .shapes import INFINITY
-from .terrain import SKY, TREE, WATER, terrain
-from .textures import Colour
-from .vector import COMPILE_OPTIONS, INNER_OPTIONS
+from ...synthetic.shapes import INFINITY
+from ...synthetic.terrain import SKY, TREE, WATER, terrain
+from ...synthetic.textures import Colour
+from ...synthetic.vector import COMPILE_OPTIONS, INNER_OPTIONS
 
 WIDTH, FINE = 64, 4  # of the land: blocks a side, points to a block
 FIELD_OF_VIEW = 70.0  # degrees

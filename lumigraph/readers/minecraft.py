@@ -8,18 +8,15 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from ..datasets.world import LABELS, BlockLabels
+from ..datasets.world import LABELS
 from ..errors import LumigraphError
 from ..system.progress import track
-from .capture import Capture
 
 EXPECTED_FILES = "region files, r.*.*.mca (Minecraft)"
 LOOKED_FOR = ("r.*.*.mca", "region/r.*.*.mca")
@@ -55,14 +52,6 @@ def recognises(path: Path) -> bool:
 
 def region_files(folder: Path) -> list[Path]:
     return sorted(file for pattern in LOOKED_FOR for file in folder.glob(pattern))
-
-
-def read(path: Path) -> Capture:
-    """The part of a region file, or of a world's folder, that has most chunks: at most 64 blocks each way."""
-    labels, notes = read_blocks(path)
-    synthetic = import_module("..synthetic", __package__)  # a room above this one
-    found = synthetic.block_capture(BlockLabels(labels), str(path))
-    return replace(found, notes=notes)
 
 
 def read_blocks(path: Path) -> tuple[UInt8[np.ndarray, "x y z"], list[str]]:

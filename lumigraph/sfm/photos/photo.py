@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..raw import Developed
+from ...readers.raw import Developed
 
 # (items, what is being done, how many there will be) -> the items one by one; display.track is one
 Track = Callable[[Iterable[Any], str, int], Iterator[Any]]

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from ...errors import LumigraphError
-from ...files import claim as claim_file
-from ...files import claim_folder, read_json, refuse_links, remove, replacing, replacing_folder, write_json
-from ...files.marks import is_ours
-from ...files.ply import write_rows
-from ...system.library import pycolmap
-from ..masks import MASKS as MASKS
-from ..photos import Photo
-from ..photos.photo import Track
-from ..pictures import list_images, read_grey
-from ..raw import RAW_FILE
-from ..transforms import OPENCV_FROM_OPENGL, Made
-from ..transforms import RESULT_FILE as RESULT_FILE
+from ..errors import LumigraphError
+from ..files import claim as claim_file
+from ..files import claim_folder, read_json, refuse_links, remove, replacing, replacing_folder, write_json
+from ..files.marks import is_ours
+from ..files.ply import write_rows
+from ..readers.masks import MASKS as MASKS
+from ..readers.pictures import list_images, read_grey
+from ..readers.raw import RAW_FILE
+from ..readers.transforms import OPENCV_FROM_OPENGL, Made
+from ..readers.transforms import RESULT_FILE as RESULT_FILE
+from ..system.library import pycolmap
+from .photos import Photo
+from .photos.photo import Track
 
 WORK_FOLDER = "work"
 SOURCES_FILE = "sources.json"  # inside WORK_FOLDER: the sources of the folder

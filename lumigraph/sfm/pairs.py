@@ -12,8 +12,8 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial import cKDTree
 
-from ...geometry import evenly
-from ...system.library import pycolmap
+from ..geometry import evenly
+from ..system.library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Pair = tuple[int, int]

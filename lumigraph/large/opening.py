@@ -1,0 +1,45 @@
+"""Open what was trained or exported: runs of one field or in blocks, splat files, SNeRG's folders and compositions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import LumigraphError
+from ..exchange import fourdgs, is_splat_file, place_of, snerg
+from ..files import is_file, read_json
+from ..files.reading import reads
+from ..run import Opened, Run, Trained, is_block_run
+from ..run.composition import CANONICAL_FORMAT, Canonicalised, Composition, Nesting
+from ..run.files import MovingFile, SnergFolder, SplatFile
+from .block_run import BlockRun
+
+
+@reads()
+def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
+    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
+    one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
+
+    within: what it is opened as a part of
+    Raises LumigraphError, in one sentence, for anything else.
+    """
+    path = Path(path)
+    if fourdgs.is_moving_file(path):
+        return MovingFile(path)
+    if is_splat_file(path):
+        return SplatFile(place_of(path))
+    if path.suffix.lower() == ".json" and not path.is_dir():
+        said = read_json(path)
+        if isinstance(said, dict) and said.get("format") == CANONICAL_FORMAT:
+            return Canonicalised(path)
+        return Composition(path, open_any, within)
+    if is_file(path):
+        raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
+    return SnergFolder(path) if snerg.recognises(path) and not is_block_run(path) else open_run(path)
+
+
+@reads()
+def open_run(path: Path | str) -> Trained:
+    """A run, of one field or in blocks. Raises LumigraphError for a folder that is neither."""
+    if not is_block_run(Path(path)):
+        return Run(path)
+    return BlockRun(path)

@@ -1,0 +1,52 @@
+"""Readers of captures and shapes: a file for each layout, and the steps from what it holds to a Scene.
+
+Bounds, scale, splits and the loading of images are found in one place, `assemble`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+
+from ..errors import LumigraphError
+from ..files import exists
+from ..files.readers import LISTED, NAMES
+from ..files.reading import reads
+from .assemble import Before as Before
+from .assemble import assemble as assemble
+from .capture import Capture as Capture
+from .capture import Shot as Shot
+from .part import CapturePart as CapturePart
+from .part import Places as Places
+from .part import places_of as places_of
+from .pictures import list_images
+from .unposed import Unposed as Unposed
+from .views import multiscale as multiscale
+
+READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
+
+
+@reads()
+def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
+    """The reader that recognises a folder. Raises LumigraphError if none does."""
+    if not exists(folder):
+        raise LumigraphError(f"{folder} does not exist; check the path")
+    if not folder.is_dir():
+        raise LumigraphError(
+            f"{folder} is a file; name the folder that holds the photographs and their poses, "
+            f"or find those of a video or of photographs first: lumigraph capture {folder}"
+        )
+    if not any(folder.iterdir()):
+        raise LumigraphError(f"{folder} is empty; name a folder that holds photographs and their poses")
+    if name is not None and name not in READERS:
+        raise LumigraphError(f"there is no reader called {name}; there are {LISTED}")
+    asked = READERS if name is None else {name: READERS[name]}
+    for reader in asked.values():
+        if reader.recognises(folder):
+            return reader
+    pictures = len(list_images(folder))
+    raise LumigraphError(
+        f"{folder} holds no camera poses ({pictures} images were found): looked for "
+        f"{'; '.join(r.EXPECTED_FILES for r in asked.values())}; find the poses first: lumigraph capture {folder}"
+    )
