@@ -36,7 +36,7 @@ SCRIPT = """
 import sys
 import torch
 from lumigraph import fit, methods
-from lumigraph.capture import open_scene
+from lumigraph.opening import open_scene
 from lumigraph.run import build
 
 data, kind, device = open_scene(sys.argv[1]), methods.find("instant-ngp"), torch.device("cpu")

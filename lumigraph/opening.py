@@ -1,5 +1,8 @@
-"""Open what a user names as a dataset: photographs as a Scene, meshes as Shapes, folders of either as a Collection,
-words, worlds of blocks, and procedural scenes."""
+"""Opening of what a user names as a dataset, by its path or prefix.
+
+Photographs become a Scene, meshes are Shapes, folders of either a Collection; a world of blocks, words and procedural
+scenes have kinds of their own.
+"""
 
 from __future__ import annotations
 
@@ -196,7 +199,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     path = expanded(source)
     chosen = minecraft if path.is_file() and minecraft.recognises(path) else choose_reader(path, reader)
     if chosen is minecraft:  # whose pictures are traced
-        labels, notes = minecraft.read_blocks(path)
+        labels, notes = minecraft.read(path)
         return replace(synthetic.block_capture(BlockLabels(labels), str(path)), notes=notes)
     capture = with_bones(with_tracks(chosen.read(path), path), path)
     return with_inner_depth(with_raw(with_masks(capture, path), path))

@@ -495,7 +495,7 @@ def test_large_pictures_are_decoded_one_at_a_time_elsewhere_and_once(app, client
 def test_a_large_picture_that_memory_does_not_hold_is_refused(tmp_path, monkeypatch):
     Image.new("RGB", (80, 60)).save(tmp_path / "a.png")
     monkeypatch.setattr(pictures, "LARGE_PIXELS", 1000)
-    monkeypatch.setattr("lumigraph.capture.numbers.free_memory", lambda: 100)
+    monkeypatch.setattr("lumigraph.readers.numbers.free_memory", lambda: 100)
     with pytest.raises(LumigraphError, match="a.png cannot be shown: its 80x60 pixels take .* GB are free"):
         pictures.thumbnail(tmp_path / "a.png")
 

@@ -562,7 +562,7 @@ def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):
     random = np.random.default_rng(0)
     vectors, places = random.normal(size=(50, 6)).astype(np.float32), random.normal(size=(50, 3))
     whole = alike(vectors, 4, apart=3)
-    monkeypatch.setattr("lumigraph.capture.motion.pairs.BLOCK_VIEWS", 7)
+    monkeypatch.setattr("lumigraph.sfm.pairs.BLOCK_VIEWS", 7)
     assert alike(vectors, 4, apart=3) == whole and all(j - i >= 3 for i, j in whole)
     places[[3, 20]] = np.nan
     away = np.linalg.norm(places[:, None] - places, axis=-1)

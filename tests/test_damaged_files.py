@@ -304,7 +304,7 @@ def unions(kind: Any) -> Iterator[tuple[Any, ...]]:
 
 def test_no_layout_mixes_ranges_and_tuples():
     """On which msgspec 0.22 reads memory that is not its own."""
-    rooms = "datasets.scene budget paths.keyframes capture.transforms run.settings run.composition run.records"
+    rooms = "datasets.scene budget paths.keyframes readers.transforms run.settings run.composition run.records"
     found = 0
     for room in rooms.split():
         module = importlib.import_module(f"lumigraph.{room}")

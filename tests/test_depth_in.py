@@ -169,7 +169,7 @@ def test_apples_disparity_is_one_over_metres(monkeypatch, tmp_path):
         __exit__ = lambda self, *_: None  # noqa: E731
 
     monkeypatch.setattr(Image, "open", lambda path: Opened())
-    monkeypatch.setattr("lumigraph.capture.inner_depth.reads_heic", lambda: True)
+    monkeypatch.setattr("lumigraph.readers.inner_depth.reads_heic", lambda: True)
     found = of_heic(tmp_path / "a.heic")
     assert found is not None
     np.testing.assert_allclose(found.metres, [[np.nan, 2.5], [0.625, 0.5]], rtol=1e-6)

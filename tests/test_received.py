@@ -66,8 +66,8 @@ def test_one_function_begins_processes():
                     value=ast.Name(id="asyncio"), attr="create_subprocess_exec" | "create_subprocess_shell"
                 ):
                     found.add(path.relative_to(PACKAGE).as_posix())
-    assert found == {"system/children.py", "capture/motion/worker.py", "app/sharing.py"}
-    assert '[sys.executable, "-P", str(COUNTER)' in (PACKAGE / "capture/motion/worker.py").read_text("utf-8")
+    assert found == {"system/children.py", "sfm/worker.py", "app/sharing.py"}
+    assert '[sys.executable, "-P", str(COUNTER)' in (PACKAGE / "sfm/worker.py").read_text("utf-8")
 
 
 @pytest.mark.parametrize("module", [True, False])

@@ -27,17 +27,17 @@ COMMANDS = {
     "render RUN --frames 2": "lumigraph.export.film.film",
     "report RUN": "lumigraph.evaluation.report.write_report",
     "resume RUN --steps 100": "lumigraph.run.Run.dataset",
-    "train voxel-grid SCENE": "lumigraph.capture.open_dataset",
-    "demo --output OUT": "lumigraph.capture.open_dataset",
+    "train voxel-grid SCENE": "lumigraph.opening.open_dataset",
+    "demo --output OUT": "lumigraph.opening.open_dataset",
     "export mesh RUN OUT.ply": "lumigraph.export.mesh.render_depth_maps",
     "export points RUN OUT.ply": "lumigraph.export.points.render_depth_maps",
     "export panorama RUN OUT.png": "lumigraph.export.panorama.panorama",
     "export stereo RUN OUT.png": "lumigraph.export.panorama.stereo_pair",
     "export web RUN OUT.html": "lumigraph.export.page.views_page",
-    "export splats RUN OUT.ply": "lumigraph.run.open_any",
-    "compose RUN RUN --output OUT.json": "lumigraph.run.open_any",
+    "export splats RUN OUT.ply": "lumigraph.large.open_any",
+    "compose RUN RUN --output OUT.json": "lumigraph.large.open_any",
     "explain ray RUN": "lumigraph.explain.ray.along_ray",
-    "capture SCENE --output OUT": "lumigraph.capture.motion.reconstruct",
+    "capture SCENE --output OUT": "lumigraph.sfm.reconstruct",
     "bench kernels": "lumigraph.kernels.bench.bench_kernels",
     "bench step voxel-grid SCENE": "lumigraph.benchmark.step.bench_step",
     "bench methods --methods voxel-grid --scenes SCENE --output OUT": "lumigraph.benchmark.conduct.conduct",
@@ -187,7 +187,7 @@ def test_pycolmap_is_loaded_at_one_place():
         for path in PACKAGE.rglob("*.py")
         if any(line.strip() == "import pycolmap" for line in path.read_text("utf-8").splitlines())
     }
-    assert loading == {"system/library.py", "capture/motion/worker.py"}
+    assert loading == {"system/library.py", "sfm/worker.py"}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells children that their parent has died")

@@ -14,6 +14,7 @@ from budgets import budget
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.camera.rays import Rendering
+from lumigraph.datasets.terrain import terrain
 from lumigraph.datasets.world import LABELS, BlockWorld
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate_walk, warped_difference
@@ -24,7 +25,6 @@ from lumigraph.opening import kind_of, open_dataset
 from lumigraph.readers import minecraft
 from lumigraph.synthetic import block_stage
 from lumigraph.synthetic.scenes.blocks import Options, blocks
-from lumigraph.synthetic.terrain import terrain
 
 pytestmark = budget("capture", 12)
 anvil = pytest.importorskip("anvil")
@@ -58,7 +58,7 @@ def region(path, change=lambda chunk: chunk):
 
 
 def test_a_region_becomes_labels_with_north_ahead_and_height_up(tmp_path):
-    labels, notes = minecraft.read_blocks(region(tmp_path / "r.0.0.mca"))
+    labels, notes = minecraft.read(region(tmp_path / "r.0.0.mca"))
     assert labels.shape == (16, 16, 7)  # with a layer of air above the sand
     stone, sand = LABELS.index("stone"), LABELS.index("sand")
     assert (labels[:, :, :4] == stone).all()
@@ -83,16 +83,16 @@ def forget_sections(chunk):
 
 def test_bad_regions_are_told_in_one_sentence(tmp_path):
     with pytest.raises(LumigraphError, match="unknown version .DataVersion 99999"):
-        minecraft.read_blocks(region(tmp_path / "r.0.0.mca", forget_sections))
+        minecraft.read(region(tmp_path / "r.0.0.mca", forget_sections))
     (tmp_path / "r.0.1.mca").write_bytes(bytes(8192))
     with pytest.raises(LumigraphError, match="it has no chunks"):
-        minecraft.read_blocks(tmp_path / "r.0.1.mca")
+        minecraft.read(tmp_path / "r.0.1.mca")
     damaged = bytearray(region(tmp_path / "r.0.2.mca").read_bytes())
     offset = 4096 * int.from_bytes(damaged[4 * 33 : 4 * 33 + 3], "big")
     damaged[offset + 5 : offset + 80] = bytes(75)
     (tmp_path / "r.0.2.mca").write_bytes(bytes(damaged))
     with pytest.raises(LumigraphError, match=r"its chunks \(1, 1\) are damaged"):
-        minecraft.read_blocks(tmp_path / "r.0.2.mca")
+        minecraft.read(tmp_path / "r.0.2.mca")
 
 
 def test_boxes_cover_what_can_be_seen_once():

@@ -1,4 +1,4 @@
-"""Scenes too large for one field (Tancik 2022): blocks that train as runs and render as one; opening of any run.
+"""Scenes too large for one field (Tancik 2022): blocks that train as runs and render as one.
 
 layout               positions of blocks, at street crossings or evenly spread, and the photographs of each
 plan, planning       blocks.json, the task of each block, and the plan drawn from above, before any training

@@ -54,7 +54,7 @@ def region_files(folder: Path) -> list[Path]:
     return sorted(file for pattern in LOOKED_FOR for file in folder.glob(pattern))
 
 
-def read_blocks(path: Path) -> tuple[UInt8[np.ndarray, "x y z"], list[str]]:
+def read(path: Path) -> tuple[UInt8[np.ndarray, "x y z"], list[str]]:
     """Labels of blocks, x east, y north, z up, and what a user should know.
 
     Raises LumigraphError for files without a readable chunk, and for chunks of an unknown version.

@@ -19,7 +19,7 @@ from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
 from ..files import is_file, read_json
 from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
-from ..files.reading import reading
+from ..files.reading import reading, reads
 from . import colmap
 from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, reductions, upright_size, versions
@@ -129,6 +129,7 @@ def recognises(folder: Path) -> bool:
     return (folder / "transforms.json").is_file()
 
 
+@reads()
 def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError for malformed JSON, unusable poses, and unknown lenses."""
     path = folder / "transforms.json"

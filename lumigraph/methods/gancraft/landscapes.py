@@ -15,10 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from ...synthetic.shapes import INFINITY
-from ...synthetic.terrain import SKY, TREE, WATER, terrain
-from ...synthetic.textures import Colour
-from ...synthetic.vector import COMPILE_OPTIONS, INNER_OPTIONS
+from ...datasets.terrain import SKY, TREE, WATER, terrain
 
 WIDTH, FINE = 64, 4  # of the land: blocks a side, points to a block
 FIELD_OF_VIEW = 70.0  # degrees
@@ -27,7 +24,17 @@ FIRST_STEP, STEP_GROWTH, FAR = 0.06, 0.008, 240.0  # of rays: blocks, share of t
 CAUTION = 0.3  # of the height above the land, that a ray steps on at least
 SHADOW_REACH = 40.0  # blocks
 AMBIENT = 0.42  # share of the light that comes from the sky
+# Infinity means that nothing is hit, so fast-math may not assume it away.
+COMPILE_OPTIONS = {
+    "nogil": True,
+    "_nrt": False,
+    "fastmath": {"reassoc", "nsz", "arcp", "contract"},
+    "error_model": "numpy",
+}
 TEXTURE = 256  # points a side of the noise that textures repeat
+
+
+Colour = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -219,7 +226,7 @@ def distances(height, origins, directions, far):
     return found
 
 
-@njit(**INNER_OPTIONS)
+@njit(no_cpython_wrapper=True, **COMPILE_OPTIONS)
 def elevation_at(height, x, y):
     """Height of the field at a place, bilinear; the land is mirrored at its borders."""
     n = len(height)
@@ -240,7 +247,7 @@ def march(height, highest, origins, directions, far, found):
     """Fill `found` with the distance along each ray to the height field; see `distances`."""
     for r in range(len(origins)):
         t, before, above = 0.0, 0.0, 0.0
-        found[r] = INFINITY
+        found[r] = math.inf
         while t < far:
             t += max(FIRST_STEP + STEP_GROWTH * t, CAUTION * above)
             z = origins[r, 2] + t * directions[r, 2]

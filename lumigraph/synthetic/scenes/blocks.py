@@ -10,11 +10,11 @@ from typing import Annotated
 
 import numpy as np
 
+from ...datasets.terrain import DIRT, GRASS, SAND, STONE, TREE, WATER, WATER_LEVEL, Terrain, terrain
 from ...datasets.world import BlockLabels
 from ...files.ranges import Seed, between
 from ..block_stage import stage_of
 from ..stage import Pictures, SyntheticStage
-from ..terrain import DIRT, GRASS, SAND, STONE, TREE, WATER, WATER_LEVEL, Terrain, terrain
 
 MARGIN = 8  # blocks of air above the highest ground
 SOIL = 2  # blocks of dirt below grass

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from ..datasets.world import LABELS
+from .world import LABELS
 
 SKY, GRASS, DIRT, STONE, SAND, WATER, TREE, SNOW = range(len(LABELS))
 WATER_LEVEL, BEACH, SNOW_LINE = 4.0, 1.0, 15.0  # heights, blocks
