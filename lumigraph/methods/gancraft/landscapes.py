@@ -24,7 +24,6 @@ FIRST_STEP, STEP_GROWTH, FAR = 0.06, 0.008, 240.0  # of rays: blocks, share of t
 CAUTION = 0.3  # of the height above the land, that a ray steps on at least
 SHADOW_REACH = 40.0  # blocks
 AMBIENT = 0.42  # share of the light that comes from the sky
-# Infinity means that nothing is hit, so fast-math may not assume it away.
 COMPILE_OPTIONS = {
     "nogil": True,
     "_nrt": False,
