@@ -17,7 +17,17 @@ from .functions import FUNCTIONS
 TRAIN = "train gaussian-splatting given --steps 1 --output out/new --device cpu --initial-gaussians 100"
 SPLATS = "given/cloud"
 OF_RUN = ("config.json", "cameras.json", "metrics.jsonl", "eval.json", "eval.png", "eval/*", "report.html", "rays*")
-OF_RUN += ("checkpoints", "checkpoints/*", "previews*", "renders*", "paths*", "lock.json", ".lumigraph", "*/.lumigraph")
+OF_RUN += (
+    "checkpoints",
+    "checkpoints/*",
+    "previews*",
+    "renders*",
+    "paths*",
+    "lock.json",
+    "photographs*",
+    ".lumigraph",
+    "*/.lumigraph",
+)
 CHANGES = ("resume", "eval", "report", "explain", "render")  # commands that write into the run that they are given
 
 

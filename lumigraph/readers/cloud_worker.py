@@ -8,6 +8,7 @@ once the result is whole; otherwise the last line of standard error has the reas
 from __future__ import annotations
 
 import contextlib
+import signal
 import struct
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 PIECE = 1_000_000  # points that are unpacked together
+WALL_FACTOR = 4  # of the seconds of the processor, for machines that are busy
 LAS_HEADER_BYTES, RECORD_BYTES = 375, 54  # of version 1.4; of a record's own header
 POINT_BYTES = 3 * 24  # of memory for each point: its coordinates, and copies of them
 
@@ -36,6 +38,7 @@ def limit(memory: int, seconds: int) -> None:
         for kind, wanted in (*limits.items(), (resource.RLIMIT_CORE, 0)):
             hard = resource.getrlimit(kind)[1]
             resource.setrlimit(kind, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
+        signal.alarm(WALL_FACTOR * seconds)  # a library that runs out of memory may wait for itself
 
 
 def read_las(path: Path, memory: int) -> np.ndarray:

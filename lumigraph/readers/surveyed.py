@@ -36,8 +36,12 @@ SUFFIXES = (*CLOUD_SUFFIXES, *meshes.SUFFIXES)
 POINT_BYTES = 200  # of memory for each point while a photograph sees the cloud
 WORKER = Path(__file__).with_name("cloud_worker.py")
 MIN_MEMORY, MAX_RATIO = 1 << 28, 200  # bytes of a worker for any file; bytes for each byte of a file
-MIN_SECONDS, BYTES_PER_SECOND = 10, 1_000_000  # of a worker's processor, and of a file
-FEW_THREADS = {"RAYON_NUM_THREADS": "4", "MALLOC_ARENA_MAX": "1"}  # each thread reserves addresses
+MIN_SECONDS, BYTES_PER_SECOND = 5, 1_000_000  # of a worker's processor, and of a file
+FEW_THREADS = {
+    "RAYON_NUM_THREADS": "4",
+    "MALLOC_ARENA_MAX": "1",
+    "RUST_BACKTRACE": "0",
+}  # each thread reserves addresses
 LIBRARIES = {".las": "laspy", ".laz": "laspy", ".e57": "pye57"}
 CELL = 3  # pixels along a square whose nearest point hides what is behind it
 HIDDEN = 0.03  # of the distance of the nearest point around, behind which a point is hidden
