@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -183,6 +184,18 @@ def test_a_received_title_is_one_readable_line(app, client, project, title):  # 
     (app.root / project / "runs" / "a" / "config.json").write_text("{}")
     request = sharing.share_request(find_item(app.root, project), share)
     assert request.command == "export web" and request.options["title"] == shown
+
+
+def test_files_to_share_hold_no_place_on_earth(app, project):  # noqa: F811
+    (app.root / project / "runs" / "a").mkdir(parents=True)
+    (app.root / project / "runs" / "a" / "config.json").write_text("{}")
+    asked = {}
+    for kind in sharing.KINDS:
+        share = sharing.ShareJob("x", kind, "a", "queued", 1.0)
+        request = sharing.share_request(find_item(app.root, project), share)
+        command = command_of(json.dumps(asdict(request)).encode())
+        asked[kind] = getattr(command, "origin", False)  # pages, films and splats have none
+    assert asked == dict.fromkeys(sharing.KINDS, False)
 
 
 # Links
