@@ -191,7 +191,7 @@ def test_files_to_share_hold_no_place_on_earth(app, project):  # noqa: F811
     (app.root / project / "runs" / "a" / "config.json").write_text("{}")
     asked = {}
     for kind in sharing.KINDS:
-        share = sharing.ShareJob("x", kind, "a", "queued", 1.0)
+        share = sharing.ShareJob(f"x{sharing.KINDS[kind].ending}", kind, "a", "queued", 1.0)
         request = sharing.share_request(find_item(app.root, project), share)
         command = command_of(json.dumps(asdict(request)).encode())
         asked[kind] = getattr(command, "origin", False)  # pages, films and splats have none

@@ -8,12 +8,17 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
+from typing import Annotated, get_args, get_origin
 
 import pytest
 from budgets import budget
 from shape_checks import PACKAGE, module_name
 from test_house import imported
+
+from lumigraph import methods
+from lumigraph.files.ranges import hints
 
 pytestmark = budget("house", 8)
 
@@ -21,6 +26,12 @@ ROOT = PACKAGE.parent
 Sources = dict[str, str]  # module names, and the text of each
 parsed = functools.cache(ast.parse)
 RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", "how", "whose", "where"}
+# Of the package: who lowers a number lowers its ceiling.
+MAX_LINES = 113_100  # of Python
+MAX_LONG_FUNCTIONS = 20  # of more than 60 lines
+MAX_ANY_METHODS = 123  # parameters `method: Any`
+MAX_ROOMS = 38  # names at the top level
+MAX_OPTIONS = 1_530  # of all methods, those of parts counted for each method that holds them
 TO_BE_WRITTEN = {"lumigraph/methods/soft_colours.py"}  # by the reader of CONTRIBUTING.md
 
 
@@ -179,6 +190,54 @@ def test_no_config_inherits(house):
 def test_a_config_that_inherits_is_noticed():
     assert heirs({"a": "class Config:\n    pass\nclass NGP(RayMethod):\n    Config = Config"}) == []
     assert heirs({"a": "class Config(HashNumbers, b.C):\n    pass"}) == ["a.Config(HashNumbers, b.C)"]
+
+
+# Sizes, which may only fall
+
+
+def long_functions(sources: Sources, lines: int = 60) -> list[str]:
+    return [
+        f"{module}.{node.name}: {length}"
+        for module, source in sources.items()
+        for node in ast.walk(parsed(source))
+        if isinstance(node, ast.FunctionDef) and (length := (node.end_lineno or 0) - node.lineno + 1) > lines
+    ]
+
+
+def options_of(config: type) -> int:
+    """Numbers of a Config and of what it holds."""
+    return sum(options_of(kind) if is_dataclass(kind) else 1 for kind in map(held, hints(config).values()))
+
+
+def held(kind: object) -> object:
+    """An annotation without what is said about it."""
+    return held(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
+
+
+def test_the_house_does_not_grow(house):
+    lines = sum(source.count("\n") for source in house.values())
+    assert lines <= MAX_LINES, f"{lines} lines, and at most {MAX_LINES:,} may be"
+    at_most(MAX_LONG_FUNCTIONS, long_functions(house))
+    at_most(MAX_ANY_METHODS, [name for name, text in house.items() for _ in re.findall(r"\bmethod: Any\b", text)])
+    at_most(MAX_ROOMS, sorted({name.split(".")[1] for name in house if "." in name}))
+    at_most(MAX_OPTIONS, [name for name in methods.available() for _ in range(options_of(methods.find(name).Config))])
+
+
+def test_what_is_too_much_is_counted():
+    assert long_functions({"a": "def f():\n" + "    f()\n" * 60}) == ["a.f: 61"]
+    assert options_of(Outer) == 3
+
+
+@dataclass
+class Inner:
+    width: Annotated[int, "pixels"] = 1
+    depth: int = 2
+
+
+@dataclass
+class Outer:
+    inner: Annotated[Inner, "flat"]
+    rate: float = 0.1
 
 
 # Documents name files that are there
