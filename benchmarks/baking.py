@@ -18,13 +18,13 @@ import torch
 import tyro
 
 from lumigraph import methods
-from lumigraph.benchmark.table import size, table
 from lumigraph.budget import Budget
 from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import is_file, write_json
+from lumigraph.lab.benchmark.table import size, table
 from lumigraph.opening import open_scene
 from lumigraph.run import Run
 from lumigraph.run.folder import build

@@ -20,13 +20,13 @@ from compression import Options as Pressed
 from compression import chart, rungs
 
 from lumigraph import methods
-from lumigraph.benchmark.cell import Cell, CellSettings, read_rows
-from lumigraph.benchmark.conduct import conduct
-from lumigraph.benchmark.table import size, table
 from lumigraph.budget import Budget
 from lumigraph.commands.bench import place_of
 from lumigraph.figures.charts import standalone
 from lumigraph.files import read_json, scene_name, write_bytes, write_json
+from lumigraph.lab.benchmark.cell import Cell, CellSettings, read_rows
+from lumigraph.lab.benchmark.conduct import conduct
+from lumigraph.lab.benchmark.table import size, table
 from lumigraph.run import Run
 
 KINDS = {"dvgo": "dense", "plenoxels": "sparse", "tensorf": "factorised", "instant-ngp": "hashed"}

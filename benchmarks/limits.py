@@ -23,10 +23,10 @@ import torch
 import tyro
 from torch import Tensor
 
-from lumigraph.benchmark.step import memory_rate
 from lumigraph.files import write_json
 from lumigraph.kernels import using
 from lumigraph.kernels._operation import tensors
+from lumigraph.lab.benchmark.step import memory_rate
 
 WINDOW, CHANNELS, MAPS = 11, 3, 5  # of SSIM: taps of a pass, colours, blurred maps
 LEVELS, CORNERS, FEATURES = 16, 8, 2  # of the hash table

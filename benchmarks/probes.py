@@ -35,8 +35,8 @@ from lumigraph.export.probes import bake_probes
 from lumigraph.export.probes_page import BALL_WHITE, flat_camera, probes_page
 from lumigraph.figures import to_image
 from lumigraph.files import write_json
+from lumigraph.light.probes import ProbeGrid
 from lumigraph.method import Method
-from lumigraph.probes import ProbeGrid
 from lumigraph.run import Run
 from lumigraph.synthetic import lit, radiance, render, scenes, trace
 from lumigraph.synthetic.cameras import look_at, pinhole

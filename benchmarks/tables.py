@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from lumigraph import methods
-from lumigraph.benchmark.gallery import SECTIONS, SHOWPIECES
-from lumigraph.benchmark.table import protocol, published, size, trained_for
+from lumigraph.lab.benchmark.gallery import SECTIONS, SHOWPIECES
+from lumigraph.lab.benchmark.table import protocol, published, size, trained_for
 from lumigraph.metrics import scores_of
 
 ROOT = Path(__file__).parent.parent

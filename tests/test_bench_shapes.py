@@ -12,11 +12,11 @@ import trimesh
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.benchmark.shapes import measure
 from lumigraph.commands.cli import main
 from lumigraph.datasets.scene import Photograph
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.evaluation.completion import CLOUD_POINTS, Retrieval, known_of
+from lumigraph.lab.benchmark.shapes import measure
 from lumigraph.opening import open_dataset
 from lumigraph.run import Run, State, build
 
@@ -95,9 +95,9 @@ def test_runs_are_measured(tmp_path):
 def test_the_command_trains_and_measures(tmp_path, monkeypatch):
     """Methods of one shape are not trained on a folder; training is another test's."""
     cells = []
-    monkeypatch.setattr("lumigraph.benchmark.conduct.conduct", lambda given, *_: cells.extend(given) or 0)
+    monkeypatch.setattr("lumigraph.lab.benchmark.conduct.conduct", lambda given, *_: cells.extend(given) or 0)
     measured = []
-    monkeypatch.setattr("lumigraph.benchmark.shapes.measure", lambda runs, *_: measured.extend(runs))
+    monkeypatch.setattr("lumigraph.lab.benchmark.shapes.measure", lambda runs, *_: measured.extend(runs))
     folder = tiny_shapes.write(tmp_path / "meshes")
     shapes_of = [str(folder / "ball.obj"), str(folder)]
     words = ["bench", "shapes", "--methods", "deepsdf", "nglod", "--shapes", *shapes_of]

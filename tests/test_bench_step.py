@@ -13,12 +13,12 @@ import torch
 from budgets import budget
 
 from lumigraph import kernels
-from lumigraph.benchmark.step import KINDS, bench_step, take_apart
 from lumigraph.commands.cli import main
 from lumigraph.figures.charts import standalone
 from lumigraph.figures.flame import WIDTH, Span, flame_graph
 from lumigraph.kernels._operation import watched, watching
 from lumigraph.kernels.tile import cpu as tile_engine
+from lumigraph.lab.benchmark.step import KINDS, bench_step, take_apart
 from lumigraph.methods.gaussian_splatting import GaussianSplatting
 from lumigraph.run import build
 

@@ -12,12 +12,12 @@ from budgets import budget
 from test_benchmark import Here
 from test_priors import prior_run
 
-from lumigraph.benchmark.cell import FEW_VIEW_FIGURES, Cell, CellSettings, train_command
-from lumigraph.benchmark.conduct import Patience, conduct, draw_charts
-from lumigraph.benchmark.table import over_views
 from lumigraph.budget import Budget
 from lumigraph.commands.bench import BenchViews
 from lumigraph.commands.cli import main
+from lumigraph.lab.benchmark.cell import FEW_VIEW_FIGURES, Cell, CellSettings, train_command
+from lumigraph.lab.benchmark.conduct import Patience, conduct, draw_charts
+from lumigraph.lab.benchmark.table import over_views
 
 pytestmark = budget("runs")
 

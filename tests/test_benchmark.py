@@ -17,12 +17,12 @@ import pytest
 from budgets import budget
 from PIL import Image
 
-from lumigraph.benchmark.cell import FIGURES, Cell, CellSettings, published
-from lumigraph.benchmark.conduct import Patience, conduct, draw_charts, launch, reason
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation.halves import LEFT_HALVES, RIGHT_HALVES
+from lumigraph.lab.benchmark.cell import FIGURES, Cell, CellSettings, published
+from lumigraph.lab.benchmark.conduct import Patience, conduct, draw_charts, launch, reason
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 40)

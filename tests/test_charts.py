@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 import pytest
 from budgets import budget
 
-from lumigraph.benchmark.table import curves
 from lumigraph.figures.charts import (
     COLOURS,
     DASHES,
@@ -23,6 +22,7 @@ from lumigraph.figures.charts import (
     standalone,
     ticks,
 )
+from lumigraph.lab.benchmark.table import curves
 from lumigraph.methods import COLOURED, available, colour
 
 pytestmark = budget("runs")

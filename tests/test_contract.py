@@ -23,7 +23,6 @@ from budgets import PER_METHOD, budget
 
 import lumigraph
 from lumigraph import methods
-from lumigraph.benchmark.cell import CellSettings, evaluated
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
 from lumigraph.camera.rays import Rays, Rendering
@@ -40,11 +39,12 @@ from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, held_out_poses
 from lumigraph.evaluation.run import evaluate_run
 from lumigraph.exchange import read_gaussians, write_gaussians
-from lumigraph.explain.ray import along_ray
 from lumigraph.export import points as export_points
 from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.page import splats_page, views_page
+from lumigraph.lab.benchmark.cell import CellSettings, evaluated
+from lumigraph.lab.explain.ray import along_ray
 from lumigraph.method import Method, RayMethod
 from lumigraph.method.capabilities import (
     CanCompress,

@@ -23,8 +23,8 @@ import lumigraph
 from lumigraph import methods
 from lumigraph.components.sampling.importance import importance
 from lumigraph.exchange.packing import Stored, most_important
+from lumigraph.light.probes import write_probes
 from lumigraph.methods.instant_ngp import InstantNGP
-from lumigraph.probes import write_probes
 from lumigraph.run import build
 
 pytestmark = budget("runs", 12)

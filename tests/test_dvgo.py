@@ -16,7 +16,7 @@ from lumigraph.components.fields.voxels import VoxelGrid, corners, shape_of, tig
 from lumigraph.components.training.row_optimizers import LazyAdam
 from lumigraph.datasets.scene import Frame
 from lumigraph.evaluation import evaluate
-from lumigraph.explain.activation import fits
+from lumigraph.lab.explain.activation import fits
 from lumigraph.methods.dvgo import DVGO, point_error, shift_of
 from lumigraph.run import build
 from lumigraph.training import fit

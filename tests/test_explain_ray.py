@@ -17,9 +17,9 @@ import lumigraph.methods
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
-from lumigraph.explain.ray import Sight, along_ray
-from lumigraph.explain.ray_figure import LEFT, RIGHT, ray_figure
 from lumigraph.figures.charts import standalone
+from lumigraph.lab.explain.ray import Sight, along_ray
+from lumigraph.lab.explain.ray_figure import LEFT, RIGHT, ray_figure
 from lumigraph.run import Run
 from lumigraph.volume import composite
 

@@ -18,8 +18,8 @@ from lumigraph.camera.rays import Rays
 from lumigraph.commands.cli import main
 from lumigraph.components.fields.layers import Dense
 from lumigraph.datasets.scene import Frame
-from lumigraph.explain.encodings import GRID_POINTS, compare, kernel_at_start, learn, spectrum, tangent_kernel
-from lumigraph.explain.encodings_page import write_page
+from lumigraph.lab.explain.encodings import GRID_POINTS, compare, kernel_at_start, learn, spectrum, tangent_kernel
+from lumigraph.lab.explain.encodings_page import write_page
 from lumigraph.methods.fourier_features import Config, FourierFeatures, frequencies
 from lumigraph.opening import open_scene
 from lumigraph.run import build

@@ -9,8 +9,8 @@ from budgets import budget
 from test_benchmark import Here
 
 from lumigraph import methods
-from lumigraph.benchmark import gallery as room
 from lumigraph.errors import LumigraphError
+from lumigraph.lab.benchmark import gallery as room
 
 pytestmark = budget("runs", 4)
 

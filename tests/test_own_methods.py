@@ -11,11 +11,11 @@ import tiny
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.benchmark.cell import Cell, CellSettings, row_of
-from lumigraph.benchmark.conduct import launch
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
+from lumigraph.lab.benchmark.cell import Cell, CellSettings, row_of
+from lumigraph.lab.benchmark.conduct import launch
 from lumigraph.run import Run
 
 pytestmark = budget("runs", 8)

@@ -27,12 +27,12 @@ from lumigraph.export.probes import bake_probes
 from lumigraph.export.probes_page import ball, probes_page
 from lumigraph.geometry import Similarity, look_at, unit
 from lumigraph.large import open_any
+from lumigraph.light.probes import FREE, MATTER, ProbeGrid, projected, read_probes, write_probes
+from lumigraph.light.probes.harmonics import convolved, evaluated
+from lumigraph.light.probes.octahedral import bordered, looked_up, texel_directions
+from lumigraph.light.probes.octahedral import decoded as unfolded
+from lumigraph.light.probes.octahedral import encoded as folded
 from lumigraph.method import Method
-from lumigraph.probes import FREE, MATTER, ProbeGrid, projected, read_probes, write_probes
-from lumigraph.probes.harmonics import convolved, evaluated
-from lumigraph.probes.octahedral import bordered, looked_up, texel_directions
-from lumigraph.probes.octahedral import decoded as unfolded
-from lumigraph.probes.octahedral import encoded as folded
 
 pytestmark = budget("exports", 9)
 

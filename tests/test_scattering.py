@@ -12,9 +12,9 @@ from budgets import budget
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
-from lumigraph.explain import scattering
-from lumigraph.explain.scattering import henyey_greenstein, truncation
 from lumigraph.geometry import look_at
+from lumigraph.lab.explain import scattering
+from lumigraph.lab.explain.scattering import henyey_greenstein, truncation
 from lumigraph.synthetic import Fog, Lamp, Material, Object, Pose, Sky, World, scattered
 from lumigraph.synthetic.shapes import Ball, Cuboid
 from lumigraph.synthetic.textures import Plain

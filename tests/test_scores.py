@@ -17,9 +17,6 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.benchmark.cell import Cell, CellSettings
-from lumigraph.benchmark.conduct import conduct
-from lumigraph.benchmark.table import markdown
 from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import Collection
@@ -30,6 +27,9 @@ from lumigraph.evaluation import evaluate, evaluate_collection, evaluate_on, eva
 from lumigraph.evaluation.report import write_report
 from lumigraph.evaluation.run import joined_shapes
 from lumigraph.evaluation.shapes import ShapeScore, ShapesEvaluation
+from lumigraph.lab.benchmark.cell import Cell, CellSettings
+from lumigraph.lab.benchmark.conduct import conduct
+from lumigraph.lab.benchmark.table import markdown
 from lumigraph.metrics import Score, chamfer_distance, intersection_over_union, named, normal_consistency, scores_of
 from lumigraph.run import Run, build
 from lumigraph.training import fit

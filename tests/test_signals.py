@@ -36,11 +36,11 @@ COMMANDS = {
     "export web RUN OUT.html": "lumigraph.export.page.views_page",
     "export splats RUN OUT.ply": "lumigraph.large.open_any",
     "compose RUN RUN --output OUT.json": "lumigraph.large.open_any",
-    "explain ray RUN": "lumigraph.explain.ray.along_ray",
+    "explain ray RUN": "lumigraph.lab.explain.ray.along_ray",
     "capture SCENE --output OUT": "lumigraph.sfm.reconstruct",
     "bench kernels": "lumigraph.kernels.bench.bench_kernels",
-    "bench step voxel-grid SCENE": "lumigraph.benchmark.step.bench_step",
-    "bench methods --methods voxel-grid --scenes SCENE --output OUT": "lumigraph.benchmark.conduct.conduct",
+    "bench step voxel-grid SCENE": "lumigraph.lab.benchmark.step.bench_step",
+    "bench methods --methods voxel-grid --scenes SCENE --output OUT": "lumigraph.lab.benchmark.conduct.conduct",
     "view RUN": "lumigraph.viewer.choose_address",
 }
 

@@ -14,7 +14,6 @@ import tiny_words
 import torch
 from budgets import budget
 
-from lumigraph.benchmark.cell import CellSettings, evaluated
 from lumigraph.commands.cli import main
 from lumigraph.components.guidance.clip import VisionSizes
 from lumigraph.components.guidance.clip_files import read_clip
@@ -32,6 +31,7 @@ from lumigraph.components.guidance.views import (
 )
 from lumigraph.datasets.words import Words
 from lumigraph.errors import LumigraphError
+from lumigraph.lab.benchmark.cell import CellSettings, evaluated
 from lumigraph.run import Run
 from lumigraph.synthetic import captions
 from lumigraph.training.captions import (

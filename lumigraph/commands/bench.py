@@ -23,7 +23,7 @@ from .train import DEFAULT_SECONDS
 FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
 
 if TYPE_CHECKING:
-    from ..benchmark.cell import Cell, CellSettings
+    from ..lab.benchmark.cell import Cell, CellSettings
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class BenchStep:
 
     def run(self) -> int:
         os.environ.setdefault("CUDA_LAUNCH_BLOCKING", "1")  # a GPU's work then counts where it is launched
-        from ..benchmark.step import bench_step
         from ..figures.charts import standalone
         from ..files import write_bytes, write_json
+        from ..lab.benchmark.step import bench_step
         from ..opening import open_dataset
         from ..run import Run, build
 
@@ -133,7 +133,7 @@ class Cells:
 
     def checked(self) -> CellSettings:
         """Settings of all cells. Raises LumigraphError for impossible ones, before anything is opened or trained."""
-        from ..benchmark.cell import CellSettings
+        from ..lab.benchmark.cell import CellSettings
         from ..metrics.lpips import load_lpips, named_files
 
         for name in self.methods:
@@ -148,7 +148,7 @@ class Cells:
 
     def conduct(self, cells: Sequence[Cell], settings: CellSettings) -> int:
         """Train and compare all cells."""
-        from ..benchmark.conduct import conduct
+        from ..lab.benchmark.conduct import conduct
 
         code = conduct(cells, settings, self.output, say)
         if code:
@@ -187,7 +187,7 @@ class BenchMethods(Cells):
     """Train for these numbers of steps instead."""
 
     def run(self) -> int:
-        from ..benchmark.cell import Cell
+        from ..lab.benchmark.cell import Cell
 
         times, settings = budgets(self.seconds, self.steps), self.checked()
         cells = [
@@ -256,8 +256,8 @@ class BenchViews(Cells):
     ) -> tuple[dict[str, dict[int, Path]], list[Cell]]:
         """The prior's run for each method that learns from collections and each seed, and cells that train those that
         are not there."""
-        from ..benchmark.cell import Cell
         from ..datasets.collection import Collection
+        from ..lab.benchmark.cell import Cell
         from ..opening import kind_of
         from ..run import Run
 
@@ -280,9 +280,9 @@ class BenchViews(Cells):
 
     def places(self, source: str) -> Iterator[Place]:
         """The source itself, or held-out members of the collection that it is."""
-        from ..benchmark.cell import MEMBERS
         from ..datasets.collection import Collection
         from ..geometry import evenly
+        from ..lab.benchmark.cell import MEMBERS
         from ..opening import kind_of, open_dataset, sources_of
 
         if kind_of(source) is not Collection:
@@ -298,7 +298,7 @@ class BenchViews(Cells):
         self, place: Place, names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
     ) -> Iterator[Cell]:
         """A place's cells: each number of photographs, each seed, each method."""
-        from ..benchmark.cell import Cell
+        from ..lab.benchmark.cell import Cell
 
         there = self.there(place.source)
         for number in self.possible(place.source, there):
@@ -311,7 +311,7 @@ class BenchViews(Cells):
 
     def there(self, source: str) -> int:
         """Number of a scene's training photographs."""
-        from ..benchmark.cell import reduced
+        from ..lab.benchmark.cell import reduced
         from ..opening import open_scene
 
         downscale = reduced(source, self.downscale)
@@ -360,10 +360,10 @@ class BenchShapes:
     """Defaults of the methods' options: the papers', or those tuned for a CPU; auto decides by --device."""
 
     def run(self) -> int:
-        from ..benchmark.cell import Cell, CellSettings
-        from ..benchmark.conduct import conduct
-        from ..benchmark.shapes import measure
         from ..datasets.shapes import Shapes
+        from ..lab.benchmark.cell import Cell, CellSettings
+        from ..lab.benchmark.conduct import conduct
+        from ..lab.benchmark.shapes import measure
 
         (budget,) = budgets(given(self.seconds), given(self.steps))
         choose_device(self.device)

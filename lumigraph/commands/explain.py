@@ -33,8 +33,8 @@ class ExplainActivation:
     """Training steps for each order."""
 
     def run(self) -> int:
-        from ..explain.activation import draw, fits
         from ..files import claim
+        from ..lab.explain.activation import draw, fits
         from ..system.progress import counting
 
         claim(self.output, "figure", self.overwrite)
@@ -72,8 +72,8 @@ class ExplainEncodings:
             raise LumigraphError("A curve over scales needs two or more of them; for example --scales 1 10 100")
         from dataclasses import replace
 
-        from ..explain.encodings import compare
-        from ..explain.encodings_page import claim_page, write_page
+        from ..lab.explain.encodings import compare
+        from ..lab.explain.encodings_page import claim_page, write_page
         from ..methods.fourier_features import FourierFeatures
         from ..opening import open_scene
         from ..readers import single_image
@@ -113,8 +113,8 @@ class ExplainFitting:
     def run(self) -> int:
         from ..datasets.scene import Scene
         from ..datasets.shapes import Shapes
-        from ..explain.fitting import compare, draw
         from ..files import claim
+        from ..lab.explain.fitting import compare, draw
         from ..opening import open_dataset
 
         name = scene_name(self.data)
@@ -154,9 +154,9 @@ class ExplainLightField:
     device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ..explain.light_field import draw, measure, seen_along
         from ..export.light_field import focal_distance
         from ..files import claim
+        from ..lab.explain.light_field import draw, measure, seen_along
         from ..run import Run
 
         run = Run(self.run_folder)
@@ -205,10 +205,10 @@ class ExplainRay:
         if self.output and self.output.suffix != ".svg":
             raise LumigraphError(f"{self.output} has no ending of a figure; give --output a name ending in .svg")
         from ..evaluation import file_name
-        from ..explain.ray import along_ray
-        from ..explain.ray_figure import ray_figure
         from ..figures.charts import standalone
         from ..files import claim, write_bytes, write_json
+        from ..lab.explain.ray import along_ray
+        from ..lab.explain.ray_figure import ray_figure
         from ..run import Run
         from ..system.progress import counting
 
@@ -264,8 +264,8 @@ class ExplainScattering:
     seed: SeedOption = 0
 
     def run(self) -> int:
-        from ..explain.scattering import LAMPS, draw, measure
         from ..files import claim
+        from ..lab.explain.scattering import LAMPS, draw, measure
 
         for file in ("scattering.png", "lamps.svg", "phase.svg", "scattering.json"):
             claim(self.output / file, "figure", self.overwrite)
@@ -303,7 +303,7 @@ class ExplainTemplate:
 
     def run(self) -> int:
         from .. import methods
-        from ..explain.template import draw, shown_photograph, stages_of
+        from ..lab.explain.template import draw, shown_photograph, stages_of
         from ..run import Run, check_new
 
         run = Run(self.run_folder)

@@ -65,7 +65,7 @@ class ExportProbes:
     def run(self) -> int:
         from ..export.probes import bake_probes
         from ..files import claim, claim_folder
-        from ..probes import FREE, MATTER, UNSEEN, write_probes
+        from ..light.probes import FREE, MATTER, UNSEEN, write_probes
 
         claim_folder(self.output, "probes")
         if self.page is not None:

@@ -28,7 +28,7 @@ class Gallery:
     """Training time of each method in seconds; longer gives better pictures."""
 
     def run(self) -> int:
-        from ..benchmark.gallery import PAGE, SHOWPIECES, gallery
+        from ..lab.benchmark.gallery import PAGE, SHOWPIECES, gallery
 
         names = [methods.check(name) for name in self.methods] or list(SHOWPIECES)
         code = gallery(names, self.seconds, self.output, say)

@@ -33,8 +33,8 @@ from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..geometry import Similarity, look_at, normals_from_depth, unit
+from ..light.probes import ProbeGrid
 from ..method import Method
-from ..probes import ProbeGrid
 from . import loops
 from .composed import Composed, compose
 from .placed import Placed

@@ -19,10 +19,10 @@ from ..composition import Placed, compose
 from ..depth_maps import DepthMap, Tolerance, hidden, render_depth_maps
 from ..errors import LumigraphError
 from ..geometry import Similarity, Vector
+from ..light.probes import FREE, MATTER, UNSEEN, ProbeGrid, lattice, octahedral, projected
+from ..light.probes.storage import MAX_PROBES
 from ..method import Method
 from ..method.capabilities import HasLooks, can
-from ..probes import FREE, MATTER, UNSEEN, ProbeGrid, lattice, octahedral, projected
-from ..probes.storage import MAX_PROBES
 from ..system.progress import track
 from ..system.work import at_work
 from .film import light_of

@@ -20,11 +20,11 @@ from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..files import write_bytes
+from ..light.probes import FREE, ProbeGrid
 from ..method import Method
 from ..paths import film_size
 from ..paths.automatic import angle_of_view
 from ..paths.opening import opening_of_scene
-from ..probes import FREE, ProbeGrid
 from ..readers.meshes import read_shape
 from .page import page_bytes, webp
 

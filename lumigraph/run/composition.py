@@ -67,9 +67,9 @@ from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, Share, between, typed
 from ..files.reading import reads
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
+from ..light.probes import read_probes
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
-from ..probes import read_probes
 from ..readers.meshes import read_shape
 from ..system.memory import ask_for
 from .folder import Run

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate, softplus
 
-from ..figures import Row, contact_sheet, save_picture
-from ..metrics import psnr
+from ...figures import Row, contact_sheet, save_picture
+from ...metrics import psnr
 
 SIDE = 256  # pixels of the picture that is learnt
 SHIFT = -4.6  # of softplus, so that a voxel of zero stops 1 % of the light

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..evaluation.report import heading, jpeg, page, section
-from ..figures import Row, contact_sheet, save_picture
-from ..figures.charts import Series, line_chart, standalone
-from ..files import claim, write_bytes, write_json
+from ...evaluation.report import heading, jpeg, page, section
+from ...figures import Row, contact_sheet, save_picture
+from ...figures.charts import Series, line_chart, standalone
+from ...files import claim, write_bytes, write_json
 from .encodings import SCALED_ENCODINGS, EncodingComparison, EncodingFit
 
 CROP, ENLARGEMENT = 96, 3  # pixels a side of the picture's middle, and how many times larger the sheet shows them

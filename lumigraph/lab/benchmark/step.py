@@ -25,14 +25,14 @@ from torch.autograd.profiler import record_function as span
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ..datasets.dataset import Dataset
-from ..figures.flame import Span, flame_graph
-from ..kernels import operations, watching
-from ..method import Method
-from ..run import Run, State
-from ..system.threads import TASKS_FOLDER, Contention
-from ..system.work import at_work
-from ..training import advance
+from ...datasets.dataset import Dataset
+from ...figures.flame import Span, flame_graph
+from ...kernels import operations, watching
+from ...method import Method
+from ...run import Run, State
+from ...system.threads import TASKS_FOLDER, Contention
+from ...system.work import at_work
+from ...training import advance
 
 KINDS = "kernel", "operation", "optimizer", "data", "check", "autograd", "Python"
 WHOLE = {"data": "photographs and rays", "check": "finite loss and gradients"}  # parts of a step that are one row

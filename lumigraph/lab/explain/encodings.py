@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..components.fields.layers import Dense
-from ..datasets.scene import Scene
-from ..methods.fourier_features import Config, Encoding, FourierFeatures
-from ..metrics import psnr
-from ..run import build
-from ..system.progress import track
-from ..system.signals import go_on_unless
-from ..training import fit
+from ...components.fields.layers import Dense
+from ...datasets.scene import Scene
+from ...methods.fourier_features import Config, Encoding, FourierFeatures
+from ...metrics import psnr
+from ...run import build
+from ...system.progress import track
+from ...system.signals import go_on_unless
+from ...training import fit
 
 UNSCALED_ENCODINGS: tuple[Encoding, ...] = ("none", "basic")
 SCALED_ENCODINGS: tuple[Encoding, ...] = ("positional", "gaussian")

@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from .. import files, methods
-from ..budget import Budget
-from ..errors import LumigraphError
-from ..evaluation.report import jpeg, page
-from ..evaluation.views import file_name
-from ..figures import save_picture
-from ..metrics import scores_of
-from ..opening import open_scene
-from ..run import Run
+from ... import files, methods
+from ...budget import Budget
+from ...errors import LumigraphError
+from ...evaluation.report import jpeg, page
+from ...evaluation.views import file_name
+from ...figures import save_picture
+from ...metrics import scores_of
+from ...opening import open_scene
+from ...run import Run
 from .cell import Cell, CellSettings, Row, read_rows
 from .conduct import STOP_CODES, Launch, conduct, launch, reason
 from .table import size

@@ -19,12 +19,12 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from . import files
-from .color.srgb import linear_from_srgb
-from .errors import LumigraphError
-from .files.ffmpeg import decode
-from .files.reading import reading
-from .kernels import spherical_harmonics
+from .. import files
+from ..color.srgb import linear_from_srgb
+from ..errors import LumigraphError
+from ..files.ffmpeg import decode
+from ..files.reading import reading
+from ..kernels import spherical_harmonics
 
 SUFFIXES = (".hdr", ".exr", ".npy", ".png")
 MIN_ROWS, MIN_COLUMNS = 4, 8

@@ -19,22 +19,22 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from .. import kernels
-from ..camera import Camera
-from ..camera.rays import Rays, Samples
-from ..components.fields.development import encoded
-from ..components.sampling.sampling import stratified
-from ..figures import Row, contact_sheet, save_picture
-from ..figures.charts import Series, line_chart, standalone
-from ..files import write_bytes, write_json
-from ..kernels.harmonic_grid import COEFFICIENTS
-from ..kernels.sparse_grid import Nodes
-from ..metrics import psnr
-from ..synthetic import scattered
-from ..synthetic.cameras import look_at, pinhole, sphere_point
-from ..synthetic.scenes import fog
-from ..system.progress import track
-from ..volume import composite
+from ... import kernels
+from ...camera import Camera
+from ...camera.rays import Rays, Samples
+from ...components.fields.development import encoded
+from ...components.sampling.sampling import stratified
+from ...figures import Row, contact_sheet, save_picture
+from ...figures.charts import Series, line_chart, standalone
+from ...files import write_bytes, write_json
+from ...kernels.harmonic_grid import COEFFICIENTS
+from ...kernels.sparse_grid import Nodes
+from ...metrics import psnr
+from ...synthetic import scattered
+from ...synthetic.cameras import look_at, pinhole, sphere_point
+from ...synthetic.scenes import fog
+from ...system.progress import track
+from ...volume import composite
 
 CELLS = 40  # nodes of the grid along each axis
 HALF = fog.REACH  # half-size of the grid's cube, scene units

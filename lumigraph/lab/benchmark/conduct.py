@@ -18,19 +18,19 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from .. import files, methods
-from ..errors import LumigraphError
-from ..evaluation import file_name
-from ..figures import Row as Line
-from ..figures import contact_sheet, save_picture
-from ..figures.charts import line_chart, standalone
-from ..files.locks import check_place, held
-from ..metrics import scores_of
-from ..readers.pictures import readable
-from ..run import Run
-from ..system.children import start_python
-from ..system.progress import clock, counting
-from ..system.signals import Interrupt
+from ... import files, methods
+from ...errors import LumigraphError
+from ...evaluation import file_name
+from ...figures import Row as Line
+from ...figures import contact_sheet, save_picture
+from ...figures.charts import line_chart, standalone
+from ...files.locks import check_place, held
+from ...metrics import scores_of
+from ...readers.pictures import readable
+from ...run import Run
+from ...system.children import start_python
+from ...system.progress import clock, counting
+from ...system.signals import Interrupt
 from .cell import SHEET, Cell, CellSettings, Row, claim, evaluation, read_rows, row_of, scored, training
 from .table import markdown, over_time, over_views, places, resolution, together
 

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..camera import Camera
-from ..camera.rays import Look
-from ..errors import LumigraphError
-from ..method import Method
-from ..method.capabilities import HasLooks, needs
-from ..volume import composite, weights_of
+from ...camera import Camera
+from ...camera.rays import Look
+from ...errors import LumigraphError
+from ...method import Method
+from ...method.capabilities import HasLooks, needs
+from ...volume import composite, weights_of
 
 MIN_WEIGHT = 1e-3  # weight from which on a sample shows in a picture of 256 levels
 INSET_PIXELS = 400  # pixels of the small picture's longer side, at most

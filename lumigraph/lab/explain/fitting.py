@@ -14,19 +14,19 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..camera import Camera, dome, ring
-from ..datasets.images import ImageStore
-from ..datasets.mesh import Mesh
-from ..datasets.scene import Frame, Scene
-from ..datasets.shapes import Shape, Shapes
-from ..errors import LumigraphError
-from ..figures import Row, contact_sheet, save_picture
-from ..figures.charts import Series, line_chart, standalone
-from ..files import write_bytes, write_json
-from ..files.ranges import changed
-from ..geometry import unit
-from ..methods.mesh_fit import Config, MeshFit
-from ..system.progress import track
+from ...camera import Camera, dome, ring
+from ...datasets.images import ImageStore
+from ...datasets.mesh import Mesh
+from ...datasets.scene import Frame, Scene
+from ...datasets.shapes import Shape, Shapes
+from ...errors import LumigraphError
+from ...figures import Row, contact_sheet, save_picture
+from ...figures.charts import Series, line_chart, standalone
+from ...files import write_bytes, write_json
+from ...files.ranges import changed
+from ...geometry import unit
+from ...methods.mesh_fit import Config, MeshFit
+from ...system.progress import track
 
 SIZE, VIEWS = 160, 24  # pixels a side of a mesh's pictures, and how many there are about
 LIGHT = (0.4, -0.5, 0.77)  # direction to the light of shaded surfaces

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from .. import methods
-from ..budget import Budget
-from ..evaluation.halves import LEFT_HALVES
-from ..evaluation.views import CAPTURED_POSES
-from ..figures.charts import COLOURS, Series
-from ..metrics import named, scores_of
-from ..run.records import compared_kind
+from ... import methods
+from ...budget import Budget
+from ...evaluation.halves import LEFT_HALVES
+from ...evaluation.views import CAPTURED_POSES
+from ...figures.charts import COLOURS, Series
+from ...metrics import named, scores_of
+from ...run.records import compared_kind
 from .cell import FEW_VIEW_FIGURES, MEMBERS, Row, duration
 
 NONE = "–"

@@ -15,15 +15,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from ..camera import Camera
-from ..errors import LumigraphError
-from ..export.light_field import grid_of
-from ..figures import Row, contact_sheet, save_picture
-from ..figures.charts import Series, line_chart, standalone
-from ..files import write_bytes, write_json
-from ..method import Method
-from ..metrics import psnr
-from ..system.progress import track
+from ...camera import Camera
+from ...errors import LumigraphError
+from ...export.light_field import grid_of
+from ...figures import Row, contact_sheet, save_picture
+from ...figures.charts import Series, line_chart, standalone
+from ...files import write_bytes, write_json
+from ...method import Method
+from ...metrics import psnr
+from ...system.progress import track
 
 INTERVALS = 32  # between the cameras of the whole row
 STRIDES = (32, 16, 8, 4, 2)  # of the cameras that are kept; those between are interpolated

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .. import kernels
+from ... import kernels
 
 # A_l of the clamped cosine, for bands 0 to 3 (eq. 8): odd bands beyond the first add nothing.
 COSINE_FACTORS = math.pi, 2 * math.pi / 3, math.pi / 4, 0.0

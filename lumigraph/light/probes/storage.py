@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float, UInt16
 from PIL import Image
 
-from ..errors import LumigraphError
-from ..files import exists, read_json, replacing_folder, write_json
-from ..files.ranges import Point, Positive, between, typed
-from ..files.reading import reads
+from ...errors import LumigraphError
+from ...files import exists, read_json, replacing_folder, write_json
+from ...files.ranges import Point, Positive, between, typed
+from ...files.reading import reads
 from .grid import ProbeGrid
 from .harmonics import MAX_ORDER
 from .octahedral import BORDER

@@ -14,15 +14,15 @@ from typing import cast
 
 import torch
 
-from .. import files
-from ..camera import ring
-from ..datasets.shapes import Shape, Shapes
-from ..evaluation.completion import Completed, completions
-from ..evaluation.shapes import ShapeScore, compare_shapes, surface_of
-from ..geometry import evenly
-from ..method import Method
-from ..method.capabilities import HasLevels, can, needs
-from ..run import Run
+from ... import files
+from ...camera import ring
+from ...datasets.shapes import Shape, Shapes
+from ...evaluation.completion import Completed, completions
+from ...evaluation.shapes import ShapeScore, compare_shapes, surface_of
+from ...geometry import evenly
+from ...method import Method
+from ...method.capabilities import HasLevels, can, needs
+from ...run import Run
 from .table import NONE, literal, table
 
 FRAME_SIZE, FRAMES = 400, 3  # pixels a side of the pictures that are timed, and how many of them

@@ -11,16 +11,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .. import methods
-from ..datasets.scene import Scene
-from ..derive.conversion import ConversionTarget, check, convert, new_student, shown, take_over
-from ..figures import Row, contact_sheet, save_picture
-from ..figures.charts import Series, line_chart, standalone
-from ..files import write_bytes, write_json
-from ..method import Method
-from ..run import Run, build
-from ..system.signals import go_on_unless
-from ..training import fit
+from ... import methods
+from ...datasets.scene import Scene
+from ...derive.conversion import ConversionTarget, check, convert, new_student, shown, take_over
+from ...figures import Row, contact_sheet, save_picture
+from ...figures.charts import Series, line_chart, standalone
+from ...files import write_bytes, write_json
+from ...method import Method
+from ...run import Run, build
+from ...system.signals import go_on_unless
+from ...training import fit
 
 STAGES = "trained", "moved", "continued", "from nothing"
 

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..figures import to_image
-from ..figures.charts import Axis, numbers, svg
+from ...figures import to_image
+from ...figures.charts import Axis, numbers, svg
 from .ray import RayPass, Sight, triple
 
 WIDTH, LEFT, RIGHT = 988, 64, 700  # of the whole, and where the axis of distance begins and ends

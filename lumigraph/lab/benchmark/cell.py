@@ -10,16 +10,16 @@ from typing import Annotated, Any
 
 import msgspec
 
-from .. import files, methods
-from ..budget import Budget
-from ..errors import LumigraphError
-from ..files.ranges import Lasted, Tally, typed
-from ..metrics import Score
-from ..opening import requested
-from ..run import Run
-from ..run.derived import Inferred
-from ..run.records import Protocol, ViewScores, compared_kind
-from ..synthetic import is_category
+from ... import files, methods
+from ...budget import Budget
+from ...errors import LumigraphError
+from ...files.ranges import Lasted, Tally, typed
+from ...metrics import Score
+from ...opening import requested
+from ...run import Run
+from ...run.derived import Inferred
+from ...run.records import Protocol, ViewScores, compared_kind
+from ...synthetic import is_category
 
 SHEET = "views.png"
 MEMBERS = "-members"  # behind a collection's name: its members, averaged
