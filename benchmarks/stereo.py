@@ -1,4 +1,4 @@
-"""Stereo and optical flow beside OpenCV's (`pip install opencv-python-headless`), on Middlebury's Motorcycle pair.
+"""Stereo beside OpenCV's, and optical flow at OpenCV's presets, on Middlebury's Motorcycle pair.
 
     NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 python benchmarks/stereo.py FOLDER
 

@@ -6,6 +6,7 @@ import ast
 import re
 import shutil
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import beartype
@@ -19,6 +20,7 @@ from shape_checks import JIT, PACKAGE, checked_modules, module_name
 
 import lumigraph
 from lumigraph.geometry import to_quaternion
+from lumigraph.kernels._operation import operations
 
 ROOT = PACKAGE.parent
 pytestmark = budget("house", 10)
@@ -379,6 +381,14 @@ def test_a_kernel_that_does_not_is_noticed(file, before, after, sentence, tmp_pa
     assert any(sentence in found for found in lacks(operation)), lacks(operation)
 
 
+def test_the_page_of_kernels_names_every_operation():
+    """Each has a row, and the row says "none" exactly where no gradient passes."""
+    text = (ROOT / "docs" / "kernels.md").read_text(encoding="utf-8")
+    named = {name: gradients != "none" for name, gradients in re.findall(r"^\| `(\w+)` \|.*\| (.*) \|$", text, re.M)}
+    packages = {name: import_module(f"lumigraph.kernels.{name}") for name in operations()}
+    assert named == {name: bool(package.FACTS.differentiable) for name, package in packages.items()}
+
+
 def test_compiled_functions_stay_outside_the_shape_checks():
     """Numba and Triton read a function's source: checks wrapped around it would stop them."""
     checked = checked_modules()
@@ -432,7 +442,6 @@ def rooms_table() -> str:
 
 EXTRAS = {
     "coacd",
-    "cv2",
     "fourdgs",
     "laspy",
     "liblzfse",

@@ -8,11 +8,13 @@ import pytest
 import torch
 from budgets import budget
 from test_dense_start import RADIUS, ball
+from torch.nn.functional import avg_pool2d
 
 from lumigraph.commands.cli import main
 from lumigraph.depth_maps import stereo
 from lumigraph.depth_maps.flat_view import FlatView
 from lumigraph.depth_maps.multi_view import pair_depth
+from lumigraph.depth_maps.optical_flow import optical_flow, sampled
 from lumigraph.errors import LumigraphError
 
 pytestmark = budget("exports", 6)
@@ -51,6 +53,53 @@ def test_blocks_from_coarse_to_fine_find_the_square():
 def test_a_wall_without_texture_is_not_sure():
     flat = torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8)
     assert not stereo.semi_global(flat, flat, 0, 16).sure.any()
+
+
+def texture(height: int, width: int) -> torch.Tensor:
+    """A smooth picture of chance, as bytes."""
+    noise = torch.rand(3, height, width, generator=torch.Generator().manual_seed(0))
+    return (255 * avg_pool2d(noise, 5, 1, 2)).movedim(0, -1).to(torch.uint8).contiguous()
+
+
+@pytest.mark.parametrize("start", [None, (-2.6, 1.7)])
+def test_optical_flow_is_the_shift_of_a_picture(start):
+    whole = texture(76, 96)
+    first, second = whole[8:68, 8:88], whole[6:66, 11:91]  # what is at x, y is then at x - 3, y + 2
+    guess = None if start is None else torch.tensor(start).expand(60, 80, 2)
+    flow = optical_flow(first, second, guess)
+    assert (flow - torch.tensor([-3.0, 2.0]))[8:-8, 8:-8].norm(dim=-1).median() < 0.1
+
+
+def test_optical_flow_is_the_same_with_any_number_of_threads():
+    import cv2
+
+    whole, before, found = texture(120, 200), cv2.getNumThreads(), []
+    for threads in (1, 2, 3, 8):
+        cv2.setNumThreads(threads)
+        found.append(optical_flow(whole[:, :-4].contiguous(), whole[:, 4:].contiguous()))
+    cv2.setNumThreads(before)
+    assert all(torch.equal(one, found[0]) for one in found)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (11, 11), (1, 64), (40, 7)])
+def test_optical_flow_of_small_pictures(size):
+    """Pictures too small for OpenCV's search are continued by their border."""
+    flow = optical_flow(texture(*size), texture(*size), torch.zeros(*size, 2))
+    assert flow.shape == (*size, 2) and flow.abs().max() < 0.1
+
+
+def test_finer_disparity_of_a_slanted_wall():
+    """Semi-global matching knows parts of pixels roughly; a picture stretched by 1.05 has all of them."""
+    whole = texture(60, 130)
+    x = torch.arange(100.0)
+    truth = 3 + 0.05 * x
+    places = torch.stack(torch.meshgrid(x + 0.5, torch.arange(60) + 0.5, indexing="xy"), -1)
+    right = whole[:, :100]
+    left = sampled(right.float(), places - torch.stack([truth.expand(60, 100), torch.zeros(60, 100)], -1))
+    left = left.round().to(torch.uint8)
+    found = stereo.semi_global(left, right, 0, 16).values
+    errors = [(d - truth)[8:-8, 20:-8].abs().mean() for d in (found, stereo.sharpened(found, left, right))]
+    assert errors[1] < min(0.5 * errors[0], 0.1)
 
 
 def test_the_depth_of_a_rectified_pair_is_that_of_the_ball():

@@ -263,16 +263,16 @@ def test_titles_cannot_break_a_page(tmp_path):
 def test_programs_name_the_versions_that_are_pinned():
     pinned = json.loads(PACKAGES.read_text("utf-8"))["dependencies"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in pinned.values())
-    for program, names in {
-        "splats": ["three", "@sparkjsdev/spark"],
-        "mesh": ["three"],
-        "volumes": ["three"],
-        "views": [],
-    }.items():
+    for program, names in {"stage": ["three"], "splats": ["@sparkjsdev/spark"]}.items():
         heading = (WEB / f"{program}.js").read_text("utf-8")[:20_000]
         for name in names:
             assert f"{name} {pinned[name]}" in heading
         assert heading.count("Permission is hereby granted") >= len(names)
+
+
+def test_three_js_is_bundled_once():
+    holders = [path.name for path in WEB.glob("*.js") if "THREE.WebGLRenderer" in path.read_text("utf-8")]
+    assert holders == ["stage.js"]
 
 
 def test_the_lock_names_no_registry():

@@ -1,10 +1,13 @@
-// Bundles src/{splats,mesh,volumes,views,probes}.js into lumigraph/export/web/, each with its parts' versions and licences on top.
+// Bundles src/ into lumigraph/export/web/, each file with its parts' versions and licences on top: stage.js, which all pages
+// with WebGL share (three.js and src/stage.js), and a program for each kind of page, which takes those from it.
 
 import { build } from "esbuild";
 import { readFile } from "node:fs/promises";
 import { fileURLToPath } from "node:url";
+import * as three from "three";
 
 const here = (path) => fileURLToPath(new URL(path, import.meta.url));
+const built = (name) => here(`../lumigraph/export/web/${name}.js`);
 const own = JSON.parse(await readFile(here("package.json")));
 const shown = "Built from web/ by `npm ci && npm run build`. Do not edit.";
 
@@ -20,28 +23,46 @@ async function notice(name) {
   return `${name} ${about.version}\n\n${licence.trim()}`;
 }
 
-for (const [page, parts] of [
-  ["splats", ["three", "@sparkjsdev/spark", "fflate"]],
-  ["mesh", ["three"]],
-  ["volumes", ["three"]],
-  ["views", []],
-  ["probes", ["three"]],
-]) {
-  const pinned = parts.filter((name) => own.dependencies[name]).map((name) => `${name} ${own.dependencies[name]}`);
+async function bundle(name, parts, options) {
+  const pinned = parts.filter((part) => own.dependencies[part]).map((part) => `${part} ${own.dependencies[part]}`);
   const notices = await Promise.all(parts.map(notice));
   if (parts.includes("@sparkjsdev/spark")) notices.push(CRATES);
   const heading = ["Lumigraph's page program", ...pinned].join(" · ");
   await build({
-    entryPoints: [here(`src/${page}.js`)],
-    outfile: here(`../lumigraph/export/web/${page}.js`),
+    outfile: built(name),
     bundle: true,
     minify: true,
     format: "iife",
-    globalName: "lumigraphProgram",
     target: "es2022",
     charset: "utf8",
     loader: { ".glsl": "text" },
     legalComments: "none",
     banner: { js: `/*\n${[heading, shown, ...notices].join("\n\n")}\n*/` },
+    ...options,
   });
 }
+
+// In place of three.js and src/stage.js, what stage.js has put into a global variable.
+const fromStage = {
+  name: "from stage.js",
+  setup({ onResolve, onLoad }) {
+    onResolve({ filter: /^(three|\.\/stage\.js)$/ }, () => ({ path: "stage", namespace: "shared" }));
+    onLoad({ filter: /.*/, namespace: "shared" }, () => ({ contents: "module.exports = lumigraphStage;" }));
+  },
+};
+
+let programs = "";
+for (const [name, parts] of [
+  ["splats", ["@sparkjsdev/spark", "fflate"]],
+  ["mesh", []],
+  ["volumes", []],
+  ["views", []],
+  ["probes", []],
+]) {
+  const options = { entryPoints: [here(`src/${name}.js`)], globalName: "lumigraphProgram", plugins: [fromStage] };
+  await bundle(name, parts, options);
+  programs += await readFile(built(name), "utf8");
+}
+const names = Object.keys(three).filter((name) => new RegExp(`\\.${name}\\b`).test(programs));
+const contents = `export { ${names.join(", ")} } from "three"; export * from "./src/stage.js";`;
+await bundle("stage", ["three"], { stdin: { contents, resolveDir: here(".") }, globalName: "lumigraphStage" });

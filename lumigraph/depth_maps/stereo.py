@@ -22,14 +22,14 @@ from ..errors import LumigraphError
 from . import loops
 from .depth_map import DepthMap
 from .flat_view import GREY, FlatView
-from .optical_flow import gradient
+from .optical_flow import optical_flow
 
 SLOPE_PENALTY = 16  # P1, for a change of one disparity
 JUMP_PENALTY, MIN_JUMP_PENALTY = 160, 32  # P2, for any other change; at the strongest edges
 JUMP_EDGE = 15.0  # grey levels: an edge over which P2 falls to 1 / e
 CONSISTENT = 1.0  # pixels between the disparities of both pictures
 MIN_MARGIN = 16.0  # sum of eight costs: of the next best disparity over the best, of pixels that are sure
-FINE_WINDOW, FINE_STEPS, FINE_MOVE = 7, 4, 0.75  # pixels a side; searches; pixels of a change at most
+MAX_FINE_MOVE = 0.75  # pixels by which optical flow may change a disparity
 TEXTURE_WINDOW, MIN_CONTRAST = 9, 8  # pixels a side; grey levels in it, at least, of pixels that are sure
 FILL_DIRECTIONS = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 FILL_DIRECTIONS = np.concatenate([FILL_DIRECTIONS, -FILL_DIRECTIONS])
@@ -139,15 +139,13 @@ def contrast(guide: UInt8[Tensor, "height width"]) -> Float[Tensor, "height widt
 def sharpened(
     found: Float[Tensor, "height width"], left: UInt8[Tensor, "height width 3"], right: UInt8[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width"]:
-    """Disparity with finer parts of pixels: a window at each pixel is moved to where it fits (`kernels.patch_flow`).
+    """Disparity with finer parts of pixels, by optical flow that starts from it.
 
-    Windows that move farther than FINE_MOVE keep their disparity.
+    Pixels that move farther than MAX_FINE_MOVE keep their disparity.
     """
-    margin = FINE_WINDOW // 2
-    a, b = (pad(grey(x).float()[None, None] / 255, (margin,) * 4, "replicate")[0, 0] for x in (left, right))
     start = torch.stack([-found, torch.zeros_like(found)], -1)
-    moved = kernels.patch_flow(start, a, b, gradient(a), FINE_WINDOW, 1, FINE_STEPS) - start
-    near = moved.abs().amax(-1) < FINE_MOVE
+    moved = optical_flow(left, right, start) - start
+    near = moved.abs().amax(-1) < MAX_FINE_MOVE
     return torch.where(near, found - moved[..., 0], found)
 
 

@@ -1,8 +1,8 @@
 """A page to share: one HTML file that opens from disk, with the scene and the program that draws it inside. For open
 scenes it also has a backdrop: colours of unobserved directions, from the scene's own, and the floor as camera limit.
 
-The programs in web/ are built from the folder `web` of the repository (three.js and Spark for clouds, three.js for
-meshes and volumes, neither for pictures). They are compressed into the page, and so is what they show.
+The programs in web/ are built from the folder `web` of the repository. Pages with WebGL hold stage.js (three.js, camera
+and controls) before their own program; that of clouds has Spark. They are compressed into the page, as its data are.
 """
 
 from __future__ import annotations
@@ -228,7 +228,8 @@ def page_bytes(program: str, settings: dict[str, Any], data: bytes, help_text: t
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
     red, green, blue = (round(255 * value) for value in settings["background"])
-    source = (WEB / f"{program}.js").read_bytes()
+    scripts = ["stage", program] if settings["webgl"] else [program]
+    source = b"".join((WEB / f"{name}.js").read_bytes() for name in scripts)
     parts = {
         "version": escape(__version__),
         "title": escape(settings["title"]),

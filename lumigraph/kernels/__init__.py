@@ -30,7 +30,6 @@ from .octree_cells import Tree as Tree
 from .octree_cells import octree_cells as octree_cells
 from .octree_march import octree_march as octree_march
 from .patch_cost import patch_cost as patch_cost
-from .patch_flow import patch_flow as patch_flow
 from .perceptron import perceptron as perceptron
 from .photometric import photometric as photometric
 from .plane_sweep import plane_sweep as plane_sweep
@@ -38,7 +37,6 @@ from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize
 from .rasterize_mesh import rasterize_mesh as rasterize_mesh
-from .relax_flow import relax_flow as relax_flow
 from .sample_proposals import Resampling as Resampling
 from .sample_proposals import sample_proposals as sample_proposals
 from .semi_global import semi_global as semi_global

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import grid_sample, interpolate, normalize
+from torch.nn.functional import interpolate, normalize
 
 from ..camera import Camera
 from ..camera.rays import Rendering
@@ -19,7 +19,7 @@ from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import consensus
 from ..components.image_based.warping import behind, pushed, soft_splat
 from ..datasets.scene import Frame, Scene
-from ..depth_maps.optical_flow import optical_flow
+from ..depth_maps.optical_flow import optical_flow, round_trip_error, sampled
 from ..files.ranges import NonNegative, Pixels, Positive, PositiveShare, Seed, between
 from ..geometry import to_matrix, to_quaternion
 from ..system.work import at_work
@@ -140,8 +140,7 @@ class ViewInterpolation(ImageBasedMethod):
         for a, b, t in ((i, j, share), (j, i, 1 - share)):
             flow, back = self._flow(a, b), self._flow(b, a)
             pixels = tables.cameras[a].pixels().to(self.device)
-            there = pixels + flow
-            error = (flow + sampled(back.view(height, width, 2), there)).norm(dim=-1)
+            error = round_trip_error(pixels, flow, back.view(height, width, 2))
             picture = tables.pictures[a, :height, :width, :3].reshape(-1, 3).float() / 255
             importance = -error / FLOW_DISAGREEMENT
             found, cover = soft_splat(pixels + t * flow, picture, importance, (height, width), 1.0)
@@ -189,16 +188,6 @@ def enlarged(values: Float[Tensor, "rows columns"], size: tuple[int, int]) -> Fl
     smooth = interpolate(values[None, None], size, mode="bilinear")[0, 0]
     nearest = interpolate(values[None, None], size, mode="nearest-exact")[0, 0]
     return torch.where((smooth - nearest).abs() < 0.02 * nearest, smooth, nearest)
-
-
-def sampled(
-    picture: Float[Tensor, "height width channel"], places: Float[Tensor, "point 2"]
-) -> Float[Tensor, "point channel"]:
-    """Values of a picture at places (x, y), between its pixels; beyond its border those of the border."""
-    height, width = picture.shape[:2]
-    at = 2 * places / torch.tensor([width, height], device=places.device) - 1
-    found = grid_sample(picture.movedim(-1, 0)[None], at[None, None], padding_mode="border", align_corners=False)
-    return found[0, :, 0].T
 
 
 def between_poses(a: Float[Tensor, "1 3 4"], b: Float[Tensor, "1 3 4"], share: float) -> Float[Tensor, "1 3 4"]:

@@ -1,4 +1,4 @@
-"""Priors of NSFF from the photographs: optical flow to neighbouring moments (DIS), and depth of what stands still."""
+"""Priors of NSFF from the photographs: optical flow to neighbouring moments, and depth of what stands still."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import math
 from functools import cached_property
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from ...camera import Camera
 from ...camera.lens import Lens
 from ...components.clouds.dense_points import compile_sweep, seen_points
 from ...components.fields.kept_photographs import WHERE, Kept, Taken
 from ...datasets.scene import Batch, Photograph, Scene
-from ...errors import LumigraphError
+from ...depth_maps.optical_flow import optical_flow, round_trip_error
 from ...exchange.packing import Stored
 from ...files import from_json
 from ...files.ranges import typed
@@ -70,7 +70,6 @@ class MotionPriors(Part):
         said = {"pose": cameras.pose.tolist(), "lens": cameras.lens.to_json(), "size": cameras.size.tolist()}
         self.taken.rows = torch.frombuffer(bytearray(json.dumps(said).encode()), dtype=torch.uint8).to(device)
         if self.flows and cameras.time is not None:
-            need_opencv()
             others_of = partners(cameras, train)
             self.partner[train] = others_of.to(device)
             flow = torch.full((len(train), 2, height, width, 2), math.nan, dtype=torch.half)
@@ -78,7 +77,7 @@ class MotionPriors(Part):
                 for way, other in enumerate(others):
                     if other != UNKNOWN:
                         offsets = checked_flow(bytes_of(pictures[photograph]), bytes_of(pictures[other]))
-                        flow[i, way, : offsets.shape[0], : offsets.shape[1]] = torch.from_numpy(offsets).half()
+                        flow[i, way, : offsets.shape[0], : offsets.shape[1]] = offsets.half()
             self.flow.rows = flow.view(-1, 2).to(device)
         if self.source is not None:
             depth = self.known_depth(data, train.tolist(), smaller, (height, width), seconds)
@@ -158,39 +157,24 @@ def partners(cameras: Camera, train: Int[Tensor, " photograph"]) -> Int[Tensor, 
     return found
 
 
-def bytes_of(photograph: Photograph) -> UInt8[np.ndarray, "height width"]:
-    """Its grey values, before black."""
-    import cv2
-
-    return cv2.cvtColor((photograph.before((0.0, 0.0, 0.0)) * 255).byte().numpy(), cv2.COLOR_RGB2GRAY)
+def bytes_of(photograph: Photograph) -> UInt8[Tensor, "height width 3"]:
+    """Colours over black."""
+    return (photograph.before((0.0, 0.0, 0.0)) * 255).byte()
 
 
 def checked_flow(
-    first: UInt8[np.ndarray, "height width"], second: UInt8[np.ndarray, "rows columns"]
-) -> Float[np.ndarray, "height width 2"]:
-    """Flow from one picture to another by DIS (Kroeger 2016), NaN where the way back leads elsewhere."""
-    import cv2
-
+    first: UInt8[Tensor, "height width 3"], second: UInt8[Tensor, "rows columns 3"]
+) -> Float[Tensor, "height width 2"]:
+    """Optical flow from one picture to another, NaN where the way back leads elsewhere."""
     if first.shape != second.shape:
-        second = cv2.resize(second, first.shape[::-1], interpolation=cv2.INTER_AREA)
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    dis.setFinestScale(0)  # full size: half the error on what moves of `procedural:jelly`, 0.40 for 0.76 pixels of 4.1
-    forward, back = dis.calc(first, second, None), dis.calc(second, first, None)
-    y, x = np.mgrid[: first.shape[0], : first.shape[1]].astype(np.float32)
-    there = np.stack([x, y], -1) + forward
-    returned = cv2.remap(back, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderValue=(np.nan, np.nan))
-    sure = np.linalg.norm(forward + returned, axis=-1) < MAX_ROUND_TRIP
-    return np.where(sure[..., None], forward, np.nan).astype(np.float32)
-
-
-def need_opencv() -> None:
-    """Raises LumigraphError where OpenCV is missing."""
-    try:
-        import cv2  # noqa: F401
-    except ImportError:
-        raise LumigraphError(
-            "nsff finds optical flow by OpenCV, which is missing; pip install 'lumigraph[flow]', or --flow-weight 0"
-        ) from None
+        second = interpolate(second.movedim(-1, 0)[None].float(), first.shape[:2], mode="area")[0].movedim(0, -1).byte()
+    height, width = first.shape[:2]
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels, flow = torch.stack([x, y], -1), optical_flow(first, second)
+    there = pixels + flow
+    inside = ((there >= 0.5) & (there <= torch.tensor([width, height]) - 0.5)).all(-1)
+    sure = inside & (round_trip_error(pixels, flow, optical_flow(second, first)) < MAX_ROUND_TRIP)
+    return torch.where(sure[..., None], flow, torch.nan)
 
 
 def seen(mask: Bool[Tensor, " ray"], values: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
