@@ -24,6 +24,7 @@ from ..datasets.shapes import CUBE, HALF_SIDE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
 from ..files.ranges import Count, Depth, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ..geometry import Similarity
+from ..method import seeded
 
 Tally = Annotated[int, between(0, 100_000)]
 
@@ -115,8 +116,7 @@ class DeepSDF(CodedSurface):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.decoder = Decoder(c)
         self.pools = PointPools("deepsdf", c.points, c.seed)
 

@@ -29,7 +29,7 @@ from ..exchange.packing import Stored, most_important
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
-from ..method import Field, FieldMethod
+from ..method import Field, FieldMethod, seeded
 from ..method.depth import DepthNumbers, depth_terms
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
@@ -166,8 +166,7 @@ class DVGO(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = VoxelField(c, frame, space)
         schedule = GridSchedule(begins=FREE_FROM * c.coarse_share, early_steps=0)
         numbers = c.occupancy, c.proposals, schedule

@@ -24,7 +24,7 @@ from ..components.training.photometric import backdrop
 from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
-from ..method import FieldMethod, Pass
+from ..method import FieldMethod, Pass, seeded
 from ..method.controls import Control
 from ..method.field import Densities, Points
 from ..volume import composite
@@ -158,8 +158,7 @@ class NeRFW(FieldMethod):
         super().__init__(frame, c)
         space, code, hidden = space_of(frame), c.appearance_code, [c.transient_width] * c.transient_layers
         self.sky = None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = EncodedHashField(c.table, c.hidden_width, space, frame.reach, code)
                 self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)

@@ -29,7 +29,7 @@ from ..components.training.schedules import held
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
 from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
-from ..method import FieldMethod
+from ..method import FieldMethod, seeded
 from ..method.controls import Control
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
@@ -100,8 +100,7 @@ class RawNeRF(FieldMethod):
         space = space_of(frame)
         self.poses = poses_for(frame, c.poses)
         joining = self.poses.weights if self.poses else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = LightField(c.table, c.hidden_width, space, frame.reach, joining=joining)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         photographs = frame.image_count

@@ -27,6 +27,7 @@ from ...files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, 
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
+from ...method import seeded
 from ...method.controls import Control
 from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
@@ -68,8 +69,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         super().__init__(frame, c)
         self.poses = None
         self.density_control = AdaptiveDensity(c.refine, c.adaptive, len(self.cloud))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.skin = SkinnedCloud(frame, c.bones, c.weights)
         self.bones = self.skin.bones
         self.tidying = Tidying(c.tidying)

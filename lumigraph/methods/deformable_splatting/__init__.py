@@ -26,6 +26,7 @@ from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
 from ...geometry import to_matrix
+from ...method import seeded
 from ...method.controls import Control, moment
 from .planes import MotionNumbers, PlaneMotion
 
@@ -66,8 +67,7 @@ class DeformableSplatting(CloudMethod):
         count = len(self.cloud)
         self.poses = None
         self.density_control = AdaptiveDensity(c.refine, c.adaptive, count)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.motion = PlaneMotion(frame, c.motion, count)  # it follows what density control does to the cloud
         self.tidying = Tidying(c.tidying)
 

@@ -155,7 +155,6 @@ class PlaneMotion(Addition):
         self.register_buffer("shares", torch.zeros(count, CARRIERS))
         self.register_buffer("active", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(1.0))
-        self.progress = 0.0
 
     # The cloud at a moment
 
@@ -216,11 +215,11 @@ class PlaneMotion(Addition):
         self.follow_cloud(method.cloud.means.detach())
 
     @torch.no_grad()
-    def follow_cloud(self, means: Float[Tensor, "gaussian 3"]) -> None:
-        """Tell static Gaussians from moving ones, and find neighbours of these."""
+    def follow_cloud(self, means: Float[Tensor, "gaussian 3"], apart: bool = False) -> None:
+        """Find neighbours of moving Gaussians. apart: tell static ones from them, by their offsets; else all move"""
         count, device = len(means), means.device
         self.moves = torch.ones(count, dtype=torch.bool, device=device)
-        if self.active and self.progress >= self.numbers.told_apart:
+        if apart:
             first, last = self.times or (0.0, 1.0)
             moments = torch.linspace(first, last, PROBED_MOMENTS).tolist()
             farthest = torch.stack([self.offsets(means, t)[0].norm(dim=-1) for t in moments]).amax(0)
@@ -263,7 +262,6 @@ class PlaneMotion(Addition):
         self.carriers, self.shares = self.carriers[kept], self.shares[kept]
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
-        self.progress = progress
         self.active.fill_(progress >= self.numbers.still_until)
 
     def before_raster(self, method: Any, step: Step) -> None:
@@ -303,7 +301,8 @@ class PlaneMotion(Addition):
 
     def after_step(self, method: Any, step: int) -> None:
         if method.current.due or len(self.moves) != len(method.cloud):
-            self.follow_cloud(method.cloud.means.detach())
+            apart = bool(self.active) and method.progress >= self.numbers.told_apart
+            self.follow_cloud(method.cloud.means.detach(), apart)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         n = self.numbers

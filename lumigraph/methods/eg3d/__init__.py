@@ -27,7 +27,6 @@ from ...components.training.adversarial import (
     discriminator_loss,
     follow,
     generator_loss,
-    held,
     lazy_adam,
     r1_penalty,
     widths_of,
@@ -36,7 +35,7 @@ from ...datasets.collection import Collection
 from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Positive, RaySamples, Seed, Share, Width, between
-from ...method import Descend, Method
+from ...method import Descend, Method, frozen, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...system.work import at_work
@@ -175,8 +174,7 @@ class EG3D(Method):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.generator = ObjectGenerator(c)
             channels = 6 if self.generator.upscaling else 3
             widths = widths_of(c.picture_size, c.channel_base, c.channel_most)
@@ -261,7 +259,7 @@ class EG3D(Method):
         descend(terms, [discriminators])
         self.figures = {name: float(value.detach()) for name, value in terms.items()}
 
-        with held(self.discriminator):
+        with frozen(self.discriminator):
             terms = {"generator": generator_loss(self.discriminator(fake, views))}
         if step % c.density_interval == 0 and c.density_weight > 0:
             terms["density"] = c.density_interval * c.density_weight * self._roughness(made, random)

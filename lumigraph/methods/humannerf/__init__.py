@@ -22,7 +22,7 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
 from ...files.ranges import LearningRate, Seed, Width, between
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density
 from ...volume import composite
@@ -60,8 +60,7 @@ class HumanNeRF(Articulated, FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = Box(frame.bounds, frame.near)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.bones = BoneMotion(frame, c.bones)
             canonical: Any
             if c.field == "hash":

@@ -28,7 +28,7 @@ from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
 from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...geometry import look_at, turning
-from ...method import Method, RayMethod
+from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.up import common_up
@@ -138,8 +138,7 @@ class HypNeRF(RayMethod):
         c = config or Config()
         super().__init__(frame, c)
         self.shape = HashShape.of(c.table, c.hidden_width)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             sizes = [c.colour_code if colour else c.shape_code for colour in self.shape.of_colour]
             self.hyper = HyperNetwork(sizes, c.hyper_width, c.hyper_layers, self.shape.tensors)
             self.denoiser = PictureDenoiser(c.denoiser_width)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -24,7 +23,7 @@ from ...components.tracking.trajectory import Pose, moved
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
 from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ...method import FieldMethod, Pass
+from ...method import FieldMethod, Pass, frozen, seeded
 from ...method.method import Descend
 from ...volume import composite
 from .fields import DistanceTable, MapNetwork
@@ -114,8 +113,7 @@ class IMap(FieldMethod):
         super().__init__(frame, c)
         self.unit = 1 / frame.to_source.scale  # scene units of a metre
         space, hashed = Box(frame.bounds, frame.near), c.field == "hash"
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if hashed:
                 self.network = DistanceTable(c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness)
             else:
@@ -374,19 +372,6 @@ class IMap(FieldMethod):
         if isinstance(self.network, DistanceTable):
             return self.network.optimizers_at(self.config.learning_rate)
         return [torch.optim.Adam(self.network.parameters(), self.config.learning_rate)]
-
-
-@contextlib.contextmanager
-def frozen(field: torch.nn.Module) -> Iterator[None]:
-    """A field whose parameters get no gradient meanwhile."""
-    learnt = [p for p in field.parameters() if p.requires_grad]
-    try:
-        for p in learnt:
-            p.requires_grad_(False)
-        yield
-    finally:
-        for p in learnt:
-            p.requires_grad_(True)
 
 
 def joined_rays(parts: Sequence[Rays]) -> Rays:

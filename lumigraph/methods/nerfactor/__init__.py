@@ -44,7 +44,7 @@ from ...files.ranges import (
 )
 from ...geometry import unit
 from ...light import SUFFIXES, EnvironmentLight, directions, solid_angles
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -148,8 +148,7 @@ class NeRFactor(FieldMethod):
         super().__init__(frame, c)
         space = space_of(frame)
         code = c.code_width if c.reflectance == "learnt" else 1
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = HashField(c.table, c.hidden_width, space, frame.reach)
             if c.properties == "hash":
                 self.properties = HashProperties(c.table, c.hidden_width, code, space, frame.reach)
@@ -168,7 +167,6 @@ class NeRFactor(FieldMethod):
         self.register_buffer("stage", torch.tensor(0))
         self.register_buffer("began", torch.tensor(-1.0))
         self._told: EnvironmentLight | None = None
-        self._progress = 0.0
         self._choose_learning()
 
     @classmethod
@@ -299,11 +297,11 @@ class NeRFactor(FieldMethod):
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         """Rays of a step. Geometry is frozen here when its share of the budget is over."""
-        if not self.stage and self._progress >= self.config.geometry_share:
+        if not self.stage and self.progress >= self.config.geometry_share:
             self.grid.fill(self.density, self.random(2))
             self.stage.fill_(1)
             self._choose_learning()
-            self.began.fill_(self._progress)
+            self.began.fill_(self.progress)
             self._begin_light(data)
         if not self.stage:
             return data.sample_rays(self.sampler.batch_size, generator).to(self.device)
@@ -351,7 +349,7 @@ class NeRFactor(FieldMethod):
             beside = self.lights_seen(jittered, self.pixels[0])
             terms["visibility"] = c.visibility_weight * mean((seen.visibility - traced).square())
             terms["visibility_smoothness"] = c.visibility_smoothness * mean((seen.visibility - beside).abs())
-        if self._over(self._progress) < c.shape_share:
+        if self._over(self.progress) < c.shape_share:
             return terms
         error = mean((tone(seen.radiance) - tone(light)).square())
         self.figures = {"mse": float(error.detach()), "rays": len(batch), "surface_points": len(points)}
@@ -388,7 +386,7 @@ class NeRFactor(FieldMethod):
         }
 
     def before_step(self, step: int, progress: float) -> None:
-        self._progress, share = progress, self.config.geometry_share
+        share = self.config.geometry_share
         if not self.stage and progress < share:
             super().before_step(step, progress / share)
 

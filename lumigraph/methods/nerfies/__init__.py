@@ -23,7 +23,7 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between
-from ...method import FieldMethod, Pass
+from ...method import FieldMethod, Pass, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density
 from ...volume import composite, weights_of
@@ -95,8 +95,7 @@ class Nerfies(FieldMethod):
         d, space = c.deformation, space_of(frame)
         shape, ambient = (d.deformation_depth, d.deformation_width, d.deformation_skip), d.slice_dimensions
         first = None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.levels = BandSchedule(c.table_annealing) if c.table_annealing else None
                 hash_of = partial(SlicedHash, c.table, c.hidden_width, space, frame.reach, c.appearance_code)
@@ -115,7 +114,7 @@ class Nerfies(FieldMethod):
         self.network = WarpedField(canonical, motion, slices, c.appearance_code, first)
         self.appearance = AppearanceCodes(frame.image_count, c.appearance_code) if c.appearance_code else None
         self.register_buffer("background_points", torch.zeros(0, 3))
-        self.elastic, self.progress = 0.0, 0.0  # weight of the elastic loss now; share of the budget that is spent
+        self.elastic = 0.0  # weight of the elastic loss now
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -191,7 +190,7 @@ class Nerfies(FieldMethod):
 
     def before_step(self, step: int, progress: float) -> None:
         """The elastic weight is constant, then falls by half a cosine over twice that time (the authors' release)."""
-        d, self.progress = self.config.deformation, progress
+        d = self.config.deformation
         fallen = min(max(progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
         self.elastic = d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
         super().before_step(step, progress)

@@ -17,7 +17,7 @@ from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import BatchSize, LearningRate, NonNegative, RaySamples, Seed, Width, between
-from ...method import RayMethod
+from ...method import RayMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
 from .cameras import Backgrounds, Rig
@@ -75,8 +75,7 @@ class NeuralVolumes(RayMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.encoder = Encoder(c.encoder_cameras, c.encoder_size, c.encoder_width, c.code)
             warp = c.affines, c.warp_resolution, c.warp_width
             sides = c.shared_resolution, c.view_dependence

@@ -20,7 +20,7 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import BatchSize, LearningRate, NonNegative, PositiveShare, RaySamples, Seed, Width, between
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Densities, Directions, Points
 from ...method.sampler import Density
@@ -98,8 +98,7 @@ class NSFF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = self.space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 static: Any = StaticHash(c.table, c.hidden_width, space, frame.reach)
                 moments = max(frame.train_count or frame.image_count, 2)

@@ -31,7 +31,7 @@ from ...composition.composed import kept, union
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
 from ...geometry import Similarity
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.controls import Control
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -86,8 +86,7 @@ class ObjectNeRF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = HashField(c.table, c.hidden_width, space, frame.reach)
                 self.branch = ObjectTable(c.table, c.hidden_width, space, frame.reach, c.code)

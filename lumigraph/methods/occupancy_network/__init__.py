@@ -24,6 +24,7 @@ from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Seed, Width, between
+from ...method import seeded
 from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
 Input = Literal["points", "voxels", "picture"]
@@ -120,8 +121,7 @@ class OccupancyNetwork(CodedSurface):
         c = config or Config()
         super().__init__(frame, c)
         encoders = {"points": PointEncoder, "voxels": VoxelEncoder, "picture": WholePictureEncoder}
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.encoder = encoders[c.input](c.code, c.encoder_width)
             self.decoder = OccupancyDecoder(c.code, c.hidden_width, c.blocks, c.octaves)
         self.codes.rows.requires_grad_(False)  # encoded, not learnt

@@ -27,7 +27,7 @@ from ...exchange.packing import Stored, most_important
 from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
-from ...method import Field, FieldMethod
+from ...method import Field, FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -190,8 +190,7 @@ class TensoRF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = TensorField(c, frame, space)
         numbers, rays = (frame, space, c.occupancy, c.proposals, SCHEDULE), c.rays_per_step
         open_samples = c.open_samples_per_step
