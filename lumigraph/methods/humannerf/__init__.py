@@ -22,8 +22,8 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
 from ...files.ranges import LearningRate, Seed, Width, between
-from ...method import FieldMethod, seeded
-from ...method.field import Densities, Points
+from ...method import FieldMethod, Pass, seeded
+from ...method.field import Colours, Densities, Directions, Points
 from ...method.sampler import Density
 from ...volume import composite
 from .fields import NonRigidNumbers, NonRigidOffset, PosedField
@@ -68,7 +68,7 @@ class HumanNeRF(Articulated, FieldMethod):
             else:
                 canonical = CoordinateField(c.network, c.hidden_width, space)
             offset = NonRigidOffset(self.bones.given_angles.shape[1], c.nonrigid)
-            self.network = PosedField(canonical, WeightVolume(frame, c.weights), len(self.bones.skeleton), offset)
+            self.network = PosedField(canonical, WeightVolume(frame, c.weights), offset)
         self.sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps=c.steps)
 
     @classmethod
@@ -93,24 +93,24 @@ class HumanNeRF(Articulated, FieldMethod):
 
     # Moments
 
-    def pose(self, times: Float[Tensor, " moment"]) -> None:
-        """Put the field into the poses of moments, under the settings."""
+    def posed(self, times: Float[Tensor, " moment"]) -> PosedField:
+        """The field in the poses of moments, under the settings."""
         turns, places = self.bones.shown(self, times)
-        self.network.pose(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
+        return self.network.posed(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
 
-    def code(self, rays: Rays) -> Float[Tensor, "#ray code"]:
-        """The row of each ray's moment among the poses that the field is put into."""
+    def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Pass]:
         times, rows = self.moments(rays).unique(return_inverse=True)
-        self.pose(times)
-        return rows[:, None].float()
+        return self.sampler.sample(rays, self.posed(times), rows[:, None].float(), generator)
 
-    @property
-    def shown_code(self) -> Float[Tensor, "1 code"]:
-        self.pose(torch.tensor([self.moment_of()], device=self.device))
-        return torch.zeros(1, 1, device=self.device)
+    def shown_field(self) -> PosedField:
+        """The field in the pose of pictures, by the settings."""
+        return self.posed(torch.tensor([self.moment_of()], device=self.device))
+
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
+        return self.shown_field()(points, directions)
 
     def density(self, points: Points) -> Densities:
-        return self.network.density(points, self.shown_code.expand(len(points), -1))
+        return self.shown_field().density(points)
 
     def density_in_training(self, generator: torch.Generator) -> Density:
         """Density of each point at one of some random moments of the capture."""
@@ -118,12 +118,8 @@ class HumanNeRF(Articulated, FieldMethod):
 
         @torch.no_grad()
         def density(points: Points) -> Densities:
-            before = self.network.table, self.network.angles, self.network.weights
-            self.pose(moments.to(self.device))
             rows = torch.randint(len(moments), (len(points), 1), generator=generator).to(self.device).float()
-            found = self.network.density(points, rows)
-            self.network.table, self.network.angles, self.network.weights = before
-            return found
+            return self.posed(moments.to(self.device)).density(points, rows)
 
         return density
 
