@@ -216,6 +216,7 @@ def test_the_papers_network_learns_too_and_is_baked():
     scene, chance = tiny.scene(), torch.Generator().manual_seed(0)
     made.begin(scene)
     made.progress = 0.0
+    made.before_step(0, made.progress)
     terms = made.loss(made.batch(scene, chance), 0)
     terms["colour"].backward()
     assert terms["sparsity"] > 0

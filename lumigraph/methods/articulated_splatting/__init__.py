@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers
 from ...datasets.scene import Frame, Photograph, Scene
-from ...files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between
+from ...files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
@@ -77,17 +77,18 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud without view dependence, a coarser volume, and higher rates for few steps."""
-        c = Config(sh_degree=0, initial_gaussians=6000, half_resolution_until=0.3)
-        c = replace(c, refine=RefineNumbers(30_000, cap_ramp=True), rates=RateNumbers(most_haste=4.0))
-        return replace(c, weights=replace(c.weights, weight_cells=24), bones=replace(c.bones, pose_smoothing=True))
+        c = Config(sh_degree=0, initial_gaussians=6000, refine=RefineNumbers(30_000, cap_ramp=True))
+        return changed(c, half_resolution_until=0.3, most_haste=4.0, weight_cells=24, pose_smoothing=True)
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians on bones, refined within some twenty quick steps."""
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
-        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
-        c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, refine=refine, adaptive=adaptive)
-        return replace(c, weights=WeightNumbers(8, 0, 1e-2, 0.5), bones=BoneNumbers("table", pose_lr=1e-3))
+        return changed(
+            Config(refine=refine), sh_degree=1, sh_degree_interval=4, initial_gaussians=200,
+            densify_grad_threshold=1e-6, opacity_reset_interval=5, weight_cells=8, weight_code=0, weights_lr=1e-2,
+            bone_radius=0.5, pose_correction="table", pose_lr=1e-3, pose_from=0.0,
+        )  # fmt: skip
 
     def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
         """Round Gaussians about the bones at rest, in random colours."""

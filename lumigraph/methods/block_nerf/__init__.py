@@ -109,12 +109,11 @@ class BlockNeRF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64)
-        c = replace(
-            c, rays=RayNumbers(128, 128), head_layers=1, head_width=16, pose_penalty=0.0, final_pose_penalty=0.0
-        )
-        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE)
-        return replace(c, decay_start=0.3, huber_delta=0.3)
+        return Config(
+            **CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64,
+            rays=RayNumbers(128, 128), head_layers=1, head_width=16, pose_penalty=0.0, final_pose_penalty=0.0,
+            learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE, decay_start=0.3, huber_delta=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -21,7 +21,7 @@ from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
-from ...files.ranges import LearningRate, Seed, Width, between
+from ...files.ranges import LearningRate, Seed, Width, between, changed
 from ...method import FieldMethod, Pass, seeded
 from ...method.field import Colours, Densities, Directions, Points
 from ...method.sampler import Density
@@ -74,22 +74,24 @@ class HumanNeRF(Articulated, FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical field, a learnt volume of weights, a small offset, and higher rates."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
-        c = replace(c, table=replace(c.table, sh_bands=1), decay_start=0.3)
-        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        c = replace(c, bones=BoneNumbers("table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True))
-        c = replace(c, weights=WeightNumbers(24, 0, 1e-2))
-        return replace(c, nonrigid=NonRigidNumbers(2, 32, 1, 4, 0.3, 0.7, 1e-3))
+        return changed(
+            Config(**CPU_HASH), field="hash", hidden_width=32, sh_bands=1, samples_per_step=1 << 13,
+            occupancy_resolution=64, learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+            weight_cells=24, weight_code=0, weights_lr=1e-2,
+            pose_correction="table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True,
+            nonrigid_depth=2, nonrigid_width=32, nonrigid_skip=1, nonrigid_frequencies=4,
+            nonrigid_from=0.3, nonrigid_until=0.7, nonrigid_lr=1e-3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under tiny motions within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
-        c = replace(
-            c, bones=BoneNumbers(pose_lr=1e-3, pose_width=8, pose_depth=1), weights=WeightNumbers(8, 4, 1e-2, 0.2)
-        )
-        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1024))
-        return replace(c, nonrigid=NonRigidNumbers(2, 8, 1, 2, 0.0, 0.5, 1e-3))
+        return changed(
+            Config(**TINY_HASH), field="hash", hidden_width=16, samples_per_step=1024, learning_rate=2e-2,
+            final_learning_rate=1e-3, weight_cells=8, weight_code=4, weights_lr=1e-2, bone_radius=0.2, pose_lr=1e-3,
+            pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2, nonrigid_width=8, nonrigid_skip=1,
+            nonrigid_frequencies=2, nonrigid_from=0.0, nonrigid_until=0.5, nonrigid_lr=1e-3,
+        )  # fmt: skip
 
     # Moments
 

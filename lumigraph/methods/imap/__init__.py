@@ -22,7 +22,7 @@ from ...components.tracking.tracker import Iterations, Tracker, TrackingNumbers
 from ...components.tracking.trajectory import Pose, moved
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between, changed
 from ...method import FieldMethod, Pass, frozen, seeded
 from ...method.method import Descend
 from ...volume import composite
@@ -127,21 +127,23 @@ class IMap(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
-        table = HashNumbers(8, 2, 16, 16, 512, geometry_features=16, colour_layers=1, sh_bands=1)
-        tracking, descent = TrackingNumbers(first_estimate="surface"), FramePoseNumbers(tracking_iterations=0)
-        mapping = FieldMappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
-        mapping = replace(mapping, keyframe_pose_rate=2e-4)
-        terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3)
-        c = Config(table, SampleNumbers(16, 10), tracking, descent, mapping, terms, "hash")
-        return replace(c, hidden_width=32, learning_rate=1e-2)
+        return changed(
+            Config(), field="hash", hidden_width=32, learning_rate=1e-2,
+            levels=8, features_per_level=2, log2_hashmap_size=16, max_resolution=512, colour_layers=1, sh_bands=1,
+            coarse_samples=16, fine_samples=10, first_estimate="surface", tracking_iterations=0, mapping_iterations=5,
+            window=8, pixels_per_frame=128, active_sampling=False, keyframe_pose_rate=2e-4,
+            depth_weight=0.1, distance_weight=10.0, free_weight=10.0, smooth_weight=1e-3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny hash table and few descents a frame."""
-        mapping = FieldMappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
-        terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-4)
-        c = Config(replace(TINY_TABLE, sh_bands=1), SampleNumbers(12, 8), mapping=mapping, terms=terms, field="hash")
-        return replace(c, hidden_width=16, truncation=0.2, sharpness=4.0, learning_rate=2e-2)
+        return changed(
+            Config(replace(TINY_TABLE, sh_bands=1)), field="hash", hidden_width=16, truncation=0.2, sharpness=4.0,
+            learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1, first_iterations=2, window=4,
+            pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
+            smooth_weight=1e-4,
+        )  # fmt: skip
 
     # The sequence
 

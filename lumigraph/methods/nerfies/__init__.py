@@ -22,7 +22,18 @@ from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between
+from ...files.ranges import (
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    PositiveShare,
+    Seed,
+    Share,
+    Width,
+    between,
+    changed,
+)
 from ...method import FieldMethod, Pass, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density
@@ -119,22 +130,23 @@ class Nerfies(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
-        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
-        d = replace(d, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True)
-        d = replace(d, deformation_frequencies=4, growth=0.5)
-        c = replace(c, deformation=d, table_annealing=0.5, deformation_rate=0.3)
-        return replace(c, final_learning_rate=1e-3, decay_start=0.3)
+        return changed(
+            Config(**CPU_HASH), field="hash", hidden_width=32, appearance_code=0, samples_per_step=1 << 13,
+            occupancy_resolution=64, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5,
+            elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True,
+            deformation_frequencies=4, growth=0.5, table_annealing=0.5, deformation_rate=0.3,
+            learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under a tiny deformation with a slice, within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, appearance_code=2, learning_rate=2e-2)
-        d = replace(c.deformation, deformation_depth=2, deformation_width=16, deformation_skip=1, moment_code=2)
-        d = replace(d, deformation_frequencies=4, elastic_samples=64, background_points=64)
-        d = replace(d, slice_dimensions=1, slice_width=16)
-        return replace(c, deformation=d, final_learning_rate=1e-3, deformation_rate=0.1)
+        return changed(
+            Config(**TINY_HASH), field="hash", hidden_width=16, appearance_code=2, deformation_depth=2,
+            deformation_width=16, deformation_skip=1, moment_code=2, deformation_frequencies=4, elastic_samples=64,
+            background_points=64, slice_dimensions=1, slice_width=16, learning_rate=2e-2, final_learning_rate=1e-3,
+            deformation_rate=0.1,
+        )  # fmt: skip
 
     # Codes
 
