@@ -175,7 +175,6 @@ class NeRFW(FieldMethod):
                 self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
         self.appearance = AppearanceCodes(frame.image_count, code)
         self.transient = PhotographCodes(frame.image_count, c.transient_code)
-        self.settling = False  # whether the static scene learns alone
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -207,7 +206,7 @@ class NeRFW(FieldMethod):
             seen = composite(look.samples, look.density, look.rgb, background)
             terms[each.name] = 0.5 * squared(seen.rgb - target).mean()
         look = last.look(self.network, appearance)
-        if self.settling:
+        if self.progress < c.transient_start:  # the static scene learns alone
             seen = composite(look.samples, look.density, look.rgb, background)
             beta = torch.full_like(target[:, 0], c.beta_min)
         else:
@@ -238,10 +237,6 @@ class NeRFW(FieldMethod):
         else:
             own = [torch.optim.Adam([*self.network.parameters(), *others, *codes], rate, eps=1e-7)]
         return [*own, *super().optimizers()]
-
-    def before_step(self, step: int, progress: float) -> None:
-        self.settling = progress < self.config.transient_start
-        super().before_step(step, progress)
 
     # Rendering
 

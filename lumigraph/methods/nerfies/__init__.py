@@ -125,7 +125,6 @@ class Nerfies(FieldMethod):
         self.network = WarpedField(canonical, motion, slices, c.appearance_code, first)
         self.appearance = AppearanceCodes(frame.image_count, c.appearance_code) if c.appearance_code else None
         self.register_buffer("background_points", torch.zeros(0, 3))
-        self.elastic = 0.0  # weight of the elastic loss now
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -200,12 +199,12 @@ class Nerfies(FieldMethod):
             data = replace(data, splits={"train": train[time[train] <= until]})
         return super().batch(data, generator)
 
-    def before_step(self, step: int, progress: float) -> None:
-        """The elastic weight is constant, then falls by half a cosine over twice that time (the authors' release)."""
+    def elastic_weight(self) -> float:
+        """Weight of the elastic loss: constant, then falling by half a cosine over twice that time (the authors'
+        release)."""
         d = self.config.deformation
-        fallen = min(max(progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
-        self.elastic = d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
-        super().before_step(step, progress)
+        fallen = min(max(self.progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
+        return d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of each pass, elastic loss (eq. 10) and background loss (eq. 12)."""
@@ -219,8 +218,8 @@ class Nerfies(FieldMethod):
             self.figures["mse"] = float(error.detach())  # of the last pass in the end
             terms[each.name] = error
         motion = self.network.motion
-        if motion is not None and self.elastic:
-            terms["elastic"] = self.elastic * self.stretching(motion, batch.rays, passes[-1], code, generator)
+        if motion is not None and (weight := self.elastic_weight()):
+            terms["elastic"] = weight * self.stretching(motion, batch.rays, passes[-1], code, generator)
         if motion is not None and len(self.background_points) and self.config.deformation.background_weight:
             terms["background"] = self.config.deformation.background_weight * self.restlessness(motion, generator)
         return terms
