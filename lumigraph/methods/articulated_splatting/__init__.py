@@ -23,7 +23,7 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers
 from ...datasets.scene import Frame, Photograph, Scene
-from ...files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between, changed
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
@@ -33,6 +33,7 @@ from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
 
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
+ISOTROPY_WEIGHT = 0.01  # weight of long Gaussians, which tear at joints
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,6 @@ class Config:
     initial_gaussians: CloudSize = 10_000  # random Gaussians about the bones at first
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
-    isotropy_weight: NonNegative = 0.01  # weight of long Gaussians, which tear at joints; higher: rounder
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
     bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
@@ -99,10 +99,8 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         """The cloud's terms, and the isotropy of its Gaussians: the mean excess of their ratios of deviations."""
         terms = super().loss(batch, step)
-        if self.config.isotropy_weight:
-            ratio = (self.cloud.log_scales.amax(-1) - self.cloud.log_scales.amin(-1)).exp()
-            terms["isotropy"] = self.config.isotropy_weight * (ratio - MAX_RATIO).clamp_min(0).mean()
-        return terms
+        ratio = (self.cloud.log_scales.amax(-1) - self.cloud.log_scales.amin(-1)).exp()
+        return terms | {"isotropy": ISOTROPY_WEIGHT * (ratio - MAX_RATIO).clamp_min(0).mean()}
 
     @property
     def controls(self) -> tuple[Control, ...]:

@@ -31,6 +31,10 @@ MIN_DISTANCE = 1e-6  # between neighbours, scene units
 Moments = Float[Tensor, " gaussian"] | float
 
 
+STILL_OFFSET = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
+RIGID_SAMPLES = 1024  # Gaussians of a step whose neighbours are compared
+
+
 @dataclass(frozen=True)
 class MotionNumbers:
     """A Config's numbers of the motion; those of the authors' release (Wu 2024)."""
@@ -45,12 +49,10 @@ class MotionNumbers:
     still_until: Share = 3000 / 23_000  # share of the budget in which nothing moves, 3000 steps; later: a better start
     all_moments_from: Share = 0.0  # share of the budget until which moments join, from the middle one on
     told_apart: Share = 0.4  # share of the budget from which Gaussians that hardly move stand still; 1: never
-    still_offset: PositiveShare = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
     plane_smoothness: NonNegative = 1e-4  # weight of total variation of planes in space
     time_smoothness: NonNegative = 0.01  # weight of second differences of planes along time; higher: calmer motion
     time_sparsity: NonNegative = 1e-4  # weight of the planes' distance from no motion; higher: more stands still
     rigidity: NonNegative = 0.01  # weight of distances to neighbours that change; higher: stiffer bodies
-    rigid_samples: Annotated[int, between(1, 1 << 20)] = 1024  # Gaussians of a step whose neighbours are compared
     planes_lr: LearningRate = 1.6e-3  # learning rate of the planes at first, times the extent of the cameras
     motion_lr: LearningRate = 1.6e-4  # learning rate of the network at first, likewise
     final_rate: PositiveShare = 0.01  # share of these rates at the end of the budget
@@ -223,7 +225,7 @@ class PlaneMotion(Addition):
             first, last = self.times or (0.0, 1.0)
             moments = torch.linspace(first, last, PROBED_MOMENTS).tolist()
             farthest = torch.stack([self.offsets(means, t)[0].norm(dim=-1) for t in moments]).amax(0)
-            self.moves = farthest > self.numbers.still_offset * self.diagonal
+            self.moves = farthest > STILL_OFFSET * self.diagonal
         self.neighbours = torch.arange(count, device=device)[:, None].repeat(1, NEIGHBOURS)
         rows = self.moves.nonzero()[:, 0]
         self.carriers, self.shares = (x.new_zeros(count, CARRIERS) for x in (self.neighbours, means))
@@ -287,7 +289,7 @@ class PlaneMotion(Addition):
             rows, places = self.moves.nonzero()[:, 0], cloud.means.detach()
             if not len(rows):
                 return cloud.means.sum() * 0
-            drawn = rows[torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)]
+            drawn = rows[torch.randint(len(rows), (RIGID_SAMPLES,), generator=chance).to(rows.device)]
             links = self.neighbours[drawn]
         both = torch.cat([drawn[:, None], links], 1)
         used, both = both.unique(return_inverse=True)

@@ -38,6 +38,9 @@ from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
 Tally = Annotated[int, between(0, 100_000)]
 
 
+DENOISE_WEIGHT = 0.5  # weight of denoised renderings beside the photographs, in tuning
+
+
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers where it or its published code gives them; `HypNeRF.preset` has those of a plain CPU."""
@@ -72,7 +75,6 @@ class Config:
     tune_learning_rate: LearningRate = 2e-3  # learning rate of tuning; higher changes the field more
     denoise_views: Tally = 12  # denoised renderings around the object to tune on, section 3.3; 0: none
     denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
-    denoise_weight: NonNegative = 0.5  # weight of denoised renderings beside the photographs, in tuning
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -417,7 +419,7 @@ class HypNeRF(RayMethod):
         for step in range(steps):
             adam.param_groups[0]["lr"] = rate * (1 - step / steps)
             adam.zero_grad()
-            for weight, seen in zip((1.0, self.config.denoise_weight), sources, strict=False):
+            for weight, seen in zip((1.0, DENOISE_WEIGHT), sources, strict=False):
                 terms = self._errors(instance, seen(RAYS_PER_STEP // len(sources), generator), generator)
                 (weight * torch.stack([*terms.values()]).sum()).backward()
             adam.step()

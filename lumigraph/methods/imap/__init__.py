@@ -37,6 +37,7 @@ SURFACE_BAND = 0.7  # truncations from a table's surface within which a point is
 SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness term, and metres between them
 MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
 EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
+TRACKING_RATE = 3e-3  # Adam's rate of a frame's pose, radians and scene units
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,6 @@ class FramePoseNumbers:
 
     tracking_iterations: Iterations = 50  # descents on a frame's pose; more follow faster motion, slower
     tracking_pixels: BatchSize = 200  # pixels of each of these descents, section 3.4
-    tracking_rate: LearningRate = 3e-3  # Adam's rate of a frame's pose, radians and scene units
 
 
 @dataclass(frozen=True)
@@ -218,9 +218,9 @@ class IMap(FieldMethod):
             if self.config.tracking.first_estimate == "surface" and isinstance(self.network, DistanceTable):
                 pose = self.aligned(frame, pose, chance)
             twist = torch.zeros(1, 6, device=self.device, requires_grad=True)
-            optimizer = PoseAdam([twist], t.tracking_rate)
+            optimizer = PoseAdam([twist], TRACKING_RATE)
             for i in range(t.tracking_iterations):
-                optimizer.param_groups[0]["lr"] = t.tracking_rate * (1 - i / t.tracking_iterations)
+                optimizer.param_groups[0]["lr"] = TRACKING_RATE * (1 - i / t.tracking_iterations)
                 pixels = frame.drawn(t.tracking_pixels, chance, measured=True)
                 rays = self.world_rays(frame.rays[pixels], moved(pose[None], twist))
                 terms, _ = self.errors(rays, frame.rgb[pixels], frame.depth[pixels], chance)

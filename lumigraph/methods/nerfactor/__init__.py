@@ -52,6 +52,8 @@ from .properties import HashProperties, NetworkProperties, Properties, Raw, Visi
 from .shading import MIN_ROUGHNESS, LearntReflectance, microfacet, shaded
 from .surface import SurfaceGrid, surface_distance
 
+FINAL_GEOMETRY_RATE = 1e-3  # learning rate of the geometry at its end
+
 
 @dataclass(frozen=True)
 class Config:
@@ -90,7 +92,6 @@ class Config:
     final_learning_rate: LearningRate = 5e-4  # the same at the end, reached exponentially
     light_rate: LearningRate = 1e-3  # learning rate of the light's logarithm
     geometry_rate: LearningRate = 1e-2  # learning rate of the geometry at first; higher: faster, may diverge
-    final_geometry_rate: LearningRate = 1e-3  # learning rate of the geometry at its end
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of the geometry's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # residual of the geometry's loss at which it turns linear; 1: always squared
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -378,7 +379,7 @@ class NeRFactor(FieldMethod):
         c = self.config
         spent = min(progress / max(c.geometry_share, 1e-9), 1.0)
         return {
-            "": held(c.geometry_rate, c.final_geometry_rate, step, spent, DECAY_START),
+            "": held(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
             "properties": falling(c.learning_rate, c.final_learning_rate, self._over(progress)),
             "light": falling(
                 c.light_rate, c.light_rate * c.final_learning_rate / c.learning_rate, self._over(progress)

@@ -26,6 +26,9 @@ from .networks import Decoded, Encoder, VolumeDecoder, divergence, opacity_prior
 Side = Annotated[int, between(8, 1024)]
 
 
+SHARED_RATE = 25.0  # learning rate of what all moments share, as a multiple of the others'
+
+
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers; `NeuralVolumes.preset` has those of a plain CPU."""
@@ -49,7 +52,6 @@ class Config:
     opacity_weight: NonNegative = 0.01  # of rays that are neither opaque nor clear, section 5.4
     smooth_weight: NonNegative = 0.01  # of the total variation of log opacity, section 5.4
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher: faster, may diverge
-    shared_rate: NonNegative = 25.0  # learning rate of what all moments share, as a multiple of the others'
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -244,5 +246,5 @@ class NeuralVolumes(RayMethod):
         shared = self.decoder.shared
         groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if p is not shared]}]
         if shared is not None:
-            groups.append({"params": [shared], "scale": self.config.shared_rate})
+            groups.append({"params": [shared], "scale": SHARED_RATE})
         return [torch.optim.Adam(groups, self.config.learning_rate, fused=True), *super().optimizers()]

@@ -37,6 +37,10 @@ Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with a
 Components = Annotated[int, between(1, 1024)]  # of each factor
 
 
+TV_DENSITY_WEIGHT = 0.02  # weight of density's total variation, in the open
+TV_APPEARANCE_WEIGHT = 0.02  # weight of appearance's total variation, in the open
+
+
 @dataclass(frozen=True)
 class Config:
     """VM-192 as the paper and its code for Blender's scenes have it; `TensoRF.preset` says what a plain CPU does."""
@@ -64,8 +68,6 @@ class Config:
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's; higher: faster
     l1_weight: NonNegative = 8e-5  # weight of the L1 norm of an object's density factors, the code's; higher: sparser
     final_l1_weight: NonNegative = 4e-5  # the same once the box has shrunk, the code's
-    tv_density_weight: NonNegative = 0.02  # weight of density's total variation, in the open; higher smooths
-    tv_appearance_weight: NonNegative = 0.02  # weight of appearance's total variation, in the open; higher smooths
     tv_interval: Steps = 1  # steps between these terms, whose weight is multiplied by it; more are faster
     learning_rate: LearningRate = 0.02  # rate of planes and lines until the last upsampling, section 5
     network_learning_rate: LearningRate = 1e-3  # rate of basis matrix and network at first, section 5
@@ -245,7 +247,7 @@ class TensoRF(FieldMethod):
             if weight := c.final_l1_weight if network.stage else c.l1_weight:
                 terms["l1"] = weight * network.density_grid.sparsity()
         elif step % c.tv_interval == 0:
-            weights = {"tv_density": c.tv_density_weight, "tv_appearance": c.tv_appearance_weight}
+            weights = {"tv_density": TV_DENSITY_WEIGHT, "tv_appearance": TV_APPEARANCE_WEIGHT}
             for grid, (name, weight) in zip(network.grids.values(), weights.items(), strict=True):
                 if weight:
                     terms[name] = c.tv_interval * weight * grid.variation()
