@@ -72,7 +72,7 @@ class NonRigidOffset(Part):
 
 
 @dataclass(frozen=True)
-class Poses:
+class BodyPoses:
     """A body at some moments.
 
     table:   from posed to rest, of the bones
@@ -96,12 +96,12 @@ class PosedField(Field):
     def __init__(self, canonical: HashField | CoordinateField, volume: WeightVolume, offset: NonRigidOffset):
         super().__init__()
         self.canonical, self.volume, self.offset = canonical, volume, offset
-        self.poses: Poses | None = None
+        self.poses: BodyPoses | None = None
 
     def posed(self, transforms: Float[Tensor, "moment bone 3 4"], angles: Float[Tensor, "moment angle"]) -> PosedField:
         """The same field in poses at moments, which codes count. transforms: of bones, from rest to posed"""
         field = copy.copy(self)
-        field.poses = Poses(rigid_inverse(transforms), angles, self.volume.weights())
+        field.poses = BodyPoses(rigid_inverse(transforms), angles, self.volume.weights())
         return field
 
     def at_rest(self, points: Points, rows: Int[Tensor, " point"]) -> tuple[Points, Float[Tensor, " point"]]:
