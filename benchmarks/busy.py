@@ -200,6 +200,7 @@ def learner(method: str, scene: str) -> None:
     def one() -> None:
         nonlocal step
         set_learning_rate(optimizers, model.learning_rate(step, PROGRESS))
+        model.progress = PROGRESS
         model.before_step(step, PROGRESS)
         batch = model.batch(data, generator)
         model.step(batch, step, Descent(model, optimizers, batch, step, step % 10 == 0, sys.exit))

@@ -75,7 +75,8 @@ def steps(options: Options, device: torch.device) -> list[dict]:
 
     def one() -> list[float]:
         nonlocal step
-        method.before_step(step, min(0.4, step / 10_000))
+        method.progress = min(0.4, step / 10_000)
+        method.before_step(step, method.progress)
         marks = [clock(device)]
         batch = method.batch(scene, generator)
         marks.append(clock(device))

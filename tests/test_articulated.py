@@ -127,23 +127,23 @@ def test_inverse_skinning_leads_back_to_rest():
     rest = torch.tensor([[0.01, 0.0, -0.3], [0.0, 0.02, 0.2], [0.0, 0.0, 0.18]])
     upper = moves(BEND)[1]
     posed = torch.cat([rest[:1], rest[1:] @ upper[:, :3].T + upper[:, 3]])
-    method.pose(torch.tensor([1.0, 3.0]))
-    found, body = method.network.at_rest(posed, torch.ones(3, dtype=torch.long))
+    field = method.posed(torch.tensor([1.0, 3.0]))
+    found, body = field.at_rest(posed, torch.ones(3, dtype=torch.long))
     torch.testing.assert_close(found, rest, atol=1e-2, rtol=0)
     assert (body > 0.5).all()
-    _, nobody = method.network.at_rest(rest[1:], torch.ones(2, dtype=torch.long))  # where the upper half was
+    _, nobody = field.at_rest(rest[1:], torch.ones(2, dtype=torch.long))  # where the upper half was
     assert (nobody < 0.05).all()
 
 
 def test_density_without_gradients_is_the_same():
     method = HumanNeRF(frame(), HumanNeRF.smallest()).eval()
     method.network.offset.alpha.fill_(1.0)
-    method.pose(torch.tensor([1.0, 3.0]))
+    field = method.posed(torch.tensor([1.0, 3.0]))
     points = 0.8 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.4
     rows = (torch.arange(200) % 2)[:, None].float()
     with torch.no_grad():
-        quick = method.network.density(points, rows)
-    torch.testing.assert_close(quick, method.network.geometry(points, rows)[0].detach(), atol=2e-3, rtol=1e-3)
+        quick = field.density(points, rows)
+    torch.testing.assert_close(quick, field.geometry(points, rows)[0].detach(), atol=2e-3, rtol=1e-3)
 
 
 def test_the_offset_joins_over_its_share_of_the_budget():

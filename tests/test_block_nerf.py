@@ -215,7 +215,7 @@ def test_refined_poses_are_held_near_the_given_ones():
     batch = method.batch(scene, torch.Generator().manual_seed(0))
     squares = method.poses.moves[batch.rays.image_index].square()
     for progress, weight in (0.0, 100.0), (0.25, 80.0), (1.0, 20.0):
-        method.before_step(0, progress)
+        method.progress = progress
         found = method.loss(batch, 0)["poses"]
         torch.testing.assert_close(found, weight * squares.sum() / len(batch))
     found.backward()

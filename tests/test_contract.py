@@ -241,6 +241,7 @@ def test_every_parameter_gets_a_finite_gradient(taught):
         descents.append(terms)
 
     learns = {name for name, parameter in method.named_parameters() if parameter.requires_grad}
+    method.progress = 0.0
     method.before_step(0, 0.0)
     method.step(method.batch(taught.data, torch.Generator().manual_seed(0)), 0, descend)
     method.after_step(0)

@@ -101,7 +101,7 @@ def test_the_loss_is_that_of_the_paper(options):
     torch.testing.assert_close(terms["uncertainty"], (0.5 * (beta**2).log()).mean() - torch.tensor(c.beta_min).log())
     torch.testing.assert_close(terms["transient"], c.transient_weight * torch.stack(density).sum() / len(batch))
     assert set(terms) == {"colour", "uncertainty", "transient", *(places.name for places in coarse)}
-    method.settling = True  # nobody passes yet
+    method.config, method.progress = replace(c, transient_start=0.5), 0.0  # nobody passes yet
     seen = composite(look.samples, look.density, look.rgb, method.background)
     alone = (seen.rgb - batch.rgb).square().sum(-1).mean() / (2 * c.beta_min**2)
     torch.testing.assert_close(method.loss(batch, 0)["colour"], alone)

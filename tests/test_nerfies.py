@@ -185,6 +185,7 @@ def test_later_moments_and_levels_join_while_the_budget_is_spent():
     method, points = Nerfies(scene.frame, config), 2 * torch.rand(20, 3) - 1
     last = []
     for progress in (0.0, 0.25, 0.5):
+        method.progress = progress
         method.before_step(0, progress)
         last.append(float(method.batch(scene, torch.Generator().manual_seed(0)).rays.time.max()))
         encoded = method.network.canonical.encode(points).view(20, base.table.levels, -1)

@@ -215,12 +215,13 @@ def test_the_papers_network_learns_too_and_is_baked():
     made = method(field="network", depth=3, hidden_width=16, skip_layer=1, position_frequencies=4, learning_rate=5e-3)
     scene, chance = tiny.scene(), torch.Generator().manual_seed(0)
     made.begin(scene)
-    made.before_step(0, 0.0)
+    made.progress = 0.0
+    made.before_step(0, made.progress)
     terms = made.loss(made.batch(scene, chance), 0)
     terms["colour"].backward()
     assert terms["sparsity"] > 0
     assert all(p.grad is not None and p.grad.any() for p in made.teacher.parameters())
-    made.before_step(1, made.config.teacher_share)
+    made.progress = made.config.teacher_share
     made.batch(scene, chance)
     assert made.baked and len(made.leaves) and made.leaves.harmonics.isfinite().all()
 

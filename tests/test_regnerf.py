@@ -193,6 +193,7 @@ def test_the_loss_of_the_network_is_the_release_s():
     scene = tiny.scene()
     config = changed(RegNeRF.smallest(), likelihood_weight=0.0, depth_settling=0.5, depth_weight_start=400.0)
     method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
+    method.progress = 0.125
     method.before_step(0, 0.125)
     batch = replace(method.batch(scene, chance()), alpha=None)
     terms = method.loss(batch, 3)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -57,9 +58,19 @@ def test_its_files_say_what_it_is(run):
     config = json.loads((run.folder / "config.json").read_text())
     assert config["method"] == "voxel-grid" and config["config"]["grids"] == {"cells": 12, "channels": [1, 3]}
     assert config["splits"] == {"train": 9, "test": 3} and config["versions"]["torch"]
-    assert sorted(x.name for x in (run.folder / "checkpoints").iterdir()) == ["000010"]
-    files = {path.suffix for path in run.folder.rglob("*") if path.is_file() and path.name != ".lumigraph"}
-    assert files <= {".json", ".jsonl", ".safetensors", ".png"}  # nothing that runs when opened
+
+
+def test_an_option_that_became_a_constant_opens_with_its_value(run):
+    """At the top of a Config and in the numbers that it holds; another value is refused."""
+    settings, kind = run.settings, methods.find("gaussian-splatting")
+    said = asdict(kind.smallest())
+    for value, opens in (0.01, True), (0.02, False):
+        older = replace(settings, config=said | {"mcmc": said["mcmc"] | {"opacity_regularization": value}})
+        with contextlib.nullcontext() if opens else pytest.raises(LumigraphError, match="nothing is known of 'opacity"):
+            assert older.method_config(kind, run.folder) == kind.smallest()
+    kind = methods.find("deepsdf")
+    older = replace(settings, config=asdict(kind.smallest()) | {"fit_weight": 1e-4})
+    assert older.method_config(kind, run.folder) == kind.smallest()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -7,8 +7,6 @@ would be scored as wrong.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -20,7 +18,7 @@ from ..components.training.pose_refinement import PoseRefinement
 from ..datasets.alignment import aligning, moves
 from ..datasets.scene import Scene
 from ..geometry import Similarity
-from ..method import Method
+from ..method import Method, frozen
 from ..method.capabilities import RefinesPoses, can, needs
 from ..metrics import Score
 from .halves import judged_by_halves, left_half
@@ -82,19 +80,6 @@ def colour_error(
         seen, target = seen - seen.mean(0), target - target.mean(0)
         seen = ((seen * target).mean(0) / seen.square().mean(0).clamp_min(1e-9)).clamp_min(0) * seen
     return (seen - target).square().mean()
-
-
-@contextlib.contextmanager
-def frozen(method: Method) -> Iterator[None]:
-    """A method none of whose parameters gets a gradient meanwhile."""
-    learnt = [parameter for parameter in method.parameters() if parameter.requires_grad]
-    try:
-        for parameter in learnt:
-            parameter.requires_grad_(False)
-        yield
-    finally:
-        for parameter in learnt:
-            parameter.requires_grad_(True)
 
 
 def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:

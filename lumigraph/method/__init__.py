@@ -1,5 +1,7 @@
 """Method, and the interfaces that methods are made of: a Field, a Sampler, Parts."""
 
+from .contexts import frozen as frozen
+from .contexts import seeded as seeded
 from .field import Features as Features
 from .field import Field as Field
 from .field_method import FieldMethod as FieldMethod

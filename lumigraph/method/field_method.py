@@ -36,14 +36,17 @@ class FieldMethod(RayMethod, ABC):
         """The code that the field depends on, of each ray or one row for all; None without one."""
         return self.shown_code
 
+    def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Pass]:
+        """Passes of the field along rays, under their codes. generator: of random places in training"""
+        return self.sampler.sample(rays, self.network, self.code(rays), generator)
+
     def looks(self, rays: Rays) -> list[Look]:
         """Density and colour along rays, one entry for each pass, the one that is composited last."""
-        return [self._look(each, rays) for each in self.sampler.sample(rays, self.network, self.code(rays))]
+        return [self._look(each, rays) for each in self.passes(rays)]
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        code = self.code(rays)
-        look = self._look(self.sampler.sample(rays, self.network, code)[-1], rays)
-        return composite(look.samples, look.density, look.rgb, self.behind(rays, code, background))
+        look = self._look(self.passes(rays)[-1], rays)
+        return composite(look.samples, look.density, look.rgb, self.behind(rays, self.code(rays), background))
 
     def _look(self, seen: Pass, rays: Rays) -> Look:
         look = seen.look(self.network, self.code(rays))
@@ -105,7 +108,7 @@ class FieldMethod(RayMethod, ABC):
 
     def learn_along(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
         """Passes along rays at random places, and the sampler's loss terms by name."""
-        passes = self.sampler.sample(rays, self.network, self.code(rays), generator)
+        passes = self.passes(rays, generator)
         last = passes[-1]
         self.figures |= {"rays": len(rays), "samples": last.evaluated, "visible_samples": len(last.samples)}
         return passes, self.sampler.terms(self.density_in_training(generator), last, generator)

@@ -51,6 +51,7 @@ class Method(nn.Module, ABC):
     figures: of the last step, by name, worth a line in metrics.jsonl; "mse", the squared error of colours, becomes
              the PSNR that training shows
     settings: values that `given` set, by the names of the controls
+    progress: share of the budget (steps or seconds) that is spent, in [0, 1]; the trainer sets it ahead of each step
     All that must survive a resume lives in parameters, buffers and optimizers.
     """
 
@@ -70,6 +71,7 @@ class Method(nn.Module, ABC):
         self.frame, self.config = frame, config
         self.figures: dict[str, float] = {}
         self.settings: dict[str, Value] = {}
+        self.progress = 1.0
         self.register_buffer("_place", torch.empty(0), persistent=False)  # knows the device, also without parameters
 
     @classmethod

@@ -37,7 +37,9 @@ class RayMethod(Method):
 
     def rays_in_a_step(self, data: Scene) -> float:
         """Rays that a step learns from, about: those of a first one, which a copy draws."""
-        return len(copy.deepcopy(self).batch(data, torch.Generator().manual_seed(0)))
+        fresh = copy.deepcopy(self)
+        fresh.progress = 0.0
+        return len(fresh.batch(data, torch.Generator().manual_seed(0)))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         layers = depth_layers(self.config, data)

@@ -37,6 +37,8 @@ MIN_DEVIATION = 1e-3
 SLOPE = 0.2  # of leaky ReLUs
 FIRST_SIDE = 4  # texels a side, from which the decoder begins
 NEAR = 1e-3  # scene units, before which triangles are cut off
+TEXTURE_WEIGHT = 1.0  # lambda_T of the loss
+MESH_WEIGHT = 1.0  # lambda_M of the loss
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,6 @@ class Config:
     max_channels: Width = 512  # of any layer
     view_features: Count = 8  # of the view's direction (section 4.2)
     mesh_width: Width = 256  # of the layer before the mesh
-    texture_weight: NonNegative = 1.0  # lambda_T
-    mesh_weight: NonNegative = 1.0  # lambda_M
     divergence_weight: NonNegative = 0.01  # lambda_Z
     mesh_rows: Annotated[int, between(5, 512)] = 73  # of the mesh's grid; 7306 vertices are the paper's
     mesh_columns: Annotated[int, between(5, 512)] = 101
@@ -257,8 +257,8 @@ class DeepAppearance(Method):
         divergence = 0.5 * (mean.square() + (2 * log_deviation).exp() - 1) - log_deviation
         self.figures = {"mse": float(error.detach() * self.deviations[0] ** 2)}
         return {
-            "texture": c.texture_weight * error,
-            "mesh": c.mesh_weight * (found_mesh - mesh).square().mean(),
+            "texture": TEXTURE_WEIGHT * error,
+            "mesh": MESH_WEIGHT * (found_mesh - mesh).square().mean(),
             "divergence": c.divergence_weight * divergence.mean(),
         }
 

@@ -24,8 +24,14 @@ from ..datasets.shapes import CUBE, HALF_SIDE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
 from ..files.ranges import Count, Depth, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ..geometry import Similarity
+from ..method import seeded
 
 Tally = Annotated[int, between(0, 100_000)]
+
+
+FINAL_SHARE = 1 / 16  # share of both learning rates at the end of the budget
+FIT_LEARNING_RATE = 5e-3  # Adam's learning rate of a new code
+FIT_WEIGHT = 1e-4  # weight of the new code's squared length, eq. 10
 
 
 @dataclass(frozen=True)
@@ -48,11 +54,8 @@ class Config:
     points_per_shape: Annotated[int, between(1, 1 << 20)] = 16_384  # points of each shape in a step
     learning_rate: LearningRate = 5e-4  # Adam's learning rate of the network at first
     code_learning_rate: LearningRate = 1e-3  # Adam's learning rate of the codes at first
-    final_share: Share = 1 / 16  # share of both rates at the end of the budget, reached exponentially
     # Finding the code of a new shape.
     code_steps: Tally = 800  # steps that fit the code of a new shape, section 6.2; more take longer
-    fit_learning_rate: LearningRate = 5e-3  # Adam's learning rate of that fit
-    fit_weight: NonNegative = 1e-4  # weight of the new code's squared length, eq. 10; higher: closer to the average
     offset: Positive = 0.01  # scene units from a scanned point along its normal, at which the distance is known
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -115,8 +118,7 @@ class DeepSDF(CodedSurface):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.decoder = Decoder(c)
         self.pools = PointPools("deepsdf", c.points, c.seed)
 
@@ -180,7 +182,7 @@ class DeepSDF(CodedSurface):
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c = self.config
         rates = {"": c.learning_rate, "codes": c.code_learning_rate}
-        return {name: falling(rate, c.final_share * rate, progress) for name, rate in rates.items()}
+        return {name: falling(rate, FINAL_SHARE * rate, progress) for name, rate in rates.items()}
 
     # Shapes
 
@@ -221,11 +223,11 @@ class DeepSDF(CodedSurface):
             some = torch.randint(len(points), (count,), generator=generator).to(self.device)
             moved = scale * points[some] + shift
             off = self._error(code.expand(count, -1), moved, scale * distance[some])
-            return off / scale + c.fit_weight * code.square().sum()  # in units of the scan, or it would shrink
+            return off / scale + FIT_WEIGHT * code.square().sum()  # in units of the scan, or it would shrink
 
         with torch.no_grad():
             start = self._start(shape, partial(error, count=256))
-        unknown = fitted(start, error, c.code_steps, c.fit_learning_rate)
+        unknown = fitted(start, error, c.code_steps, FIT_LEARNING_RATE)
         code, place = unknown.split([width, 4])
         scale, shift = placed(place if shape.partial else 0 * place)
         if shape.partial:

@@ -27,7 +27,7 @@ from ..components.training.schedules import held
 from ..datasets.scene import Frame
 from ..datasets.words import Words
 from ..files.ranges import LearningRate, Seed, Width, between
-from ..method import FieldMethod
+from ..method import FieldMethod, seeded
 from ..volume import composite
 
 
@@ -59,8 +59,7 @@ class DreamFields(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = HashField(c.table, c.hidden_width, space, frame.reach)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps, adapts=False)
         self.guidance = Guidance(c.guidance, c.distillation)

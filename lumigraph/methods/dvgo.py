@@ -29,12 +29,16 @@ from ..exchange.packing import Stored, most_important
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
-from ..method import Field, FieldMethod
+from ..method import Field, FieldMethod, seeded
 from ..method.depth import DepthNumbers, depth_terms
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
 Voxels = Annotated[int, between(64, 1 << 30)]
+
+
+TV_DENSITY_WEIGHT = 1e-3  # weight of density's total variation, in the open
+TV_FEATURE_WEIGHT = 1e-4  # weight of features' total variation, in the open
 
 
 @dataclass(frozen=True)
@@ -68,8 +72,6 @@ class Config:
     point_weight: NonNegative = 0.01  # the same in the fine stage; 0: off
     coarse_entropy_weight: NonNegative = 0.01  # weight of the entropy of opacity in the coarse stage, eq. 13; 0: off
     entropy_weight: NonNegative = 0.001  # the same in the fine stage; higher gives harder edges
-    tv_density_weight: NonNegative = 1e-3  # weight of density's total variation, in the open; higher smooths
-    tv_feature_weight: NonNegative = 1e-4  # weight of features' total variation, in the open; higher smooths
     tv_interval: Steps = 8  # steps between these two terms, whose weight is multiplied by it; more are faster
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -166,8 +168,7 @@ class DVGO(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = VoxelField(c, frame, space)
         schedule = GridSchedule(begins=FREE_FROM * c.coarse_share, early_steps=0)
         numbers = c.occupancy, c.proposals, schedule
@@ -215,7 +216,7 @@ class DVGO(FieldMethod):
             terms["entropy"] = weight * opacity_entropy(rendering.opacity)
         if self.sampler.is_open and step % c.tv_interval == 0 and len(look.samples):
             assert isinstance(samples.features, Tensor)
-            weights = {"tv_density": c.tv_density_weight, "tv_feature": c.tv_feature_weight}
+            weights = {"tv_density": TV_DENSITY_WEIGHT, "tv_feature": TV_FEATURE_WEIGHT}
             for grid, (name, weight) in zip(self.network.grids, weights.items(), strict=True):
                 if weight:
                     terms[name] = c.tv_interval * weight * grid.variation(samples.features, MAX_SMOOTHED, generator)

@@ -16,7 +16,7 @@ from ..components.fields.encodings import FourierEncoding
 from ..components.fields.layers import Dense
 from ..datasets.scene import Batch, Frame, Scene
 from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
-from ..method import RayMethod
+from ..method import RayMethod, seeded
 
 Encoding = Literal["none", "basic", "positional", "gaussian"]
 FEW = 16  # inputs to a layer below which it multiplies in float32: in bfloat16 alone they tell no pixel from the next
@@ -53,8 +53,7 @@ class FourierFeatures(RayMethod):
         rows = frequencies(c)
         self.encoding = nn.Identity() if rows is None else FourierEncoding(rows)
         widths = [2 if rows is None else 2 * len(rows), *[c.hidden_width] * (c.layers - 1)]
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             hidden = [Dense(a, b, relu=True, exact=c.exact or a < FEW) for a, b in pairwise(widths)]
             self.layers = nn.Sequential(*hidden, Dense(c.hidden_width, 3, exact=True))
 

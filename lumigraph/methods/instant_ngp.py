@@ -22,7 +22,7 @@ from ..components.training.schedules import held
 from ..datasets.scene import Batch, Frame
 from ..exchange.packing import most_important
 from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
-from ..method import FieldMethod
+from ..method import FieldMethod, seeded
 from ..method.depth import DepthNumbers, depth_terms
 from ..volume import composite
 
@@ -60,8 +60,7 @@ class InstantNGP(FieldMethod):
         space = space_of(frame) if c.contraction else Box(frame.bounds, frame.near)
         self.poses = poses_for(frame, c.poses)
         joining = self.poses.weights if self.poses else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = HashField(c.table, c.hidden_width, space, frame.reach, joining=joining)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         learns_gains = c.exposure_correction != "no"

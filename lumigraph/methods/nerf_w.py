@@ -24,7 +24,7 @@ from ..components.training.photometric import backdrop
 from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
-from ..method import FieldMethod, Pass
+from ..method import FieldMethod, Pass, seeded
 from ..method.controls import Control
 from ..method.field import Densities, Points
 from ..volume import composite
@@ -158,8 +158,7 @@ class NeRFW(FieldMethod):
         super().__init__(frame, c)
         space, code, hidden = space_of(frame), c.appearance_code, [c.transient_width] * c.transient_layers
         self.sky = None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = EncodedHashField(c.table, c.hidden_width, space, frame.reach, code)
                 self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
@@ -176,7 +175,6 @@ class NeRFW(FieldMethod):
                 self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
         self.appearance = AppearanceCodes(frame.image_count, code)
         self.transient = PhotographCodes(frame.image_count, c.transient_code)
-        self.settling = False  # whether the static scene learns alone
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -208,7 +206,7 @@ class NeRFW(FieldMethod):
             seen = composite(look.samples, look.density, look.rgb, background)
             terms[each.name] = 0.5 * squared(seen.rgb - target).mean()
         look = last.look(self.network, appearance)
-        if self.settling:
+        if self.progress < c.transient_start:  # the static scene learns alone
             seen = composite(look.samples, look.density, look.rgb, background)
             beta = torch.full_like(target[:, 0], c.beta_min)
         else:
@@ -239,10 +237,6 @@ class NeRFW(FieldMethod):
         else:
             own = [torch.optim.Adam([*self.network.parameters(), *others, *codes], rate, eps=1e-7)]
         return [*own, *super().optimizers()]
-
-    def before_step(self, step: int, progress: float) -> None:
-        self.settling = progress < self.config.transient_start
-        super().before_step(step, progress)
 
     # Rendering
 

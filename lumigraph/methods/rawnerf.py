@@ -29,10 +29,12 @@ from ..components.training.schedules import held
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
 from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
-from ..method import FieldMethod
+from ..method import FieldMethod, seeded
 from ..method.controls import Control
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
+
+VARIANCE_WEIGHT = 1e-3  # weight of the variance of weights, supplement
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,6 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     epsilon: Positive = 1e-3  # epsilon of eq. 4; 1 is white in the longest exposure; higher: less weight in the dark
     huber_delta: NonNegative = 0.0  # relative error at which the loss turns from squared to linear; 0: always squared
-    variance_weight: NonNegative = 1e-3  # weight of the variance of weights, supplement; higher: thinner surfaces
     exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2; off: as stated
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher learns faster, and may diverge
@@ -100,8 +101,7 @@ class RawNeRF(FieldMethod):
         space = space_of(frame)
         self.poses = poses_for(frame, c.poses)
         joining = self.poses.weights if self.poses else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = LightField(c.table, c.hidden_width, space, frame.reach, joining=joining)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         photographs = frame.image_count
@@ -220,7 +220,7 @@ class RawNeRF(FieldMethod):
         error = (shown - measured) / (shown.detach() + self.config.epsilon)
         first, second = seen.extra["moments"].unbind(-1)
         variance = (second - first.square() / seen.opacity.clamp_min(1e-3)).mean()
-        return {"relative": self.penalized(error[known]), "variance": self.config.variance_weight * variance, **terms}
+        return {"relative": self.penalized(error[known]), "variance": VARIANCE_WEIGHT * variance, **terms}
 
     def penalized(self, error: Float[Tensor, " value"]) -> Float[Tensor, ""]:
         """The mean square of relative errors; beyond a delta the tangent of the square, so that what is dark by mistake

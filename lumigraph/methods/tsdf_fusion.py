@@ -20,7 +20,7 @@ from ..datasets.scene import Frame, Photograph, Scene
 from ..depth_maps import DepthMap, VoxelBlocks, render_depth_maps, sensor_faults, trust_of
 from ..depth_maps.voxel_blocks import BYTES_PER_BLOCK
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import Count, NonNegative, Pixels, Positive, Seed, between
+from ..files.ranges import NonNegative, Positive, Seed, between
 from ..method import Descend, RayMethod
 from ..system.memory import free_memory
 
@@ -28,6 +28,8 @@ Length = Annotated[float, between(0, 1e6)]  # of the capture's frame
 AUTOMATIC_CELLS = 256  # voxels along the longest side of the box of interest, where no size is given
 MEMORY_SHARE = 0.5  # of the free memory that blocks may fill: growing copies them once
 PRUNE_EVERY = 32  # depth maps between two searches for blocks that show no surface
+TEACHER_VIEWS = 100  # depth maps of a method that is converted, at most
+TEACHER_SIZE = 640  # pixels of their longer side
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,6 @@ class Config:
     max_depth: Length = 4.0  # in units of the capture, beyond which depth is left out; 0: none
     trusted_depth: Length = 0.0  # in units of the capture, up to which depth counts in full; 0: everywhere
     min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
-    teacher_views: Count = 100  # depth maps of a method that is converted, at most
-    teacher_size: Pixels = 640  # longer side of those
     seed: Seed = 0
 
 
@@ -140,9 +140,8 @@ class TSDFFusion(RayMethod):
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Fuse the depth that a teacher renders."""
-        c = self.config
-        views, size = c.teacher_views, c.teacher_size
-        for seen in render_depth_maps(teacher.render, cameras, self.frame.background, views, size):
+        background = self.frame.background
+        for seen in render_depth_maps(teacher.render, cameras, background, TEACHER_VIEWS, TEACHER_SIZE):
             self._fuse(seen)
         self.count.copy_(self.fused)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+import sys
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -106,7 +107,20 @@ class Settings:
     def method_config(self, kind: type[Method], file: Path) -> Any:
         """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
         its range"""
-        return typed(kind.Config, self.config, file, closed=True)
+        return typed(kind.Config, without_constants(self.config, kind.Config), file, closed=True)
+
+
+def without_constants(said: Any, kind: Any) -> Any:
+    """JSON of a Config without options of older versions that are constants now. The constant has the option's name in
+    capitals, in the module of the dataclass. An option of another value stays, and is refused as unknown."""
+    if not (isinstance(said, dict) and is_dataclass(kind)):
+        return said
+    known, module = hints(kind), vars(sys.modules[kind.__module__])  # type: ignore[arg-type]
+    return {
+        name: without_constants(value, known.get(name))
+        for name, value in said.items()
+        if name in known or module.get(name.upper(), MISSING) != value
+    }
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:

@@ -19,6 +19,7 @@ from ..components.guidance.clip_files import HEAD_WIDTH
 from ..components.guidance.tokenizer import Tokenizer
 from ..components.guidance.views import backgrounds
 from ..files.ranges import BatchSize, Count, LearningRate, NonNegative, Seed, Share, Steps, Width
+from ..method import seeded
 from ..synthetic import captions
 from ..system.progress import track
 
@@ -65,8 +66,7 @@ def new_model(n: CaptionNumbers) -> tuple[Clip, Tokenizer]:
     vision = ResnetSizes(n.width, (1, 1, 1, 1), max(1, 8 * EXPANSION * n.width // HEAD_WIDTH))
     text = TransformerSizes(TEXT_WIDTH, TEXT_LAYERS, 2, 4 * TEXT_WIDTH)
     sizes = ClipSizes(vision, text, PIXELS, len(tokenizer.vocabulary), CONTEXT, n.embedding)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(n.seed)
+    with seeded(n.seed):
         network = Clip(sizes)
     return network, tokenizer
 
@@ -82,8 +82,7 @@ def learn_captions(n: CaptionNumbers) -> Learned:
     traced = torch.from_numpy(captions.pictures(groups, TRACED_PIXELS, n.seed))
     network, tokenizer = new_model(n)
     network.visual.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(n.seed)
+    with seeded(n.seed):
         head = nn.Linear(n.embedding, len(captions.THINGS))
     distinct = {frozenset(group): group for group in groups}
     numbers = {things: i for i, things in enumerate(distinct)}

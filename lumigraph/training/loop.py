@@ -189,6 +189,7 @@ def advance(
 
     progress: share of the budget that is spent; thorough, refuse: see `Descent`
     """
+    method.progress = progress
     set_learning_rate(optimizers, method.learning_rates(step, progress))
     with span("before step"):
         method.before_step(step, progress)

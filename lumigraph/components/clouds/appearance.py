@@ -16,7 +16,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning
-from ...files.ranges import LearningRate, NonNegative
+from ...files.ranges import LearningRate
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
 from ...method.controls import Control
@@ -30,6 +30,8 @@ from .interval_schedule import short_schedule_lr_scale
 MIN_SPREAD = 0.66  # stops between neighbouring photographs, beyond which each has an appearance
 FULL_SCHEDULE_PASSES = 400  # steps for each photograph, from which on the learning rate is not scaled
 MAX_LR_SCALE = 6.0  # of the learning rate, in short runs
+FINAL_APPEARANCE_LR = 5e-4  # learning rate of appearance codes at the end of the budget
+APPEARANCE_REGULARIZATION = 1e-3  # weight of squares of appearance codes in the loss
 
 
 @dataclass(frozen=True)
@@ -39,8 +41,6 @@ class AppearanceNumbers:
     appearance: Literal["auto", "yes", "no"] = "auto"  # colours for each photograph; auto: where photographs differ
     own_skies: bool = True  # with appearance, learn a sky for each photograph of an open capture
     appearance_lr: LearningRate = 5e-3  # learning rate of these colours and skies at first
-    final_appearance_lr: LearningRate = 5e-4  # learning rate of these at the end of the budget
-    appearance_regularization: NonNegative = 1e-3  # weight of their squares in the loss; higher: closer to one light
 
 
 class SplatAppearance(Addition):
@@ -90,8 +90,7 @@ class SplatAppearance(Addition):
         if self.has_sky:
             step.background = sky(code[COLOUR_NUMBERS:], step.photograph.camera)
             step.terms["sky"] = sky_loss(step.background, step.photograph, opacity)
-        weight = self.numbers.appearance_regularization
-        step.terms["appearance"] = weight * code[:COLOUR_NUMBERS].square().sum()
+        step.terms["appearance"] = APPEARANCE_REGULARIZATION * code[:COLOUR_NUMBERS].square().sum()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         """One row a step has a gradient, as with Gaussians."""
@@ -99,7 +98,7 @@ class SplatAppearance(Addition):
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         full_schedule = FULL_SCHEDULE_PASSES * len(self.codes.codes)
-        rate = falling(self.numbers.appearance_lr, self.numbers.final_appearance_lr, progress)
+        rate = falling(self.numbers.appearance_lr, FINAL_APPEARANCE_LR, progress)
         return {"appearance": short_schedule_lr_scale(step, progress, full_schedule, MAX_LR_SCALE) * rate}
 
     # Rendering

@@ -51,7 +51,6 @@ class CloudMethod(Method, ABC):
     `initialization`, `initial_gaussians`, `half_resolution_until`, `transmittance_threshold` and `seed`, and the parts'
     `rates`, `refine` and `photographs`.
     cameras:  of the photographs that are learnt from; None before training
-    progress: share of the budget spent
     bands:    of the harmonics in use
     current:  the step between `loss` and `after_step`
     drawn:    number of photographs that were learnt from
@@ -69,7 +68,7 @@ class CloudMethod(Method, ABC):
         self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
         self.register_buffer("drawn", torch.tensor(0))
         self.cameras: Camera | None = None
-        self.progress, self.bands = 1.0, c.sh_degree + 1
+        self.bands = c.sh_degree + 1
         self.current: Step | None = None
 
     @property
@@ -127,7 +126,7 @@ class CloudMethod(Method, ABC):
     def before_step(self, step: int, progress: float) -> None:
         """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
         super().before_step(step, progress)
-        c, self.progress = self.config, progress
+        c = self.config
         joined = intervals(step, progress, c.sh_degree_interval, c.sh_degree_interval_share)
         coarse = self.moves_cameras and progress < COARSE_UNTIL
         plain = coarse or any(part.base_colours for part in self.additions)

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 import torch
@@ -51,19 +50,6 @@ def lazy_adam(parameters: Iterable[nn.Parameter], rate: float, interval: int, **
     """
     c = interval / (interval + 1)
     return torch.optim.Adam(list(parameters), rate * c, betas=(0.0, 0.99**c), eps=1e-8, **options)
-
-
-@contextlib.contextmanager
-def held(network: nn.Module) -> Iterator[None]:
-    """A network through which gradients flow, and which gets none itself."""
-    learning = [p for p in network.parameters() if p.requires_grad]
-    for p in learning:
-        p.requires_grad_(False)
-    try:
-        yield
-    finally:
-        for p in learning:
-            p.requires_grad_(True)
 
 
 @torch.no_grad()

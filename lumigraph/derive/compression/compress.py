@@ -166,8 +166,8 @@ class Ladder:
             rung = replace(rung, recipe=replace(rung.recipe, codebook=self.aim.codebook))
         method = self.run.method(self.device)
         if self.run.settings.budget:
-            spent = Budget.from_json(self.run.settings.budget).progress(step, self.run.state.seconds)
-            method.before_step(step, spent)  # how finely it looks, at this share of its training
+            method.progress = Budget.from_json(self.run.settings.budget).progress(step, self.run.state.seconds)
+            method.before_step(step, method.progress)  # how finely it looks, at this share of its training
             self.run.restore_weights(method)
         return Model(method, self.importance, rung, step)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
@@ -23,15 +23,17 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers
 from ...datasets.scene import Frame, Photograph, Scene
-from ...files.ranges import CloudSize, NonNegative, PositiveShare, Seed, Share, Steps, between
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
+from ...method import seeded
 from ...method.controls import Control
 from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
 
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
+ISOTROPY_WEIGHT = 0.01  # weight of long Gaussians, which tear at joints
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,6 @@ class Config:
     initial_gaussians: CloudSize = 10_000  # random Gaussians about the bones at first
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
-    isotropy_weight: NonNegative = 0.01  # weight of long Gaussians, which tear at joints; higher: rounder
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
     bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
@@ -68,8 +69,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         super().__init__(frame, c)
         self.poses = None
         self.density_control = AdaptiveDensity(c.refine, c.adaptive, len(self.cloud))
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.skin = SkinnedCloud(frame, c.bones, c.weights)
         self.bones = self.skin.bones
         self.tidying = Tidying(c.tidying)
@@ -77,17 +77,18 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud without view dependence, a coarser volume, and higher rates for few steps."""
-        c = Config(sh_degree=0, initial_gaussians=6000, half_resolution_until=0.3)
-        c = replace(c, refine=RefineNumbers(30_000, cap_ramp=True), rates=RateNumbers(most_haste=4.0))
-        return replace(c, weights=replace(c.weights, weight_cells=24), bones=replace(c.bones, pose_smoothing=True))
+        c = Config(sh_degree=0, initial_gaussians=6000, refine=RefineNumbers(30_000, cap_ramp=True))
+        return changed(c, half_resolution_until=0.3, most_haste=4.0, weight_cells=24, pose_smoothing=True)
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians on bones, refined within some twenty quick steps."""
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
-        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
-        c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, refine=refine, adaptive=adaptive)
-        return replace(c, weights=WeightNumbers(8, 0, 1e-2, 0.5), bones=BoneNumbers("table", pose_lr=1e-3))
+        return changed(
+            Config(refine=refine), sh_degree=1, sh_degree_interval=4, initial_gaussians=200,
+            densify_grad_threshold=1e-6, opacity_reset_interval=5, weight_cells=8, weight_code=0, weights_lr=1e-2,
+            bone_radius=0.5, pose_correction="table", pose_lr=1e-3, pose_from=0.0,
+        )  # fmt: skip
 
     def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
         """Round Gaussians about the bones at rest, in random colours."""
@@ -98,10 +99,8 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         """The cloud's terms, and the isotropy of its Gaussians: the mean excess of their ratios of deviations."""
         terms = super().loss(batch, step)
-        if self.config.isotropy_weight:
-            ratio = (self.cloud.log_scales.amax(-1) - self.cloud.log_scales.amin(-1)).exp()
-            terms["isotropy"] = self.config.isotropy_weight * (ratio - MAX_RATIO).clamp_min(0).mean()
-        return terms
+        ratio = (self.cloud.log_scales.amax(-1) - self.cloud.log_scales.amin(-1)).exp()
+        return terms | {"isotropy": ISOTROPY_WEIGHT * (ratio - MAX_RATIO).clamp_min(0).mean()}
 
     @property
     def controls(self) -> tuple[Control, ...]:

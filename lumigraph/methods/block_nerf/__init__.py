@@ -25,7 +25,7 @@ from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import RISE, held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, between
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.field import Directions, Points
 from ...volume import composite
 from .parts import Exposures, Moving, Visibility
@@ -82,7 +82,7 @@ class BlockNeRF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space, photographs, self.sky = space_of(frame), frame.image_count, None
-        self.poses, self._progress = poses_for(frame, c.poses), 0.0
+        self.poses = poses_for(frame, c.poses)
         # Exposures come first: the appearance of a photograph is found in its exposure.
         self.exposures = Exposures(photographs, c.exposure_frequencies) if c.exposure else None
         evidence = Photograph, Patches, Appearance
@@ -91,8 +91,7 @@ class BlockNeRF(FieldMethod):
         self.moving = Moving(photographs) if c.residual_masks else None
         code = (c.appearance_code if c.appearance else 0) + (self.exposures.width if self.exposures else 0)
         joining = self.poses.weights if self.poses else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = HashField(c.table, c.hidden_width, space, frame.reach, code, joining)
                 self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
@@ -110,12 +109,11 @@ class BlockNeRF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64)
-        c = replace(
-            c, rays=RayNumbers(128, 128), head_layers=1, head_width=16, pose_penalty=0.0, final_pose_penalty=0.0
-        )
-        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE)
-        return replace(c, decay_start=0.3, huber_delta=0.3)
+        return Config(
+            **CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64,
+            rays=RayNumbers(128, 128), head_layers=1, head_width=16, pose_penalty=0.0, final_pose_penalty=0.0,
+            learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE, decay_start=0.3, huber_delta=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
@@ -148,7 +146,7 @@ class BlockNeRF(FieldMethod):
                 terms[each.name] = weight * (counted * huber(residual, c.huber_delta, "none").mean(-1)).mean()
         if self.sight:
             terms["visibility"] = self.sight.error(rays, look.samples, look.density.detach(), generator)
-        if self.poses and (weight := c.pose_penalty + self._progress * (c.final_pose_penalty - c.pose_penalty)):
+        if self.poses and (weight := c.pose_penalty + self.progress * (c.final_pose_penalty - c.pose_penalty)):
             terms["poses"] = weight * self.poses.moves[rays.image_index].square().sum(-1).mean()
         if self.moving:
             self.moving.note(rays.image_index, batch.extra["place"], residual.detach().abs().mean(-1))
@@ -172,10 +170,6 @@ class BlockNeRF(FieldMethod):
         else:
             own = [torch.optim.Adam([*self.network.parameters(), *codes], rate)]
         return [*own, *super().optimizers()]
-
-    def before_step(self, step: int, progress: float) -> None:
-        self._progress = progress
-        super().before_step(step, progress)
 
     def codes(self, image: Int[Tensor, " ray"]) -> Float[Tensor, "ray code"]:
         """The code of each ray's photograph: appearance, then exposure."""

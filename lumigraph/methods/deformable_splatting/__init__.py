@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,11 +21,12 @@ from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
 from ...geometry import to_matrix
+from ...method import seeded
 from ...method.controls import Control, moment
 from .planes import MotionNumbers, PlaneMotion
 
@@ -66,28 +67,30 @@ class DeformableSplatting(CloudMethod):
         count = len(self.cloud)
         self.poses = None
         self.density_control = AdaptiveDensity(c.refine, c.adaptive, count)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.motion = PlaneMotion(frame, c.motion, count)  # it follows what density control does to the cloud
         self.tidying = Tidying(c.tidying)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense, carried by nodes, coarser planes, and higher rates for few steps."""
-        motion = MotionNumbers(plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, still_until=0.08)
-        motion = replace(motion, planes_lr=4e-3, motion_lr=1e-3, final_rate=0.1)
-        c = Config(initialization="dense", initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, motion=motion)
-        c = replace(c, refine=RefineNumbers(40_000, cap_ramp=True), tidying=ALL_RULES)
-        return replace(c, rates=RateNumbers(most_haste=4.0), half_resolution_until=0.4)
+        c = Config(initialization="dense", refine=RefineNumbers(40_000, cap_ramp=True), tidying=ALL_RULES)
+        return changed(
+            c, initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, most_haste=4.0, half_resolution_until=0.4,
+            plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, still_until=0.08, planes_lr=4e-3,
+            motion_lr=1e-3, final_rate=0.1,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that move, are refined and told apart within some twenty quick steps."""
-        motion = MotionNumbers(4, 4, 1, 4, 8, nodes=20, all_moments_from=0.3, still_until=0.0, told_apart=0.6)
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
-        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5)
-        c = Config(sh_degree=1, sh_degree_interval=4, initial_gaussians=200, ssim_weight=0.2, motion=motion)
-        return replace(c, refine=refine, adaptive=adaptive, tidying=ALL_RULES)
+        return changed(
+            Config(refine=refine, tidying=ALL_RULES), sh_degree=1, sh_degree_interval=4, initial_gaussians=200,
+            ssim_weight=0.2, densify_grad_threshold=1e-6, opacity_reset_interval=5,
+            plane_resolution=4, plane_moments=4, plane_scales=1, plane_features=4, motion_width=8, nodes=20,
+            all_moments_from=0.3, still_until=0.0, told_apart=0.6,
+        )  # fmt: skip
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
         """Photographs around the middle moment at first, and more and more of the others (`all_moments_from`)."""

@@ -31,6 +31,10 @@ MIN_DISTANCE = 1e-6  # between neighbours, scene units
 Moments = Float[Tensor, " gaussian"] | float
 
 
+STILL_OFFSET = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
+RIGID_SAMPLES = 1024  # Gaussians of a step whose neighbours are compared
+
+
 @dataclass(frozen=True)
 class MotionNumbers:
     """A Config's numbers of the motion; those of the authors' release (Wu 2024)."""
@@ -45,12 +49,10 @@ class MotionNumbers:
     still_until: Share = 3000 / 23_000  # share of the budget in which nothing moves, 3000 steps; later: a better start
     all_moments_from: Share = 0.0  # share of the budget until which moments join, from the middle one on
     told_apart: Share = 0.4  # share of the budget from which Gaussians that hardly move stand still; 1: never
-    still_offset: PositiveShare = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
     plane_smoothness: NonNegative = 1e-4  # weight of total variation of planes in space
     time_smoothness: NonNegative = 0.01  # weight of second differences of planes along time; higher: calmer motion
     time_sparsity: NonNegative = 1e-4  # weight of the planes' distance from no motion; higher: more stands still
     rigidity: NonNegative = 0.01  # weight of distances to neighbours that change; higher: stiffer bodies
-    rigid_samples: Annotated[int, between(1, 1 << 20)] = 1024  # Gaussians of a step whose neighbours are compared
     planes_lr: LearningRate = 1.6e-3  # learning rate of the planes at first, times the extent of the cameras
     motion_lr: LearningRate = 1.6e-4  # learning rate of the network at first, likewise
     final_rate: PositiveShare = 0.01  # share of these rates at the end of the budget
@@ -155,7 +157,6 @@ class PlaneMotion(Addition):
         self.register_buffer("shares", torch.zeros(count, CARRIERS))
         self.register_buffer("active", torch.tensor(False))
         self.register_buffer("extent", torch.tensor(1.0))
-        self.progress = 0.0
 
     # The cloud at a moment
 
@@ -216,15 +217,15 @@ class PlaneMotion(Addition):
         self.follow_cloud(method.cloud.means.detach())
 
     @torch.no_grad()
-    def follow_cloud(self, means: Float[Tensor, "gaussian 3"]) -> None:
-        """Tell static Gaussians from moving ones, and find neighbours of these."""
+    def follow_cloud(self, means: Float[Tensor, "gaussian 3"], apart: bool = False) -> None:
+        """Find neighbours of moving Gaussians. apart: tell static ones from them, by their offsets; else all move"""
         count, device = len(means), means.device
         self.moves = torch.ones(count, dtype=torch.bool, device=device)
-        if self.active and self.progress >= self.numbers.told_apart:
+        if apart:
             first, last = self.times or (0.0, 1.0)
             moments = torch.linspace(first, last, PROBED_MOMENTS).tolist()
             farthest = torch.stack([self.offsets(means, t)[0].norm(dim=-1) for t in moments]).amax(0)
-            self.moves = farthest > self.numbers.still_offset * self.diagonal
+            self.moves = farthest > STILL_OFFSET * self.diagonal
         self.neighbours = torch.arange(count, device=device)[:, None].repeat(1, NEIGHBOURS)
         rows = self.moves.nonzero()[:, 0]
         self.carriers, self.shares = (x.new_zeros(count, CARRIERS) for x in (self.neighbours, means))
@@ -263,7 +264,6 @@ class PlaneMotion(Addition):
         self.carriers, self.shares = self.carriers[kept], self.shares[kept]
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
-        self.progress = progress
         self.active.fill_(progress >= self.numbers.still_until)
 
     def before_raster(self, method: Any, step: Step) -> None:
@@ -289,7 +289,7 @@ class PlaneMotion(Addition):
             rows, places = self.moves.nonzero()[:, 0], cloud.means.detach()
             if not len(rows):
                 return cloud.means.sum() * 0
-            drawn = rows[torch.randint(len(rows), (self.numbers.rigid_samples,), generator=chance).to(rows.device)]
+            drawn = rows[torch.randint(len(rows), (RIGID_SAMPLES,), generator=chance).to(rows.device)]
             links = self.neighbours[drawn]
         both = torch.cat([drawn[:, None], links], 1)
         used, both = both.unique(return_inverse=True)
@@ -303,7 +303,8 @@ class PlaneMotion(Addition):
 
     def after_step(self, method: Any, step: int) -> None:
         if method.current.due or len(self.moves) != len(method.cloud):
-            self.follow_cloud(method.cloud.means.detach())
+            apart = bool(self.active) and method.progress >= self.numbers.told_apart
+            self.follow_cloud(method.cloud.means.detach(), apart)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         n = self.numbers

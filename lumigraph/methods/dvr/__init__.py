@@ -35,6 +35,7 @@ from ...files.ranges import (
     Width,
     between,
 )
+from ...method import seeded
 from .fields import LOGIT_SCALE, OccupancyField, TableField
 
 MarchSteps = Annotated[int, between(4, 4096)]
@@ -96,8 +97,7 @@ class DVR(SurfaceMethod):
         super().__init__(frame, c)
         hashed = c.field == "hash"
         self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine and hashed else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             joining = self.bands.weights if self.bands else None
             self.network = (
                 TableField(c.table, c.hidden_width, joining) if hashed else OccupancyField(c.hidden_width, c.blocks)

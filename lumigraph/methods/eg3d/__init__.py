@@ -27,7 +27,6 @@ from ...components.training.adversarial import (
     discriminator_loss,
     follow,
     generator_loss,
-    held,
     lazy_adam,
     r1_penalty,
     widths_of,
@@ -36,7 +35,7 @@ from ...datasets.collection import Collection
 from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import Count, Layers, LearningRate, NonNegative, Positive, RaySamples, Seed, Share, Width, between
-from ...method import Descend, Method
+from ...method import Descend, Method, frozen, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...system.work import at_work
@@ -175,8 +174,7 @@ class EG3D(Method):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.generator = ObjectGenerator(c)
             channels = 6 if self.generator.upscaling else 3
             widths = widths_of(c.picture_size, c.channel_base, c.channel_most)
@@ -191,13 +189,13 @@ class EG3D(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """The same design for pictures of 64 pixels."""
-        c = Config(picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2)
-        c = replace(c, super_widths=(32, 16), plane_size=64, plane_channels=16, features=8, decoder_width=32)
-        c = replace(c, film_width=64, film_layers=4, coarse_samples=8, fine_samples=6)
-        c = replace(c, density_scale=10.0, density_shift=-3.0, code=64, style=128)
-        c = replace(c, channel_base=1024, channel_most=128, pictures_per_step=4, r1_weight=2.0)
-        c = replace(c, swap_pictures=10_000, blur_deviation=1.0, blur_pictures=2000, average_pictures=1000)
-        return replace(c, code_steps=150, tune_steps=150)
+        return Config(
+            picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2, super_widths=(32, 16),
+            plane_size=64, plane_channels=16, features=8, decoder_width=32, film_width=64, film_layers=4,
+            coarse_samples=8, fine_samples=6, density_scale=10.0, density_shift=-3.0, code=64, style=128,
+            channel_base=1024, channel_most=128, pictures_per_step=4, r1_weight=2.0, swap_pictures=10_000,
+            blur_deviation=1.0, blur_pictures=2000, average_pictures=1000, code_steps=150, tune_steps=150,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
@@ -261,7 +259,7 @@ class EG3D(Method):
         descend(terms, [discriminators])
         self.figures = {name: float(value.detach()) for name, value in terms.items()}
 
-        with held(self.discriminator):
+        with frozen(self.discriminator):
             terms = {"generator": generator_loss(self.discriminator(fake, views))}
         if step % c.density_interval == 0 and c.density_weight > 0:
             terms["density"] = c.density_interval * c.density_weight * self._roughness(made, random)

@@ -19,12 +19,12 @@ from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering, Samples
 from ...components.fields.kept_photographs import Kept
-from ...components.training.adversarial import discriminator_loss, generator_loss, held
+from ...components.training.adversarial import discriminator_loss, generator_loss
 from ...components.training.row_optimizers import exchange
 from ...datasets.scene import Frame
 from ...datasets.world import LABELS, BlockWorld
 from ...files.ranges import Count, LearningRate, NonNegative, Octaves, Positive, Seed, Share, Width, between
-from ...method import Method
+from ...method import Method, frozen, seeded
 from ...method.controls import Control, blend
 from ...readers.single_image import photograph
 from ...system.progress import track
@@ -122,8 +122,7 @@ class GANcraft(Method):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.encoder = StyleEncoder(c.encoder_size, c.encoder_width, c.code)
             self.style = StyleNetwork(c.code, c.style, c.style_layers)
             shape = c.hidden_width, c.style, c.output_features
@@ -139,7 +138,6 @@ class GANcraft(Method):
         self.register_buffer("blocks_from_scene", torch.eye(4, dtype=torch.float64))
         self.register_buffer("styles", torch.zeros(len(STYLES), c.code))
         self._optimizers: list[torch.optim.Optimizer] = []
-        self._progress = 0.0
         self._world: BlockGrid | None = None
 
     @classmethod
@@ -274,10 +272,6 @@ class GANcraft(Method):
 
     # Learning
 
-    def before_step(self, step: int, progress: float) -> None:
-        super().before_step(step, progress)
-        self._progress = progress
-
     def batch(self, data: BlockWorld, generator: torch.Generator) -> WorldLesson:
         c = self.config
         there = data.splits["train"]
@@ -297,7 +291,7 @@ class GANcraft(Method):
         return WorldLesson(rays.to(device), labels[None].to(device), rgb.to(device), ground.to(device), styles)
 
     def step(self, batch: WorldLesson, step: int, descend: Any) -> dict[str, Tensor]:
-        generator, painting = self.random(step), self._progress <= self.config.painter_share
+        generator, painting = self.random(step), self.progress <= self.config.painter_share
         terms = self._step_of_painter(batch, generator, descend) if painting else {}
         if painting and step % self.config.field_interval:
             return terms
@@ -312,7 +306,7 @@ class GANcraft(Method):
         adversary.iterate()
         for_real, for_fake = adversary(torch.cat([real, fake.detach()]), labels.repeat(2, 1, 1, 1)).split(count)
         descend({"painter_adversary": discriminator_loss(for_real, for_fake)}, [self._optimizers[3]])
-        with held(adversary):
+        with frozen(adversary):
             of_fake, of_real = halves(adversary.features(torch.cat([fake, real])), count)
             terms = {
                 "painter_gan": generator_loss(adversary.logits(of_fake, labels)),
@@ -343,7 +337,7 @@ class GANcraft(Method):
         against = against + c.pseudo_gan_weight * discriminator_loss(for_pseudo, for_fake)
         descend({"adversary": against}, [self._optimizers[1]])
         error = (fake - pseudo).square().mean()
-        with held(self.adversary), held(self.painter_adversary):
+        with frozen(self.adversary, self.painter_adversary):
             like = perceptual(*halves(self.painter_adversary.features(torch.cat([fake, pseudo])), 1))
             terms = {
                 "gan": (c.gan_weight + c.pseudo_gan_weight) * generator_loss(self.adversary(fake, labels)),

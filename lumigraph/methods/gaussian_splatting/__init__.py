@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from ...camera import Camera
@@ -98,13 +98,13 @@ class GaussianSplatting(CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
-        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7)
         refine = RefineNumbers(500_000, gaussians_per_step=15.0, cap_ramp=True)
         adaptive = AdaptiveNumbers(densify_grad_threshold=1e-4)
-        c = replace(c, refine=refine, adaptive=adaptive, mcmc=McmcNumbers(joining_per_step=120.0))
-        return replace(
-            c, tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"), groups=CPU_GROUPS
-        )
+        return Config(
+            initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7, refine=refine,
+            adaptive=adaptive, mcmc=McmcNumbers(joining_per_step=120.0), tidying=ALL_RULES,
+            rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"), groups=CPU_GROUPS,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

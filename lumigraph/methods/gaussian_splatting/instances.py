@@ -18,13 +18,15 @@ from ...components.clouds.addition import Addition, Step
 from ...components.instances import ALONE, check_labels, edit_controls, edit_of, labels_of, layers_of
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored
-from ...files.ranges import LearningRate, NonNegative, Share, Steps, between
+from ...files.ranges import LearningRate, Share, Steps, between
 from ...gaussians import Gaussians, joined
 from ...method.controls import Control
 
 CHANNELS = 4  # numbers that one pass of the rasteriser composites: three colours and a depth
 FIRST_DEVIATION = 0.1  # of the numbers of codes at first
 MIN_SHARE = 0.4  # probability from which on a Gaussian belongs to the instance that it most likely shows
+IDENTITY_WEIGHT = 1.0  # weight of the cross entropy of rendered identities, eq. 4
+NEIGHBOUR_WEIGHT = 2.0  # weight of the neighbours' agreement, eq. 4
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,6 @@ class InstanceNumbers:
     identity_code: Annotated[int, between(4, 64)] = 16  # numbers of an identity code, section 3.2; a multiple of 4
     identity_lr: LearningRate = 2.5e-3  # learning rate of identity codes; the authors' release
     classifier_lr: LearningRate = 5e-4  # learning rate of the classifier; the authors' release
-    identity_weight: NonNegative = 1.0  # weight of the cross entropy of rendered identities, eq. 4
-    neighbour_weight: NonNegative = 2.0  # weight of the neighbours' agreement, eq. 4; 0: off
     neighbours: Annotated[int, between(1, 64)] = 5  # k, nearest Gaussians that should agree, section 3.2
     neighbour_samples: Annotated[int, between(16, 100_000)] = 1000  # m, Gaussians of a step that are compared with them
     identity_interval: Steps = 1  # steps between those that learn identities; more are faster
@@ -125,9 +125,9 @@ class Identities(Addition):
         logits = self.classifier(self.rendered(step))
         target = torch.where(labels >= 0, labels, n.instances)
         if known.any():
-            step.terms["identity"] = n.identity_weight * cross_entropy(logits[known], target[known])
-        if n.neighbour_weight and len(self.codes) > n.neighbours:
-            step.terms["neighbours"] = n.neighbour_weight * self.disagreement(step.chance)
+            step.terms["identity"] = IDENTITY_WEIGHT * cross_entropy(logits[known], target[known])
+        if len(self.codes) > n.neighbours:
+            step.terms["neighbours"] = NEIGHBOUR_WEIGHT * self.disagreement(step.chance)
 
     def rendered(self, step: Step) -> Float[Tensor, "height width code"]:
         """Codes, composited as colours are; gradients reach the codes alone."""

@@ -21,6 +21,8 @@ MAX_NOISE_OPACITY = 0.1  # above it the gate of the noise is below 1e-4
 GROWTH_FACTOR = 1.05  # of the number of Gaussians at each change (section 3.2)
 LAST_RELOCATION = 0.9  # share of the budget after which none is relocated or added, so that those there converge
 MAX_COPIES = 51  # of one Gaussian at a change; more are computed as so many
+OPACITY_REGULARIZATION = 0.01  # weight of the mean opacity, for mcmc (Kheradmand 2024, eq. 11)
+SCALE_REGULARIZATION = 0.01  # weight of the mean scale in extents, for mcmc (eq. 11)
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,6 @@ class McmcNumbers:
     """A Config's numbers of the strategy mcmc."""
 
     joining_per_step: NonNegative = 0.0  # Gaussians that mcmc adds for each step, if 5 % a time would be fewer
-    opacity_regularization: NonNegative = 0.01  # weight of the mean opacity, for mcmc (Kheradmand 2024, eq. 11)
-    scale_regularization: NonNegative = 0.01  # weight of the mean scale in extents, for mcmc (eq. 11)
 
 
 class MarkovChain(DensityControl):
@@ -41,9 +41,9 @@ class MarkovChain(DensityControl):
 
     def regularize(self, method: Any, step: Step) -> None:
         """Regularisers of opacity and scale (eq. 11)."""
-        numbers, whole = self.numbers, step.whole
-        step.terms["opacity"] = numbers.opacity_regularization * whole.opacities.sigmoid().mean()
-        step.terms["scale"] = numbers.scale_regularization / float(method.cloud.extent) * whole.log_scales.exp().mean()
+        whole = step.whole
+        step.terms["opacity"] = OPACITY_REGULARIZATION * whole.opacities.sigmoid().mean()
+        step.terms["scale"] = SCALE_REGULARIZATION / float(method.cloud.extent) * whole.log_scales.exp().mean()
 
     @torch.no_grad()
     def after_step(self, method: Any, step: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -21,9 +21,9 @@ from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
-from ...files.ranges import LearningRate, Seed, Width, between
-from ...method import FieldMethod
-from ...method.field import Densities, Points
+from ...files.ranges import LearningRate, Seed, Width, between, changed
+from ...method import FieldMethod, Pass, seeded
+from ...method.field import Colours, Densities, Directions, Points
 from ...method.sampler import Density
 from ...volume import composite
 from .fields import NonRigidNumbers, NonRigidOffset, PosedField
@@ -60,8 +60,7 @@ class HumanNeRF(Articulated, FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = Box(frame.bounds, frame.near)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.bones = BoneMotion(frame, c.bones)
             canonical: Any
             if c.field == "hash":
@@ -69,49 +68,51 @@ class HumanNeRF(Articulated, FieldMethod):
             else:
                 canonical = CoordinateField(c.network, c.hidden_width, space)
             offset = NonRigidOffset(self.bones.given_angles.shape[1], c.nonrigid)
-            self.network = PosedField(canonical, WeightVolume(frame, c.weights), len(self.bones.skeleton), offset)
+            self.network = PosedField(canonical, WeightVolume(frame, c.weights), offset)
         self.sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps=c.steps)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical field, a learnt volume of weights, a small offset, and higher rates."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
-        c = replace(c, table=replace(c.table, sh_bands=1), decay_start=0.3)
-        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        c = replace(c, bones=BoneNumbers("table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True))
-        c = replace(c, weights=WeightNumbers(24, 0, 1e-2))
-        return replace(c, nonrigid=NonRigidNumbers(2, 32, 1, 4, 0.3, 0.7, 1e-3))
+        return changed(
+            Config(**CPU_HASH), field="hash", hidden_width=32, sh_bands=1, samples_per_step=1 << 13,
+            occupancy_resolution=64, learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+            weight_cells=24, weight_code=0, weights_lr=1e-2,
+            pose_correction="table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True,
+            nonrigid_depth=2, nonrigid_width=32, nonrigid_skip=1, nonrigid_frequencies=4,
+            nonrigid_from=0.3, nonrigid_until=0.7, nonrigid_lr=1e-3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under tiny motions within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
-        c = replace(
-            c, bones=BoneNumbers(pose_lr=1e-3, pose_width=8, pose_depth=1), weights=WeightNumbers(8, 4, 1e-2, 0.2)
-        )
-        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1024))
-        return replace(c, nonrigid=NonRigidNumbers(2, 8, 1, 2, 0.0, 0.5, 1e-3))
+        return changed(
+            Config(**TINY_HASH), field="hash", hidden_width=16, samples_per_step=1024, learning_rate=2e-2,
+            final_learning_rate=1e-3, weight_cells=8, weight_code=4, weights_lr=1e-2, bone_radius=0.2, pose_lr=1e-3,
+            pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2, nonrigid_width=8, nonrigid_skip=1,
+            nonrigid_frequencies=2, nonrigid_from=0.0, nonrigid_until=0.5, nonrigid_lr=1e-3,
+        )  # fmt: skip
 
     # Moments
 
-    def pose(self, times: Float[Tensor, " moment"]) -> None:
-        """Put the field into the poses of moments, under the settings."""
+    def posed(self, times: Float[Tensor, " moment"]) -> PosedField:
+        """The field in the poses of moments, under the settings."""
         turns, places = self.bones.shown(self, times)
-        self.network.pose(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
+        return self.network.posed(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
 
-    def code(self, rays: Rays) -> Float[Tensor, "#ray code"]:
-        """The row of each ray's moment among the poses that the field is put into."""
+    def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Pass]:
         times, rows = self.moments(rays).unique(return_inverse=True)
-        self.pose(times)
-        return rows[:, None].float()
+        return self.sampler.sample(rays, self.posed(times), rows[:, None].float(), generator)
 
-    @property
-    def shown_code(self) -> Float[Tensor, "1 code"]:
-        self.pose(torch.tensor([self.moment_of()], device=self.device))
-        return torch.zeros(1, 1, device=self.device)
+    def shown_field(self) -> PosedField:
+        """The field in the pose of pictures, by the settings."""
+        return self.posed(torch.tensor([self.moment_of()], device=self.device))
+
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
+        return self.shown_field()(points, directions)
 
     def density(self, points: Points) -> Densities:
-        return self.network.density(points, self.shown_code.expand(len(points), -1))
+        return self.shown_field().density(points)
 
     def density_in_training(self, generator: torch.Generator) -> Density:
         """Density of each point at one of some random moments of the capture."""
@@ -119,12 +120,8 @@ class HumanNeRF(Articulated, FieldMethod):
 
         @torch.no_grad()
         def density(points: Points) -> Densities:
-            before = self.network.table, self.network.angles, self.network.weights
-            self.pose(moments.to(self.device))
             rows = torch.randint(len(moments), (len(points), 1), generator=generator).to(self.device).float()
-            found = self.network.density(points, rows)
-            self.network.table, self.network.angles, self.network.weights = before
-            return found
+            return self.posed(moments.to(self.device)).density(points, rows)
 
         return density
 

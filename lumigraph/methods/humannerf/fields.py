@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -70,43 +71,52 @@ class NonRigidOffset(Part):
         return {"nonrigid": self.numbers.nonrigid_lr}
 
 
-class PosedField(Field):
-    """Density and colour of points of a posed body. The code of a point is the row of its moment in `table`.
+@dataclass(frozen=True)
+class BodyPoses:
+    """A body at some moments.
 
-    table:   from posed to rest, of the bones at some moments
-    angles:  Omega, of joints but roots at these moments, radians
+    table:   from posed to rest, of the bones
+    angles:  Omega, of joints but roots, radians
     weights: shares of bones in the volume
+    """
+
+    table: Float[Tensor, "moment bone 3 4"]
+    angles: Float[Tensor, "moment angle"]
+    weights: Tensor
+
+
+class PosedField(Field):
+    """Density and colour of points of a posed body. The code of a point is the row of its moment in `poses`.
+
+    poses: of the body; None for the field that `posed` puts into some
     """
 
     deforms: ClassVar[bool] = True
 
-    def __init__(
-        self, canonical: HashField | CoordinateField, volume: WeightVolume, bones: int, offset: NonRigidOffset
-    ):
+    def __init__(self, canonical: HashField | CoordinateField, volume: WeightVolume, offset: NonRigidOffset):
         super().__init__()
         self.canonical, self.volume, self.offset = canonical, volume, offset
-        self.table = torch.eye(3, 4).expand(1, bones, 3, 4)
-        self.angles = torch.zeros(1, offset.angles)
-        self.weights: Tensor | None = None
+        self.poses: BodyPoses | None = None
 
-    def pose(self, transforms: Float[Tensor, "moment bone 3 4"], angles: Float[Tensor, "moment angle"]) -> None:
-        """Set the moments that codes count. transforms: of bones, from rest to posed"""
-        self.table, self.angles, self.weights = rigid_inverse(transforms), angles, self.volume.weights()
+    def posed(self, transforms: Float[Tensor, "moment bone 3 4"], angles: Float[Tensor, "moment angle"]) -> PosedField:
+        """The same field in poses at moments, which codes count. transforms: of bones, from rest to posed"""
+        field = copy.copy(self)
+        field.poses = BodyPoses(rigid_inverse(transforms), angles, self.volume.weights())
+        return field
 
     def at_rest(self, points: Points, rows: Int[Tensor, " point"]) -> tuple[Points, Float[Tensor, " point"]]:
         """Places of points at rest, and the likelihood f that they are of the body (Weng 2022, eqs. 3 to 5):
 
         x_rest = sum_k w_k(x) (R_k x + t_k) / f(x),  w_k(x) = w_c,k(R_k x + t_k),  f(x) = sum_k w_k(x)
         """
-        if self.weights is None:
-            self.weights = self.volume.weights()
-        if len(self.table) == 1:
-            table = self.table[0]
+        assert self.poses is not None
+        if len(self.poses.table) == 1:
+            table = self.poses.table[0]
             each = torch.einsum("bij,nj->bni", table[:, :, :3], points) + table[:, None, :, 3]
         else:
-            table = self.table[rows]
+            table = self.poses.table[rows]
             each = (torch.einsum("nbij,nj->nbi", table[..., :3], points) + table[..., 3]).transpose(0, 1)
-        weights = self.volume.of_each(each, self.weights)
+        weights = self.volume.of_each(each, self.poses.weights)
         body = weights.sum(0)
         body = body * (body > MIN_BODY)
         return (weights[..., None] * each).sum(0) / body.clamp_min(MIN_BODY)[:, None], body
@@ -114,7 +124,7 @@ class PosedField(Field):
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Any]:
         rows = self._rows(points, code)
         rest, body = self.at_rest(points, rows)
-        density, features = self.canonical.geometry(self.offset(rest, self.angles[rows]))
+        density, features = self.canonical.geometry(self._moved(rest, rows))
         return density * body, features
 
     def density(self, points: Points, code: Codes | None = None) -> Densities:
@@ -128,8 +138,13 @@ class PosedField(Field):
     def _dense(self, points: Points, rows: Int[Tensor, " point"]) -> Densities:
         rest, body = self.at_rest(points, rows)
         inside = body.nonzero()[:, 0]
-        placed = self.offset(rest[inside], self.angles[rows[inside]])
+        placed = self._moved(rest[inside], rows[inside])
         return torch.zeros_like(body).index_copy(0, inside, self.canonical.density(placed) * body[inside])
+
+    def _moved(self, rest: Points, rows: Int[Tensor, " point"]) -> Points:
+        """Canonical places of places at rest: with the non-rigid offset."""
+        assert self.poses is not None
+        return self.offset(rest, self.poses.angles[rows])
 
     def _rows(self, points: Points, code: Codes | None) -> Int[Tensor, " point"]:
         return torch.zeros(len(points), dtype=torch.long, device=points.device) if code is None else code[:, 0].long()

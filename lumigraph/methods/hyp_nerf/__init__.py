@@ -28,7 +28,7 @@ from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
 from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...geometry import look_at, turning
-from ...method import Method, RayMethod
+from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
 from ...readers.up import common_up
@@ -36,6 +36,9 @@ from ...volume import composite
 from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
 
 Tally = Annotated[int, between(0, 100_000)]
+
+
+DENOISE_WEIGHT = 0.5  # weight of denoised renderings beside the photographs, in tuning
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,6 @@ class Config:
     tune_learning_rate: LearningRate = 2e-3  # learning rate of tuning; higher changes the field more
     denoise_views: Tally = 12  # denoised renderings around the object to tune on, section 3.3; 0: none
     denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
-    denoise_weight: NonNegative = 0.5  # weight of denoised renderings beside the photographs, in tuning
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -138,8 +140,7 @@ class HypNeRF(RayMethod):
         c = config or Config()
         super().__init__(frame, c)
         self.shape = HashShape.of(c.table, c.hidden_width)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             sizes = [c.colour_code if colour else c.shape_code for colour in self.shape.of_colour]
             self.hyper = HyperNetwork(sizes, c.hyper_width, c.hyper_layers, self.shape.tensors)
             self.denoiser = PictureDenoiser(c.denoiser_width)
@@ -418,7 +419,7 @@ class HypNeRF(RayMethod):
         for step in range(steps):
             adam.param_groups[0]["lr"] = rate * (1 - step / steps)
             adam.zero_grad()
-            for weight, seen in zip((1.0, self.config.denoise_weight), sources, strict=False):
+            for weight, seen in zip((1.0, DENOISE_WEIGHT), sources, strict=False):
                 terms = self._errors(instance, seen(RAYS_PER_STEP // len(sources), generator), generator)
                 (weight * torch.stack([*terms.values()]).sum()).backward()
             adam.step()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -23,8 +22,8 @@ from ...components.tracking.tracker import Iterations, Tracker, TrackingNumbers
 from ...components.tracking.trajectory import Pose, moved
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ...method import FieldMethod, Pass
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between, changed
+from ...method import FieldMethod, Pass, frozen, seeded
 from ...method.method import Descend
 from ...volume import composite
 from .fields import DistanceTable, MapNetwork
@@ -38,6 +37,7 @@ SURFACE_BAND = 0.7  # truncations from a table's surface within which a point is
 SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness term, and metres between them
 MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
 EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
+TRACKING_RATE = 3e-3  # Adam's rate of a frame's pose, radians and scene units
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,6 @@ class FramePoseNumbers:
 
     tracking_iterations: Iterations = 50  # descents on a frame's pose; more follow faster motion, slower
     tracking_pixels: BatchSize = 200  # pixels of each of these descents, section 3.4
-    tracking_rate: LearningRate = 3e-3  # Adam's rate of a frame's pose, radians and scene units
 
 
 @dataclass(frozen=True)
@@ -114,8 +113,7 @@ class IMap(FieldMethod):
         super().__init__(frame, c)
         self.unit = 1 / frame.to_source.scale  # scene units of a metre
         space, hashed = Box(frame.bounds, frame.near), c.field == "hash"
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if hashed:
                 self.network = DistanceTable(c.table, c.hidden_width, space, c.truncation * self.unit, c.sharpness)
             else:
@@ -129,21 +127,23 @@ class IMap(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
-        table = HashNumbers(8, 2, 16, 16, 512, geometry_features=16, colour_layers=1, sh_bands=1)
-        tracking, descent = TrackingNumbers(first_estimate="surface"), FramePoseNumbers(tracking_iterations=0)
-        mapping = FieldMappingNumbers(5, 200, window=8, pixels_per_frame=128, active_sampling=False)
-        mapping = replace(mapping, keyframe_pose_rate=2e-4)
-        terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-3)
-        c = Config(table, SampleNumbers(16, 10), tracking, descent, mapping, terms, "hash")
-        return replace(c, hidden_width=32, learning_rate=1e-2)
+        return changed(
+            Config(), field="hash", hidden_width=32, learning_rate=1e-2,
+            levels=8, features_per_level=2, log2_hashmap_size=16, max_resolution=512, colour_layers=1, sh_bands=1,
+            coarse_samples=16, fine_samples=10, first_estimate="surface", tracking_iterations=0, mapping_iterations=5,
+            window=8, pixels_per_frame=128, active_sampling=False, keyframe_pose_rate=2e-4,
+            depth_weight=0.1, distance_weight=10.0, free_weight=10.0, smooth_weight=1e-3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny hash table and few descents a frame."""
-        mapping = FieldMappingNumbers(1, 2, window=4, pixels_per_frame=64, keyframe_share=1.0)
-        terms = LossNumbers(5.0, 0.1, 10.0, 10.0, 1e-4)
-        c = Config(replace(TINY_TABLE, sh_bands=1), SampleNumbers(12, 8), mapping=mapping, terms=terms, field="hash")
-        return replace(c, hidden_width=16, truncation=0.2, sharpness=4.0, learning_rate=2e-2)
+        return changed(
+            Config(replace(TINY_TABLE, sh_bands=1)), field="hash", hidden_width=16, truncation=0.2, sharpness=4.0,
+            learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1, first_iterations=2, window=4,
+            pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
+            smooth_weight=1e-4,
+        )  # fmt: skip
 
     # The sequence
 
@@ -218,9 +218,9 @@ class IMap(FieldMethod):
             if self.config.tracking.first_estimate == "surface" and isinstance(self.network, DistanceTable):
                 pose = self.aligned(frame, pose, chance)
             twist = torch.zeros(1, 6, device=self.device, requires_grad=True)
-            optimizer = PoseAdam([twist], t.tracking_rate)
+            optimizer = PoseAdam([twist], TRACKING_RATE)
             for i in range(t.tracking_iterations):
-                optimizer.param_groups[0]["lr"] = t.tracking_rate * (1 - i / t.tracking_iterations)
+                optimizer.param_groups[0]["lr"] = TRACKING_RATE * (1 - i / t.tracking_iterations)
                 pixels = frame.drawn(t.tracking_pixels, chance, measured=True)
                 rays = self.world_rays(frame.rays[pixels], moved(pose[None], twist))
                 terms, _ = self.errors(rays, frame.rgb[pixels], frame.depth[pixels], chance)
@@ -374,19 +374,6 @@ class IMap(FieldMethod):
         if isinstance(self.network, DistanceTable):
             return self.network.optimizers_at(self.config.learning_rate)
         return [torch.optim.Adam(self.network.parameters(), self.config.learning_rate)]
-
-
-@contextlib.contextmanager
-def frozen(field: torch.nn.Module) -> Iterator[None]:
-    """A field whose parameters get no gradient meanwhile."""
-    learnt = [p for p in field.parameters() if p.requires_grad]
-    try:
-        for p in learnt:
-            p.requires_grad_(False)
-        yield
-    finally:
-        for p in learnt:
-            p.requires_grad_(True)
 
 
 def joined_rays(parts: Sequence[Rays]) -> Rays:

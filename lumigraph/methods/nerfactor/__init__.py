@@ -44,13 +44,15 @@ from ...files.ranges import (
 )
 from ...geometry import unit
 from ...light import SUFFIXES, EnvironmentLight, directions, solid_angles
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
 from .properties import HashProperties, NetworkProperties, Properties, Raw, VisibilityNetwork
 from .shading import MIN_ROUGHNESS, LearntReflectance, microfacet, shaded
 from .surface import SurfaceGrid, surface_distance
+
+FINAL_GEOMETRY_RATE = 1e-3  # learning rate of the geometry at its end
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,6 @@ class Config:
     final_learning_rate: LearningRate = 5e-4  # the same at the end, reached exponentially
     light_rate: LearningRate = 1e-3  # learning rate of the light's logarithm
     geometry_rate: LearningRate = 1e-2  # learning rate of the geometry at first; higher: faster, may diverge
-    final_geometry_rate: LearningRate = 1e-3  # learning rate of the geometry at its end
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of the geometry's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # residual of the geometry's loss at which it turns linear; 1: always squared
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -148,8 +149,7 @@ class NeRFactor(FieldMethod):
         super().__init__(frame, c)
         space = space_of(frame)
         code = c.code_width if c.reflectance == "learnt" else 1
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = HashField(c.table, c.hidden_width, space, frame.reach)
             if c.properties == "hash":
                 self.properties = HashProperties(c.table, c.hidden_width, code, space, frame.reach)
@@ -168,7 +168,6 @@ class NeRFactor(FieldMethod):
         self.register_buffer("stage", torch.tensor(0))
         self.register_buffer("began", torch.tensor(-1.0))
         self._told: EnvironmentLight | None = None
-        self._progress = 0.0
         self._choose_learning()
 
     @classmethod
@@ -182,11 +181,11 @@ class NeRFactor(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and a light of few pixels, in all stages within some twenty steps."""
-        c = Config(**TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced")
-        c = replace(
-            c, reflectance="microfacet", geometry_share=0.6, shape_share=0.0, grid_resolution=16, huber_delta=1.0
-        )
-        return replace(c, light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2)
+        return Config(
+            **TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced",
+            reflectance="microfacet", geometry_share=0.6, shape_share=0.0, grid_resolution=16, huber_delta=1.0,
+            light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -299,11 +298,11 @@ class NeRFactor(FieldMethod):
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         """Rays of a step. Geometry is frozen here when its share of the budget is over."""
-        if not self.stage and self._progress >= self.config.geometry_share:
+        if not self.stage and self.progress >= self.config.geometry_share:
             self.grid.fill(self.density, self.random(2))
             self.stage.fill_(1)
             self._choose_learning()
-            self.began.fill_(self._progress)
+            self.began.fill_(self.progress)
             self._begin_light(data)
         if not self.stage:
             return data.sample_rays(self.sampler.batch_size, generator).to(self.device)
@@ -351,7 +350,7 @@ class NeRFactor(FieldMethod):
             beside = self.lights_seen(jittered, self.pixels[0])
             terms["visibility"] = c.visibility_weight * mean((seen.visibility - traced).square())
             terms["visibility_smoothness"] = c.visibility_smoothness * mean((seen.visibility - beside).abs())
-        if self._over(self._progress) < c.shape_share:
+        if self._over(self.progress) < c.shape_share:
             return terms
         error = mean((tone(seen.radiance) - tone(light)).square())
         self.figures = {"mse": float(error.detach()), "rays": len(batch), "surface_points": len(points)}
@@ -380,7 +379,7 @@ class NeRFactor(FieldMethod):
         c = self.config
         spent = min(progress / max(c.geometry_share, 1e-9), 1.0)
         return {
-            "": held(c.geometry_rate, c.final_geometry_rate, step, spent, DECAY_START),
+            "": held(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
             "properties": falling(c.learning_rate, c.final_learning_rate, self._over(progress)),
             "light": falling(
                 c.light_rate, c.light_rate * c.final_learning_rate / c.learning_rate, self._over(progress)
@@ -388,7 +387,7 @@ class NeRFactor(FieldMethod):
         }
 
     def before_step(self, step: int, progress: float) -> None:
-        self._progress, share = progress, self.config.geometry_share
+        share = self.config.geometry_share
         if not self.stage and progress < share:
             super().before_step(step, progress / share)
 

@@ -22,8 +22,19 @@ from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between
-from ...method import FieldMethod, Pass
+from ...files.ranges import (
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    PositiveShare,
+    Seed,
+    Share,
+    Width,
+    between,
+    changed,
+)
+from ...method import FieldMethod, Pass, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density
 from ...volume import composite, weights_of
@@ -95,8 +106,7 @@ class Nerfies(FieldMethod):
         d, space = c.deformation, space_of(frame)
         shape, ambient = (d.deformation_depth, d.deformation_width, d.deformation_skip), d.slice_dimensions
         first = None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.levels = BandSchedule(c.table_annealing) if c.table_annealing else None
                 hash_of = partial(SlicedHash, c.table, c.hidden_width, space, frame.reach, c.appearance_code)
@@ -115,27 +125,27 @@ class Nerfies(FieldMethod):
         self.network = WarpedField(canonical, motion, slices, c.appearance_code, first)
         self.appearance = AppearanceCodes(frame.image_count, c.appearance_code) if c.appearance_code else None
         self.register_buffer("background_points", torch.zeros(0, 3))
-        self.elastic, self.progress = 0.0, 0.0  # weight of the elastic loss now; share of the budget that is spent
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, appearance_code=0, learning_rate=1e-2)
-        c = replace(c, occupancy=replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64))
-        d = replace(c.deformation, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5)
-        d = replace(d, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True)
-        d = replace(d, deformation_frequencies=4, growth=0.5)
-        c = replace(c, deformation=d, table_annealing=0.5, deformation_rate=0.3)
-        return replace(c, final_learning_rate=1e-3, decay_start=0.3)
+        return changed(
+            Config(**CPU_HASH), field="hash", hidden_width=32, appearance_code=0, samples_per_step=1 << 13,
+            occupancy_resolution=64, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5,
+            elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True,
+            deformation_frequencies=4, growth=0.5, table_annealing=0.5, deformation_rate=0.3,
+            learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under a tiny deformation with a slice, within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, appearance_code=2, learning_rate=2e-2)
-        d = replace(c.deformation, deformation_depth=2, deformation_width=16, deformation_skip=1, moment_code=2)
-        d = replace(d, deformation_frequencies=4, elastic_samples=64, background_points=64)
-        d = replace(d, slice_dimensions=1, slice_width=16)
-        return replace(c, deformation=d, final_learning_rate=1e-3, deformation_rate=0.1)
+        return changed(
+            Config(**TINY_HASH), field="hash", hidden_width=16, appearance_code=2, deformation_depth=2,
+            deformation_width=16, deformation_skip=1, moment_code=2, deformation_frequencies=4, elastic_samples=64,
+            background_points=64, slice_dimensions=1, slice_width=16, learning_rate=2e-2, final_learning_rate=1e-3,
+            deformation_rate=0.1,
+        )  # fmt: skip
 
     # Codes
 
@@ -189,12 +199,12 @@ class Nerfies(FieldMethod):
             data = replace(data, splits={"train": train[time[train] <= until]})
         return super().batch(data, generator)
 
-    def before_step(self, step: int, progress: float) -> None:
-        """The elastic weight is constant, then falls by half a cosine over twice that time (the authors' release)."""
-        d, self.progress = self.config.deformation, progress
-        fallen = min(max(progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
-        self.elastic = d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
-        super().before_step(step, progress)
+    def elastic_weight(self) -> float:
+        """Weight of the elastic loss: constant, then falling by half a cosine over twice that time (the authors'
+        release)."""
+        d = self.config.deformation
+        fallen = min(max(self.progress - d.elastic_until, 0.0) / max(2 * d.elastic_until, 1e-9), 1.0)
+        return d.elastic_weight * 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * fallen))))
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of each pass, elastic loss (eq. 10) and background loss (eq. 12)."""
@@ -208,8 +218,8 @@ class Nerfies(FieldMethod):
             self.figures["mse"] = float(error.detach())  # of the last pass in the end
             terms[each.name] = error
         motion = self.network.motion
-        if motion is not None and self.elastic:
-            terms["elastic"] = self.elastic * self.stretching(motion, batch.rays, passes[-1], code, generator)
+        if motion is not None and (weight := self.elastic_weight()):
+            terms["elastic"] = weight * self.stretching(motion, batch.rays, passes[-1], code, generator)
         if motion is not None and len(self.background_points) and self.config.deformation.background_weight:
             terms["background"] = self.config.deformation.background_weight * self.restlessness(motion, generator)
         return terms

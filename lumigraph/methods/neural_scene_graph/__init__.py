@@ -27,7 +27,7 @@ from ...datasets.scene import Batch, Frame, Scene
 from ...datasets.tracks import BoxTrack, GraphNode, TrackEdit, TrackEdits, nodes_of
 from ...errors import LumigraphError
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
-from ...method import FieldMethod, Pass
+from ...method import FieldMethod, Pass, frozen, seeded
 from ...method.controls import Control, Value, blend, moment
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -92,8 +92,7 @@ class NeuralSceneGraph(FieldMethod):
         self.poses = poses_for(frame, c.poses)
         space = space_of(frame)
         joining = self.poses.weights if self.poses else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = HashField(c.table, c.hidden_width, space, frame.reach, joining=joining)
                 self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
@@ -356,33 +355,27 @@ def found_in(method: NeuralSceneGraph, scene: Scene) -> tuple[tuple[BoxTrack, ..
     student.arrange()
     fresh = torch.tensor([node.name in {track.name for track in new} for node in student.shown_nodes])
     optimizer = torch.optim.Adam([codes], CODE_RATE)
-    chance, held = method.random(7), [p for p in method.parameters() if p.requires_grad]
-    for p in held:
-        p.requires_grad_(False)
-    try:
-        with torch.enable_grad():
-            for _ in range(CODE_STEPS):
-                batch = scene.sample_rays(8 * CODE_RAYS, chance).to(method.device)
-                batch = in_frame(batch, place)
-                meets = student.crossings(batch.rays)
-                rows = meets.ray[fresh.to(meets.node.device)[meets.node]].unique()[:CODE_RAYS]
-                if not len(rows):
-                    continue
-                student.found = (*method.found[0], *new), torch.cat([method.found[1].to(codes.device), codes])
-                rays = batch.rays[rows]
-                with torch.no_grad():
-                    last = student.sampler.sample(rays, student.network, None)[-1]
-                    behind = FieldMethod._look(student, last, rays)
-                look = union([behind, *student.instance_looks(rays, chance)])
-                seen = composite(look.samples, look.density, look.rgb, student.background)
-                target = batch.rgb[rows] if batch.alpha is None else batch.before(student.background)[rows]
-                loss = (seen.rgb - target).square().mean() + method.config.code_weight * codes.square().mean()
-                optimizer.zero_grad()
-                loss.backward()
-                optimizer.step()
-    finally:
-        for p in held:
-            p.requires_grad_(True)
+    chance = method.random(7)
+    with frozen(method), torch.enable_grad():
+        for _ in range(CODE_STEPS):
+            batch = scene.sample_rays(8 * CODE_RAYS, chance).to(method.device)
+            batch = in_frame(batch, place)
+            meets = student.crossings(batch.rays)
+            rows = meets.ray[fresh.to(meets.node.device)[meets.node]].unique()[:CODE_RAYS]
+            if not len(rows):
+                continue
+            student.found = (*method.found[0], *new), torch.cat([method.found[1].to(codes.device), codes])
+            rays = batch.rays[rows]
+            with torch.no_grad():
+                last = student.sampler.sample(rays, student.network, None)[-1]
+                behind = FieldMethod._look(student, last, rays)
+            look = union([behind, *student.instance_looks(rays, chance)])
+            seen = composite(look.samples, look.density, look.rgb, student.background)
+            target = batch.rgb[rows] if batch.alpha is None else batch.before(student.background)[rows]
+            loss = (seen.rgb - target).square().mean() + method.config.code_weight * codes.square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
     return (*method.found[0], *new), torch.cat([method.found[1].to(codes.device), codes]).detach()
 
 

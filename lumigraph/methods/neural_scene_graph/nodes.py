@@ -13,12 +13,14 @@ from torch import Tensor, nn
 from ...camera.rays import Rays, Samples
 from ...components.training.schedules import falling
 from ...datasets.tracks import MAX_TIME_ERROR, BoxTrack, GraphNode
-from ...files.ranges import LearningRate, NonNegative
 from ...geometry import to_matrix
 from ...method import Part
 from ...volume import packed
 
 FALL = 0.1  # of the corrections' learning rate, that is left of it at the end of the budget
+TRACK_LEARNING_RATE = 1e-3  # of the corrections of tracks, in radians and shares of a box's length
+TRACK_PRIOR = 0.01  # weight of corrections squared
+TRACK_SMOOTHNESS = 1.0  # weight of changes of a correction from a moment to the next, squared
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,6 @@ class NodeNumbers:
     """A Config's numbers of the nodes' corrections."""
 
     refine_tracks: bool = False  # learn a small turn and shift of each box at each moment, beside the given ones
-    track_learning_rate: LearningRate = 1e-3  # of the corrections, in radians and shares of a box's length
-    track_prior: NonNegative = 0.01  # weight of corrections squared; higher keeps closer to the given poses
-    track_smoothness: NonNegative = 1.0  # weight of changes of a correction from a moment to the next, squared
 
 
 @dataclass(frozen=True)
@@ -120,20 +119,20 @@ class TrackCorrections(Part):
         """The prior to the given poses, and the smoothness of corrections."""
         if self.twist is None:
             return {}
-        n, change = self.numbers, self.twist.diff(dim=1)
-        prior = n.track_prior * self.twist.square().mean()
-        return {"tracks": prior + n.track_smoothness * change.square().sum() / self.twist.numel()}
+        change = self.twist.diff(dim=1)
+        prior = TRACK_PRIOR * self.twist.square().mean()
+        return {"tracks": prior + TRACK_SMOOTHNESS * change.square().sum() / self.twist.numel()}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         if self.twist is None:
             return []
         group = {"params": [self.twist], "name": "tracks"}
-        return [torch.optim.Adam([group], self.numbers.track_learning_rate)]
+        return [torch.optim.Adam([group], TRACK_LEARNING_RATE)]
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         if self.twist is None:
             return {}
-        return {"tracks": falling(1.0, FALL, progress) * self.numbers.track_learning_rate}
+        return {"tracks": falling(1.0, FALL, progress) * TRACK_LEARNING_RATE}
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,16 @@ from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import BatchSize, LearningRate, NonNegative, RaySamples, Seed, Width, between
-from ...method import RayMethod
+from ...method import RayMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
 from .cameras import Backgrounds, Rig
 from .networks import Decoded, Encoder, VolumeDecoder, divergence, opacity_prior, opacity_roughness
 
 Side = Annotated[int, between(8, 1024)]
+
+
+SHARED_RATE = 25.0  # learning rate of what all moments share, as a multiple of the others'
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,6 @@ class Config:
     opacity_weight: NonNegative = 0.01  # of rays that are neither opaque nor clear, section 5.4
     smooth_weight: NonNegative = 0.01  # of the total variation of log opacity, section 5.4
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher: faster, may diverge
-    shared_rate: NonNegative = 25.0  # learning rate of what all moments share, as a multiple of the others'
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -75,8 +77,7 @@ class NeuralVolumes(RayMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.encoder = Encoder(c.encoder_cameras, c.encoder_size, c.encoder_width, c.code)
             warp = c.affines, c.warp_resolution, c.warp_width
             sides = c.shared_resolution, c.view_dependence
@@ -245,5 +246,5 @@ class NeuralVolumes(RayMethod):
         shared = self.decoder.shared
         groups: list[dict[str, Any]] = [{"params": [p for p in self.parameters() if p is not shared]}]
         if shared is not None:
-            groups.append({"params": [shared], "scale": self.config.shared_rate})
+            groups.append({"params": [shared], "scale": SHARED_RATE})
         return [torch.optim.Adam(groups, self.config.learning_rate, fused=True), *super().optimizers()]

@@ -22,7 +22,7 @@ from ...components.training.schedules import BandSchedule
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
 from .fields import DistanceNumbers, HashDistance, NetworkDistance, NeuSField
@@ -88,8 +88,7 @@ class NeuS(FieldMethod):
         self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine and hashed else None
         slopes = c.cosine_annealing if not frame.has_alpha else 0.0
         self.slopes = BandSchedule(slopes) if slopes else None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if hashed:
                 shape: Any = HashDistance(c.table, c.hidden_width, self.bands.weights if self.bands else None)
                 outside: Any = HashField(c.table, c.hidden_width, around, frame.reach) if around else None

@@ -22,6 +22,7 @@ from ...datasets.shapes import PointBatch, Shapes
 from ...errors import LumigraphError
 from ...files.ranges import LearningRate, NonNegative, Seed, Width, between
 from ...kernels.octree_cells import MAX_LEVELS, Crossed
+from ...method import seeded
 from ...method.controls import Control
 from .loops import trace
 from .octree import CodeOctree
@@ -62,8 +63,7 @@ class NGLOD(SurfaceMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.octree = CodeOctree(1 << c.base_level, c.levels, c.features, c.hidden_width)
         self.levels = c.levels
         self.pools = PointPools("nglod", c.points, c.seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
@@ -19,8 +19,18 @@ from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import BatchSize, LearningRate, NonNegative, PositiveShare, RaySamples, Seed, Width, between
-from ...method import FieldMethod
+from ...files.ranges import (
+    BatchSize,
+    LearningRate,
+    NonNegative,
+    PositiveShare,
+    RaySamples,
+    Seed,
+    Width,
+    between,
+    changed,
+)
+from ...method import FieldMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Densities, Directions, Points
 from ...method.sampler import Density
@@ -98,8 +108,7 @@ class NSFF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = self.space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 static: Any = StaticHash(c.table, c.hidden_width, space, frame.reach)
                 moments = max(frame.train_count or frame.image_count, 2)
@@ -124,17 +133,17 @@ class NSFF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables instead of networks, one neighbour in a step, fewer levels, samples and cells."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, learning_rate=1e-2, final_learning_rate=1e-3)
-        table, steps = replace(c.table, levels=6, max_resolution=192), replace(c.steps, steps_per_diagonal=192)
-        occupancy = replace(c.occupancy, samples_per_step=1 << 13, occupancy_resolution=64)
-        flow = replace(c.flow, both_ways=False, neighbours=1, max_flow=0.3, prior_interval=0.3)
-        return replace(c, table=table, steps=steps, occupancy=occupancy, flow=flow, decay_start=0.3)
+        return changed(
+            Config(**CPU_HASH), field="hash", hidden_width=32, levels=6, max_resolution=192, steps_per_diagonal=192,
+            samples_per_step=1 << 13, occupancy_resolution=64, both_ways=False, neighbours=1, max_flow=0.3,
+            prior_interval=0.3, learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables, within some twenty quick steps."""
         c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
-        return replace(c, flow=replace(c.flow, both_ways=False, max_flow=0.3, prior_interval=0.3))
+        return changed(c, both_ways=False, max_flow=0.3, prior_interval=0.3)
 
     # Codes: a time from 0 to 1, and what is added to the blending weight
 

@@ -31,7 +31,7 @@ from ...composition.composed import kept, union
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
 from ...geometry import Similarity
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...method.controls import Control
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -86,8 +86,7 @@ class ObjectNeRF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = HashField(c.table, c.hidden_width, space, frame.reach)
                 self.branch = ObjectTable(c.table, c.hidden_width, space, frame.reach, c.code)
@@ -100,7 +99,6 @@ class ObjectNeRF(FieldMethod):
                 self.sampler = HierarchicalSampler(space, c.rays)
         self.codes = InstanceCodes(c.instances, c.code)
         self.boxes = InstanceBoxes(c.instances, frame.bounds)
-        self.counting = False
         self._regions: dict[tuple[int, int], Tensor] = {}
 
     @classmethod
@@ -122,10 +120,6 @@ class ObjectNeRF(FieldMethod):
         super().begin(data, seconds)
         self.codes.begin(torch.arange(self.config.instances), CODE_DEVIATION, self.random(1))
 
-    def before_step(self, step: int, progress: float) -> None:
-        super().before_step(step, progress)
-        self.counting = progress >= COUNT_AFTER
-
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(self.sampler.batch_size, generator, layers=layers_of(data)).to(self.device)
 
@@ -140,7 +134,7 @@ class ObjectNeRF(FieldMethod):
             terms[each.name] = huber(seen.rgb - target, c.huber_delta)
         self.figures["mse"] = float((seen.rgb - target).detach().square().mean())
         labels, known = labels_of(batch.extra, batch.alpha, c.instances)
-        if self.counting:
+        if self.progress >= COUNT_AFTER:
             solid = (labels >= 0) & seen.depth.isfinite() & (seen.opacity > 0.5)
             self.boxes.add(batch.rays.at(seen.depth.detach())[solid], labels[solid])
         return terms | self.object_terms(batch.rays, target, labels, known, seen, generator)

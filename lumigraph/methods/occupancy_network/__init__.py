@@ -23,10 +23,15 @@ from ...datasets.scene import Frame, Photograph
 from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
-from ...files.ranges import Count, Layers, LearningRate, NonNegative, Seed, Width, between
+from ...files.ranges import Count, Layers, LearningRate, Seed, Width, between
+from ...method import seeded
 from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
 Input = Literal["points", "voxels", "picture"]
+
+
+FIT_LEARNING_RATE = 0.02  # Adam's learning rate of a new code, in deviations of the learnt codes
+CLOUD_NOISE = 0.01  # deviation of noise of a cloud's points in training, scene units
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,6 @@ class Config:
     input: Input = "points"  # evidence that a shape is encoded from: a cloud of points, voxels, or one picture
     points: PointNumbers = PointNumbers(100_000, near_share=0.0)
     cloud_points: Annotated[int, between(8, 65_536)] = 300  # points of a cloud as input, section 4.3
-    cloud_noise: NonNegative = 0.01  # deviation of noise of these points in training, scene units; higher: more robust
     bend: Annotated[float, between(0, 0.6)] = 0.0  # largest bend of axes in training, of points alone; more vary shapes
     stretch: Annotated[float, between(0, 2)] = 0.0  # largest |log| of factors of axes in training, likewise
     picture_size: Annotated[int, between(16, 512)] = 224  # pixels a side of a picture as input
@@ -53,7 +57,6 @@ class Config:
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first, appendix A
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     code_steps: Annotated[int, between(0, 10_000)] = 0  # steps that fit an encoded cloud's code to it; many overfit
-    fit_learning_rate: LearningRate = 0.02  # Adam's learning rate of that fit, deviations of the learnt codes
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -120,8 +123,7 @@ class OccupancyNetwork(CodedSurface):
         c = config or Config()
         super().__init__(frame, c)
         encoders = {"points": PointEncoder, "voxels": VoxelEncoder, "picture": WholePictureEncoder}
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.encoder = encoders[c.input](c.code, c.encoder_width)
             self.decoder = OccupancyDecoder(c.code, c.hidden_width, c.blocks, c.octaves)
         self.codes.rows.requires_grad_(False)  # encoded, not learnt
@@ -169,7 +171,7 @@ class OccupancyNetwork(CodedSurface):
             warp = self._warp([data.members[i] for i in members], plain, generator)
             moved = warp(points.points.view(len(members), -1, 3)).flatten(0, 1)
             points, evidence = replace(points, points=moved, distance=None), warp(evidence)
-            evidence = evidence + c.cloud_noise * torch.randn(evidence.shape, generator=generator)
+            evidence = evidence + CLOUD_NOISE * torch.randn(evidence.shape, generator=generator)
         return OccupancyLesson(points.to(self.device), evidence.to(self.device), plain.to(self.device))
 
     def _warp(self, shapes: list[Shape], plain: Bool[Tensor, " member"], generator: torch.Generator) -> Warp:
@@ -281,7 +283,7 @@ class OccupancyNetwork(CodedSurface):
             return (logits - self._level).abs().clamp_max(MAX_LOGIT_ERROR).mean()
 
         c = self.config
-        return code + deviation * fitted(torch.zeros_like(code), error, c.code_steps, c.fit_learning_rate)
+        return code + deviation * fitted(torch.zeros_like(code), error, c.code_steps, FIT_LEARNING_RATE)
 
 
 def voxels_of(shape: Shape) -> Float[Tensor, "x y z"]:

@@ -6,7 +6,7 @@ Each Gaussian is flattened into a disc, whose plane gives unbiased depth and a n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -147,19 +147,13 @@ class PlanarSplatting(CloudMethod):
         """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more. Patches
         are fewer, and smaller because photographs are."""
         planes = PlaneNumbers(
-            depth="median",
-            normal_weight=0.05,
-            photometric_weight=0.6,
-            geometric_weight=0.1,
-            consistency_from=0.05,
-            patches=2048,
-            patch_side=5,
-            both_views=False,
-            discs=True,
-        )
-        c = Config(initialization="dense", initial_gaussians=20_000, half_resolution_until=0.3, planes=planes)
-        c = replace(c, refine=RefineNumbers(60_000, cap_ramp=True), tidying=ALL_RULES)
-        return replace(c, rates=RateNumbers(most_haste=4.0))
+            depth="median", normal_weight=0.05, photometric_weight=0.6, geometric_weight=0.1, consistency_from=0.05,
+            patches=2048, patch_side=5, both_views=False, discs=True,
+        )  # fmt: skip
+        return Config(
+            initialization="dense", initial_gaussians=20_000, half_resolution_until=0.3, planes=planes,
+            refine=RefineNumbers(60_000, cap_ramp=True), tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0),
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -38,7 +38,7 @@ from ...files.ranges import (
     Width,
     between,
 )
-from ...method import Field, FieldMethod, Sampler
+from ...method import Field, FieldMethod, Sampler, seeded
 from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
 from .baking import Baking, averaged_harmonics, bake, fill, met
@@ -104,8 +104,7 @@ class PlenOctrees(FieldMethod):
                 "An octree here holds an object, and this capture has no bounds; "
                 "`lumigraph train plenoxels` or instant-ngp learn it"
             )
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.teacher = HarmonicHash(c.table, c.hidden_layers, c.hidden_width, c.sh_bands)
             else:
@@ -118,7 +117,7 @@ class PlenOctrees(FieldMethod):
         learnt, baked = self.teacher_sampler.expected_rays, self.leaf_sampler.expected_rays
         self.expected_rays = c.teacher_share * learnt + (1 - c.teacher_share) * baked
         self.register_buffer("begun", torch.tensor(0.0, dtype=torch.float64))
-        self._progress, self._optimizers = 0.0, list[torch.optim.Optimizer]()
+        self._optimizers = list[torch.optim.Optimizer]()
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -222,9 +221,9 @@ class PlenOctrees(FieldMethod):
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         """Rays of a step. Here the field is baked when its share of the budget is over, for here cameras are known."""
-        if not self.baked and self._progress >= self.config.teacher_share:
+        if not self.baked and self.progress >= self.config.teacher_share:
             self._bake(data.cameras[data.splits["train"]])
-            self.begun.fill_(self._progress)
+            self.begun.fill_(self.progress)
         return super().batch(data, generator)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
@@ -316,6 +315,6 @@ class PlenOctrees(FieldMethod):
         }
 
     def before_step(self, step: int, progress: float) -> None:
-        self._progress, share = progress, self.config.teacher_share
+        share = self.config.teacher_share
         if not self.baked and progress < share:
             super().before_step(step, progress / share)

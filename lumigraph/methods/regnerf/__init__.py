@@ -36,7 +36,7 @@ from ...components.training.regularizers import (
 from ...components.training.schedules import BandSchedule, falling, held, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ...method import FieldMethod
+from ...method import FieldMethod, seeded
 from ...volume import composite
 from .patch_flow import SIDE, PatchFlow, backdrops
 
@@ -139,8 +139,7 @@ class RegNeRF(FieldMethod):
         self.bands = BandSchedule(share) if share else None
         joining = joining_of(self.poses, self.bands)
         if self.by_table:
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(c.seed)
+            with seeded(c.seed):
                 self.network = HashField(c.table, c.table_width, space, frame.reach, joining=joining)
             self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         else:
@@ -149,10 +148,8 @@ class RegNeRF(FieldMethod):
                 space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding
             )
             self.sampler.sampled_from = 1.0 if isinstance(space, NDC) else 0.5
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.flow = PatchFlow() if c.likelihood_weight else None
-        self._progress = 0.0
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -232,8 +229,8 @@ class RegNeRF(FieldMethod):
         c, terms = self.config, {}
         if c.depth_weight:
             weight = c.depth_weight
-            if self._progress < c.depth_settling:
-                weight += (c.depth_weight_start - weight) * (1 - self._progress / c.depth_settling)
+            if self.progress < c.depth_settling:
+                weight += (c.depth_weight_start - weight) * (1 - self.progress / c.depth_settling)
             terms["smoothness"] = weight * self._roughness(seen)
         if c.opacity_weight and not self.frame.is_open:
             terms["opacity"] = c.opacity_weight * opacity_entropy(seen.opacity)
@@ -269,7 +266,7 @@ class RegNeRF(FieldMethod):
         return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
-        c, self._progress = self.config, progress
+        c = self.config
         grown = progress / c.annealing if progress < c.annealing else 1.0
         forward = isinstance(self.network.space, NDC)
         self.sampler.sampled_share = max(grown, c.forward_annealing_start if forward else c.annealing_start)

@@ -42,7 +42,7 @@ from ...files.ranges import (
 from ...geometry import unit
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.spherical_harmonics import K00
-from ...method import FieldMethod, Pass
+from ...method import FieldMethod, Pass, seeded
 from ...method.capabilities import HasField, can
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
@@ -132,8 +132,7 @@ class SNeRG(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             if c.field == "hash":
                 self.network = HashDeferred(c.table, c.hidden_layers, c.hidden_width, space, frame.reach)
             else:

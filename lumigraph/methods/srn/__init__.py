@@ -21,7 +21,7 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ...method import Method, RayMethod
+from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value
 from .networks import Layer, RayMarcher, SceneHyperNetwork, perceptron, scene_features
 
@@ -89,8 +89,7 @@ class SRN(RayMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.hyper = SceneHyperNetwork(c.code, (3, *[c.hidden_width] * c.depth), c.hyper_layers)
             self.marcher = RayMarcher(c.hidden_width, c.marcher_state, c.march_steps)
             outputs = 4 if frame.has_alpha else 3

@@ -27,7 +27,7 @@ from ...exchange.packing import Stored, most_important
 from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
-from ...method import Field, FieldMethod
+from ...method import Field, FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
@@ -35,6 +35,10 @@ from .factorised import FactorGrid, nodes_in, truncate
 
 Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with as many nodes
 Components = Annotated[int, between(1, 1024)]  # of each factor
+
+
+TV_DENSITY_WEIGHT = 0.02  # weight of density's total variation, in the open
+TV_APPEARANCE_WEIGHT = 0.02  # weight of appearance's total variation, in the open
 
 
 @dataclass(frozen=True)
@@ -64,8 +68,6 @@ class Config:
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's; higher: faster
     l1_weight: NonNegative = 8e-5  # weight of the L1 norm of an object's density factors, the code's; higher: sparser
     final_l1_weight: NonNegative = 4e-5  # the same once the box has shrunk, the code's
-    tv_density_weight: NonNegative = 0.02  # weight of density's total variation, in the open; higher smooths
-    tv_appearance_weight: NonNegative = 0.02  # weight of appearance's total variation, in the open; higher smooths
     tv_interval: Steps = 1  # steps between these terms, whose weight is multiplied by it; more are faster
     learning_rate: LearningRate = 0.02  # rate of planes and lines until the last upsampling, section 5
     network_learning_rate: LearningRate = 1e-3  # rate of basis matrix and network at first, section 5
@@ -190,8 +192,7 @@ class TensoRF(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(c.seed)
+        with seeded(c.seed):
             self.network = TensorField(c, frame, space)
         numbers, rays = (frame, space, c.occupancy, c.proposals, SCHEDULE), c.rays_per_step
         open_samples = c.open_samples_per_step
@@ -246,7 +247,7 @@ class TensoRF(FieldMethod):
             if weight := c.final_l1_weight if network.stage else c.l1_weight:
                 terms["l1"] = weight * network.density_grid.sparsity()
         elif step % c.tv_interval == 0:
-            weights = {"tv_density": c.tv_density_weight, "tv_appearance": c.tv_appearance_weight}
+            weights = {"tv_density": TV_DENSITY_WEIGHT, "tv_appearance": TV_APPEARANCE_WEIGHT}
             for grid, (name, weight) in zip(network.grids.values(), weights.items(), strict=True):
                 if weight:
                     terms[name] = c.tv_interval * weight * grid.variation()
