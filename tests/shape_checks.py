@@ -38,21 +38,24 @@ def module_name(path: Path) -> str:
 
 
 def first_calls(function: Any = None, *, typechecker: Any) -> Any:
-    """jaxtyping's decorator, but for calls of a function beyond the first CHECKED_CALLS of a test."""
+    """jaxtyping's decorator, but for calls of a function beyond the first CHECKED_CALLS of a test. The check is made
+    at the first call: those of functions that no test of a process calls took a fifth of its start."""
     if function is None:
         return functools.partial(first_calls, typechecker=typechecker)
-    checked = every_call(function, typechecker=typechecker)
     if not inspect.isfunction(function):
-        return checked
-    last, calls = -1, 0
+        return every_call(function, typechecker=typechecker)
+    checked, last, calls = None, -1, 0
 
-    @functools.wraps(checked)
+    @functools.wraps(function)
     def either(*args: Any, **kwargs: Any) -> Any:
-        nonlocal last, calls
+        nonlocal checked, last, calls
         if last != test:
             last, calls = test, 0
         calls += 1
-        return (checked if calls <= CHECKED_CALLS else function)(*args, **kwargs)
+        if calls > CHECKED_CALLS:
+            return function(*args, **kwargs)
+        checked = checked or every_call(function, typechecker=typechecker)
+        return checked(*args, **kwargs)
 
     return either
 

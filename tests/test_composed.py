@@ -24,7 +24,7 @@ from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.large import open_any
 from lumigraph.method.capabilities import HasDensity, HasGaussians, HasLooks, can
 from lumigraph.method.controls import Control
-from lumigraph.run import opening
+from lumigraph.run import files
 from lumigraph.run.composition import (
     CompositionPart,
     place_from_json,
@@ -320,8 +320,8 @@ def test_a_circle_of_compositions_is_refused(folder):
 
 def test_each_path_is_opened_once_however_often_it_is_named(folder, monkeypatch):
     write_composition(folder / "many.json", [CompositionPart("red.ply", HERE)] * 400)
-    opened, read = list[Path](), opening.read_gaussians
-    monkeypatch.setattr(opening, "read_gaussians", lambda path: opened.append(path) or read(path))
+    opened, read = list[Path](), files.read_gaussians
+    monkeypatch.setattr(files, "read_gaussians", lambda path: opened.append(path) or read(path))
     many = open_any(folder / "many.json")
     assert len(opened) == 1 and many.count == 400
     monkeypatch.setattr("lumigraph.system.memory.free_memory", lambda: 1 << 20)

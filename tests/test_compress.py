@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,12 +21,21 @@ from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.compress import bytes_of, decibels, rendered, squared_error
 from lumigraph.derive.compression.model import RUNG_POSITIONS, Model, rung_at
 from lumigraph.errors import LumigraphError
+from lumigraph.evaluation import held_out_poses
 from lumigraph.opening import open_scene
 from lumigraph.run import Run, build
 from lumigraph.run.derived import Compressed
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 25)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_steps_for_held_out_poses() -> Iterator[None]:
+    """Runs are compared with each other here, by the same steps for each photograph: 5, where commands take 200."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(held_out_poses, "STEPS", 5)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -271,9 +271,10 @@ def test_the_rendering_grows():
 @pytest.mark.parametrize("field", ["planes", "film"])
 def test_both_fields_learn(field):
     method = eg3d(field=field)
-    before = method.averaged.state_dict()["mapping.layers.0.weight"].clone()
+    before = {name: value.clone() for name, value in method.averaged.named_parameters()}
     taught(method, 3)
-    assert not torch.equal(before, method.averaged.mapping.layers[0].weight)
+    for name, value in method.averaged.named_parameters():
+        assert value.isfinite().all() and not torch.equal(before[name], value), name
     assert all(p.isfinite().all() for p in method.parameters())
 
 
@@ -330,19 +331,22 @@ def test_pictures_of_many_are_those_of_each():
 
 
 def test_an_inversion_comes_closer_to_its_photograph():
-    """By the style, and further by the tuned generator; the prior itself is left as it was."""
-    method = eg3d(code_steps=10, tune_steps=0).eval()
+    """By the best of some styles, by descent from it, and further by the tuned generator; the prior itself is left as
+    it was."""
+    method = eg3d(code_steps=0, tune_steps=0).eval()
     scene = tiny_collection.tinted("green")
     one = replace(scene, splits={"train": scene.splits["train"][:1]})
     camera = scene.cameras[one.splits["train"]].resized(16 / 24)
     truth = scene.photograph(int(one.splits["train"][0])).before(scene.frame.background)
     truth = torch.nn.functional.interpolate(truth.permute(2, 0, 1)[None], (16, 16), mode="area")[0].permute(1, 2, 0)
     before = {name: value.clone() for name, value in method.state_dict().items()}
+    best = method.given(one)
+    method.config = replace(method.config, code_steps=10)
     found = method.given(one)
     method.config = replace(method.config, tune_steps=40, tune_learning_rate=1e-2)
     tuned = method.given(one)
-    scores = [psnr(x.render(camera).rgb.clamp(0, 1), truth) for x in (method, found, tuned)]
-    assert scores[0] < scores[1] + 1e-6 and scores[1] + 1 < scores[2], scores
+    scores = [psnr(x.render(camera).rgb.clamp(0, 1), truth) for x in (method, best, found, tuned)]
+    assert scores[0] + 1 < scores[1] and scores[1] + 0.5 < scores[2] and scores[2] + 1 < scores[3], scores
     for name, value in method.state_dict().items():
         assert torch.equal(value, before[name]), name
 

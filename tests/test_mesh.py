@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections import defaultdict
 from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -188,8 +189,11 @@ def is_manifold(faces: np.ndarray) -> bool:
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     if (np.unique(edges, axis=0, return_counts=True)[1] > 2).any():
         return False
-    for vertex in np.unique(faces):
-        left = [set(face) - {vertex} for face in faces.tolist() if vertex in face]
+    across = defaultdict(list)
+    for face in faces.tolist():
+        for vertex in set(face):
+            across[vertex].append(set(face) - {vertex})
+    for left in across.values():
         chain = left.pop()
         while touching := [edge for edge in left if edge & chain]:
             chain = chain.union(*touching)

@@ -16,7 +16,7 @@ from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.training import loop as train
 
-pytestmark = budget("methods", 25)
+pytestmark = budget("methods", 5)
 
 PAPER = 30_000  # steps
 

@@ -17,8 +17,9 @@ from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, mo
 from lumigraph.components.training.shared_points import Seen
 from lumigraph.errors import LumigraphError
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
-from lumigraph.readers import Unposed, without_poses
 from lumigraph.readers.capture import Capture, PixelPlane, Shot
+from lumigraph.readers.unposed import Unposed
+from lumigraph.readers.unposed import unposed as without_poses
 
 pytestmark = budget("methods", 4)
 

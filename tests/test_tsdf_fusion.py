@@ -16,7 +16,7 @@ from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.images import Layer
 from lumigraph.depth_maps import DepthMap, VoxelBlocks, sensor_faults, trust_of
 from lumigraph.errors import LumigraphError
-from lumigraph.kernels.block_hash import EMPTY, PRIMES, SIDE
+from lumigraph.kernels.block_hash import EMPTY, PRIMES
 from lumigraph.kernels.block_surface import triangles
 from lumigraph.methods.tsdf_fusion import Config, TSDFFusion
 
@@ -197,4 +197,3 @@ def test_voxels_that_fit_no_scene_are_refused():
     with pytest.raises(LumigraphError, match="do not fit a box of interest of 2 units"):
         TSDFFusion(tiny.scene().frame, Config(voxel_size=5.0))
     assert TSDFFusion(tiny.scene().frame, Config(voxel_size=0.0)).volume.edge == pytest.approx(2 / 256)
-    assert SIDE == 8
