@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, 
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import claim
 from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, Share, SphereSize, between
-from .common import show
+from .common import say
 from .export_probes import ExportProbes
 from .export_web import ExportWeb
 from .options import (
@@ -32,13 +32,14 @@ from .options import (
     photographers,
     told_origin,
 )
+from .results import Exported, Reports
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
 TEXTURED = 50_000  # triangles whose texture holds the finer detail
 
 
 @dataclass(frozen=True)
-class ExportMesh:
+class ExportMesh(Reports):
     """Export a triangle mesh with vertex colours or a texture, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
@@ -94,7 +95,7 @@ class ExportMesh:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.mesh_file import files_of
 
         if self.moments is not None:
@@ -102,21 +103,26 @@ class ExportMesh:
         for path in files_of(self.output, self.texture):
             claim(path, "mesh", self.overwrite, [self.source])
         opened, mesh, why = self.extracted()
-        show(self.written(opened, mesh, why))
-        return 0
+        return self.written(opened, mesh, why)
 
-    def _sequence(self, count: int) -> int:
+    def _sequence(self, count: int) -> Exported:
         """Write a mesh of each of some moments."""
         from ..large import open_any
 
         times = open_any(self.source).frame.times
         if times is None:
             raise LumigraphError(f"{self.source} does not move, so it has one mesh; leave out --moments")
+        made = []
         for i in range(count):
             time = times[0] + (times[1] - times[0]) * i / (count - 1)
             output = self.output.with_stem(f"{self.output.stem}-{i:03}")
-            replace(self, output=output, moments=None, settings=(*self.settings, f"time={time:.9g}")).run()
-        return 0
+            one = replace(self, output=output, moments=None, settings=(*self.settings, f"time={time:.9g}")).made()
+            say(f"{i + 1} of {count}: {one}, {one.rows['triangles']}")
+            made.append(one)
+        files = tuple(file for one in made for file in one.files)
+        counts = {name: sum(one.counts[name] for one in made) for name in made[0].counts}
+        rows = {"files": f"{made[0]} to {made[-1]}", "triangles": f"{counts['triangles']:,}, all moments together"}
+        return Exported(made[0].path, counts, files, rows=rows)
 
     def extracted(self) -> tuple[Any, Any, str]:
         """The opened source, its mesh in the frame of exports, and the source of the surface as text."""
@@ -159,8 +165,8 @@ class ExportMesh:
                 warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
             return None
 
-    def written(self, opened: Any, mesh: Any, why: str, pieces: Any = None) -> dict[str, str]:
-        """Write the files. Returns results for the terminal. why: source of the surface, and the reason"""
+    def written(self, opened: Any, mesh: Any, why: str, pieces: Any = None) -> Exported:
+        """Write the files. why: source of the surface, and the reason; pieces: for collisions, by name"""
         from ..export.mesh_file import WITH_ORIGIN, write_mesh
 
         up = opened.frame.to_source.rotation[:, 2].numpy()
@@ -176,7 +182,9 @@ class ExportMesh:
             "extent": " x ".join(f"{x:.4g}" for x in high - low) + f" {frame}",
             "size": f"{sum(file.stat().st_size for file in written) / 1e6:.1f} MB",
         }
-        return rows | ({"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {}) | place
+        rows |= {"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {}
+        counts = {"triangles": len(mesh.faces), "vertices": len(mesh.vertices)}
+        return Exported(self.output, counts, tuple(written), rows=rows | place)
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -217,7 +225,7 @@ class Levels:
 
 
 @dataclass(frozen=True)
-class ExportSplats:
+class ExportSplats(Reports):
     """Export a trained cloud of Gaussians for splat viewers, or convert a splat file to another format.
 
     The ending chooses the format: .ply (lossless), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no view-dependent
@@ -237,12 +245,12 @@ class ExportSplats:
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..exchange.fourdgs import is_moving_file
 
         return self._moving() if is_moving_file(self.output) else self._one_moment()
 
-    def _moving(self) -> int:
+    def _moving(self) -> Exported:
         """Write every moment of a run or file that moves."""
         from ..exchange.fourdgs import write_moving
         from ..large import open_any
@@ -253,7 +261,7 @@ class ExportSplats:
         claim(self.output, "splats", self.overwrite, [self.source])
         opened = open_any(self.source)
         self.scaling.remember(opened)
-        method = controlled(opened, opened.method(), self.settings)
+        method = controlled(opened, opened.ready("cpu"), self.settings)
         if "time" in method.settings:
             raise LumigraphError("A .4dgs holds every moment; leave out --set time, or name a .spz for one of them")
         moving = needs(method, HasMovingGaussians).moving(self.duration)
@@ -268,10 +276,9 @@ class ExportSplats:
             "duration": f"{moving.duration:g} s",
             "size": f"{size / 1e6:.1f} MB, {size / max(len(moving), 1):.1f} bytes each",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"still": still, "moving": moving.moving}, rows=rows)
 
-    def _one_moment(self) -> int:
+    def _one_moment(self) -> Exported:
         """Write a cloud as it is at one moment."""
         from ..exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ..exchange.streamed_sog import Detail
@@ -295,7 +302,7 @@ class ExportSplats:
         else:
             opened = open_any(self.source)
             self.scaling.remember(opened)
-            method = controlled(opened, opened.method(), self.settings)
+            method = controlled(opened, opened.ready("cpu"), self.settings)
             gaussians = needs(method, HasGaussians).gaussians()
             crop = self.part.crop(method.frame)
             gaussians = self.part.of_gaussians(gaussians, crop, method.frame, photographers(opened, method))
@@ -307,12 +314,11 @@ class ExportSplats:
             "Gaussians": f"{len(written):,}",
             "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
         }
-        show(rows)
-        return 0
+        return Exported(output, {"gaussians": len(written)}, rows=rows)
 
 
 @dataclass(frozen=True)
-class ExportOctree:
+class ExportOctree(Reports):
     """Export the octree of a plenoctrees run as one .npz, for volrend and svox.
 
     It is in the frame of the photographs. If that is rotated against the scene's, it is in the scene's frame, because
@@ -328,7 +334,7 @@ class ExportOctree:
     overwrite: Overwrite = False
     settings: Set = ()
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         if self.output.suffix.lower() != ".npz":
             raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
         claim(self.output, "octree", self.overwrite, [self.source])
@@ -337,7 +343,7 @@ class ExportOctree:
         from ..method.capabilities import HasOctree, needs
 
         opened = open_any(self.source)
-        octree = needs(controlled(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
+        octree = needs(controlled(opened, opened.ready("cpu"), self.settings), HasOctree).octree(self.depth)
         in_source = write_octree(self.output, octree, opened.frame)
         rows = {
             "file": str(self.output),
@@ -345,12 +351,11 @@ class ExportOctree:
             "frame": "of the photographs" if in_source else "of the scene, for the format has no rotation",
             "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"nodes": len(octree.child)}, rows=rows)
 
 
 @dataclass(frozen=True)
-class ExportPoints:
+class ExportPoints(Reports):
     """Export coloured points with normals, spread evenly over the surfaces that the photographs show.
 
     They are in the frame of the photographs. Floaters are left out: several cameras must see each point.
@@ -372,7 +377,7 @@ class ExportPoints:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         if self.output.suffix.lower() != ".ply":
             raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
         claim(self.output, "points", self.overwrite, [self.source])
@@ -389,15 +394,14 @@ class ExportPoints:
             "points": f"{len(points.positions):,}",
             "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
         }
-        show(rows | place)
-        return 0
+        return Exported(self.output, {"points": len(points.positions)}, rows=rows | place)
 
 
 GridSide = Annotated[int, between(2, 64)]
 
 
 @dataclass(frozen=True)
-class ExportLightField:
+class ExportLightField(Reports):
     """Render a two-plane light field: an n x n grid of pictures around a camera, sheared to a common focal plane.
 
     A folder: pictures named as in the Stanford light field archive (out_ROW_COLUMN_Y_X.png) and transforms.json, by
@@ -423,7 +427,7 @@ class ExportLightField:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.light_field import SPAN, focal_distance, quilt, write_light_field
         from ..figures import save_picture
         from ..files import claim_folder
@@ -447,11 +451,11 @@ class ExportLightField:
             claim(output, "quilt", self.overwrite, [self.source])
             spacing = span / (columns * lines - 1)
             save_picture(output, quilt(method, camera, columns, lines, spacing, focus), "quilt")
-            show({"quilt": str(output), "views": str(columns * lines), **rows})
-            return 0
+            views = columns * lines
+            return Exported(output, {"views": views}, rows={"quilt": str(output), "views": str(views), **rows})
         write_light_field(self.output, method, camera, self.grid, span / (self.grid - 1), focus, opened.frame)
-        show({"light field": str(self.output), "pictures": f"{self.grid} x {self.grid}", **rows})
-        return 0
+        rows = {"light field": str(self.output), "pictures": f"{self.grid} x {self.grid}", **rows}
+        return Exported(self.output, {"views": self.grid**2}, rows=rows)
 
     def _number(self, opened: Any) -> int:
         """Row of the photograph of --view among those to learn from."""
@@ -468,7 +472,7 @@ Place = Annotated[
 
 
 @dataclass(frozen=True)
-class SphereExport:
+class SphereExport(Reports):
     """Base of exports of the whole sphere around a place."""
 
     source: SourceOption
@@ -502,13 +506,13 @@ class ExportPanorama(SphereExport):
     The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
     """
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.panorama import panorama, save_sphere
 
         _, method, place, heading, where = self.opened()
         save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
-        show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})
-        return 0
+        rows = {"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where}
+        return Exported(self.output, {"width": self.size, "height": self.size // 2}, rows=rows)
 
 
 CONTRACTED = (
@@ -518,7 +522,7 @@ CONTRACTED = (
 
 
 @dataclass(frozen=True)
-class ExportSnerg:
+class ExportSnerg(Reports):
     """Export a baked run as the folder of SNeRG's own viewer: scene_params.json and slices of its atlas as PNG.
 
     It is in the scene's frame with +y up. Such a folder also opens like a run. A folder of an open capture is
@@ -530,14 +534,14 @@ class ExportSnerg:
     output: Annotated[Positional[Path], needed("FOLDER")]
     """The new folder."""
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..exchange import size_of, snerg
         from ..files import claim_folder
         from ..large import open_any
         from ..method.capabilities import HasAtlas, needs
 
         claim_folder(self.output, "atlas")
-        atlas = needs(open_any(self.source).method(), HasAtlas).atlas()
+        atlas = needs(open_any(self.source).ready("cpu"), HasAtlas).atlas()
         snerg.write(self.output, atlas)
         if atlas.contracted:
             warnings.warn(CONTRACTED, LumigraphWarning, stacklevel=2)
@@ -547,8 +551,7 @@ class ExportSnerg:
             "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks",
             "size": f"{size_of(self.output) / 1e6:.1f} MB",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"voxels": x * y * z, "blocks": len(atlas.values)}, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -563,7 +566,7 @@ class ExportStereo(SphereExport):
     interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
     """Distance between the eyes, in units of the photographs' frame; larger makes the scene look smaller and deeper."""
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.panorama import EYE_DISTANCE_SHARE, save_sphere, stereo_pair, surrounding_distances, top_bottom
 
         opened, method, place, heading, where = self.opened()
@@ -583,8 +586,7 @@ class ExportStereo(SphereExport):
             "from": where,
             "eyes": f"{apart * unit:.4g} apart; half of all is nearer than {middle * unit:.4g}",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"width": self.size, "height": self.size}, rows=rows)
 
 
 PIECE_NAMES = {"unreal": "UCX_{name}_{number:02}", "godot": "{name}_{number:02}-convcolonly"}
@@ -605,7 +607,7 @@ class ExportCollision(ExportMesh):
     pieces: Annotated[Annotated[int, between(1, 1000)] | None, option("N", "as many as the concavity needs")] = None
     """Largest number of pieces."""
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.collision import convex_pieces
 
         claim(self.output, "mesh", self.overwrite, [self.source])
@@ -613,8 +615,8 @@ class ExportCollision(ExportMesh):
         found = convex_pieces(mesh, self.concavity, self.pieces)
         named = {PIECE_NAMES[self.engine].format(name="source", number=i): piece for i, piece in enumerate(found)}
         rows = {"pieces": f"{len(found)}, {sum(len(faces) for _, faces in found):,} triangles"}
-        show(self.written(opened, mesh, why, named) | rows)
-        return 0
+        made = self.written(opened, mesh, why, named)
+        return replace(made, counts={**made.counts, "pieces": len(found)}, rows={**made.rows, **rows})
 
     def check(self) -> None:
         super().check()

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
@@ -30,6 +30,11 @@ def option(metavar: str, default: str | None = None, about: str | None = None, n
 def needed(metavar: str, about: str | None = None, name: str | None = None) -> Any:
     """An argument without a default in --help."""
     return option(metavar, "", about, name)
+
+
+def option_name(field: str, kind: Any) -> str:
+    """The name of a field's option, from Python: that of its annotation, or its own."""
+    return next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), field).replace("-", "_")
 
 
 DEVICE = "Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."
@@ -70,7 +75,7 @@ def open_method(
     opened = open_any(source)
     if scaling is not None:
         scaling.remember(opened)
-    method = controlled(opened, opened.method(choose_device(device)), settings)
+    method = controlled(opened, opened.ready(choose_device(device)), settings)
     return opened, method, {split: method.refined(cameras) for split, cameras in opened.cameras().items()}
 
 
