@@ -132,7 +132,7 @@ def test_weights_are_loaded_once_for_all_calls(own_run, tmp_path, monkeypatch):
     weights = {name: value.clone() for name, value in own_run.ready().state_dict().items()}
     film = own_run.film(tmp_path / "film.gif", frames=2, size=16)
     mesh = own_run.export("mesh", tmp_path / "a.ply", size=16, views=4, cell_size=0.2, smooth=0)
-    own_run.export("points", tmp_path / "b.ply", size=16, views=4, count=50)
+    own_run.export("panorama", tmp_path / "b.png", size=64)
     found = own_run.evaluate(views=2)
     assert (len(loads), opens) == (1, [])
     assert all(torch.equal(value, weights[name]) for name, value in own_run.ready().state_dict().items())

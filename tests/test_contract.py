@@ -44,6 +44,7 @@ from lumigraph.explain.ray import along_ray
 from lumigraph.export import points as export_points
 from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
+from lumigraph.export.options import MeshOptions
 from lumigraph.export.page import splats_page, views_page
 from lumigraph.method import Method, RayMethod
 from lumigraph.method.capabilities import (
@@ -426,7 +427,7 @@ def test_it_becomes_points_and_a_mesh(lenient):
         mesh = lenient.method.mesh()
         assert isinstance(mesh, Mesh)
     else:
-        mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, way="depth", views=6)
+        mesh = extract_mesh(lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, way="depth", views=6))
     around(torch.from_numpy(mesh.vertices))
     assert len(mesh.faces) > 3 and mesh.faces.max() < len(mesh.vertices) == len(mesh.colours)
 
@@ -438,14 +439,16 @@ def test_its_density_becomes_a_mesh(lenient):
     with torch.no_grad():
         density = lenient.method.density(torch.cartesian_prod(grid, grid, grid))
     level = float(density.max()) / 4
-    mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, way="density", level=level, views=6, smooth=0)
+    mesh = extract_mesh(
+        lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, way="density", level=level, views=6, smooth=0)
+    )
     around(torch.from_numpy(mesh.vertices))
 
 
 def test_its_distance_becomes_a_mesh(lenient):
     if not can(lenient.method, HasDistance):
         return
-    mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, views=6, smooth=0)
+    mesh = extract_mesh(lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, views=6, smooth=0))
     around(torch.from_numpy(mesh.vertices))
     with torch.no_grad():
         distance = lenient.method.distance(torch.from_numpy(mesh.vertices).float().to(lenient.device))

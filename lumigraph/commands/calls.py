@@ -16,11 +16,11 @@ from tyro.conf import Fixed, Positional
 
 from ..errors import LumigraphError
 from ..files.names import counted
+from ..files.options import option_name
 from ..files.ranges import coherent, hints, members, typed
 from ..system.children import Request
 from ..system.work import at_work
 from .common import kept_rows
-from .options import option_name
 from .request import kind_of
 
 T = TypeVar("T")

@@ -29,6 +29,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
+from ..files.options import option_name
 from ..files.ranges import coherent, domain, is_surprising, outside, shown
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
@@ -52,7 +53,6 @@ from .infer import Infer
 from .info import Info
 from .jump import Jump
 from .methods import Methods
-from .options import option_name
 from .photo3d import Photo3DCommand
 from .render import Render
 from .report import Report

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from ..errors import LumigraphError, LumigraphWarning
+from ..export.options import FOR_PHONES, MeshOptions
 from ..files import claim
-from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, Share, SphereSize, between
+from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, SphereSize, between
 from .common import say
 from .export_probes import ExportProbes
 from .export_web import ExportWeb
@@ -34,12 +35,18 @@ from .options import (
 )
 from .results import Exported, Reports
 
-FOR_PHONES = 100_000  # triangles that a phone shows with ease
-TEXTURED = 50_000  # triangles whose texture holds the finer detail
+
+@dataclass(frozen=True)
+class Files:
+    """Source and output of an export."""
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new file."""
 
 
 @dataclass(frozen=True)
-class ExportMesh(Reports):
+class ExportMesh(Reports, MeshOptions, Files):
     """Export a triangle mesh with vertex colours or a texture, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
@@ -48,43 +55,6 @@ class ExportMesh(Reports):
     Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 
-    source: SourceOption
-    output: Annotated[Positional[Path], needed("FILE")]
-    """The new file."""
-    extent: Annotated[
-        Annotated[float, between(0.001, 1000)] | None, option("TIMES", "1 for objects, 1.5 for the rest")
-    ] = None
-    """Size of the meshed region, times the box of interest in `lumigraph info`; or give --box or --sphere."""
-    cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
-    """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
-    way: Annotated[
-        Literal["auto", "distance", "density", "own", "depth"],
-        arg(name="from", help_behavior_hint="(default: the first of these that the method has)"),
-    ] = "auto"
-    """Source of the surface: the signed distance, the density field, the method's own mesh, or rendered depth."""
-    level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
-    """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
-    smooth: Annotated[int, between(0, 1000), option("N")] = 10
-    """Rounds of smoothing; more round off detail, 0 is none."""
-    faces: Annotated[
-        Annotated[int, between(4, 1_000_000_000)] | None,
-        option("N", f"all, for phones {FOR_PHONES:,}, with --texture {TEXTURED:,}"),
-    ] = None
-    """Number of triangles after simplification; fewer make a smaller file."""
-    texture: bool = False
-    """Give the mesh a texture and a normal map (.glb, .obj, .usdz), from the photographs where they are at hand."""
-    texture_size: Annotated[int, between(64, 32_768), option("TEXELS")] = 2048
-    """Width and height of the texture; larger shows finer print, and takes more memory and a larger file."""
-    lit: bool = False
-    """Let lights of a viewer act on a textured mesh; otherwise it shines in the photographs' own light."""
-    keep: Annotated[Share, option("SHARE")] = 0.01
-    """Smallest piece to keep, as a share of the largest one's area; larger removes more fragments."""
-    unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
-    """Unseen surface: close it for a watertight mesh, or cut it."""
-    size: Annotated[Pixels, option("PIXELS")] = 400
-    """Longer side of the pictures for colours and depth, at most that of the photographs; larger is finer, slower."""
-    views: Annotated[Count, option("N")] = 64
-    """Largest number of these pictures, and of photographs for a texture."""
     moments: Annotated[Annotated[int, between(2, 1000)] | None, option("N", "one, as --set time says")] = None
     """Number of moments of a scene that moves, evenly spread: a mesh each, FILE-000 and on."""
     scene: PhotographsOption = None
@@ -128,26 +98,16 @@ class ExportMesh(Reports):
         """The opened source, its mesh in the frame of exports, and the source of the surface as text."""
         from ..export.mesh import best_way, extract_mesh
 
-        for_phones = self.output.suffix.lower() == ".usdz" and not self.texture
         opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
         method = at_one_moment(method)
-        way, why = best_way(method) if self.way == "auto" else (self.way, f"{self.way}, as --from says")
+        why = best_way(method)[1] if self.way == "auto" else f"{self.way}, as --from says"
+        for_phones = self.output.suffix.lower() == ".usdz" and not self.texture and self.faces is None
         mesh = extract_mesh(
             self.part.without_floaters(method, opened),
             opened.survey(cameras["train"]),
-            extent=self.extent,
-            crop=self.part.crop(opened.frame),
-            cell=None if self.cell_size is None else self.cell_size / opened.frame.to_export.scale,
-            level=self.level,
-            way=way,
-            smooth=self.smooth,
-            faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
-            keep=self.keep,
-            closed=None if self.unseen is None else self.unseen == "close",
-            size=self.size,
-            views=self.views,
-            texture=self.texture_size if self.texture else None,
-            photographs=self.photographs(opened),
+            replace(self, faces=FOR_PHONES) if for_phones else self,
+            self.part.crop(opened.frame),
+            self.photographs(opened),
         )
         return opened, mesh.in_source(opened.frame), why
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ..errors import LumigraphError
+from ..export.options import MeshOptions
 from ..files import claim
 from ..files.ranges import Seconds, between
 from .common import choose_device, show
@@ -123,7 +124,7 @@ class ExportWeb(Reports):
             views_page(self.output, self.part.of_method(method, opened), cameras, opening, self.views, self.size)
             return f"{self.views} views", {"views": self.views}
         whole, crop = self.part.without_floaters(method, opened), self.part.crop(method.frame)
-        mesh = extract_mesh(whole, cameras, crop=crop, faces=FACES)
+        mesh = extract_mesh(whole, cameras, MeshOptions(faces=FACES), crop)
         mesh_page(self.output, mesh, opening)
         return f"{len(mesh.faces):,} triangles", {"triangles": len(mesh.faces)}
 

@@ -7,11 +7,13 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from ..errors import LumigraphError
+from ..files.options import needed as needed
+from ..files.options import option as option
 from ..files.ranges import Coordinate, Positive, Seed, Share, Steps
 from ..files.readers import LISTED, NAMES
 
@@ -19,22 +21,6 @@ if TYPE_CHECKING:
     Reader = str
 else:
     Reader = Literal[NAMES]
-
-
-def option(metavar: str, default: str | None = None, about: str | None = None, name: str | None = None) -> Any:
-    """An option in --help: its placeholder, its default in words, its description, its name if not the field's."""
-    hint = default and f"(default: {default})"
-    return arg(metavar=metavar, help_behavior_hint=hint, help=about, name=name)
-
-
-def needed(metavar: str, about: str | None = None, name: str | None = None) -> Any:
-    """An argument without a default in --help."""
-    return option(metavar, "", about, name)
-
-
-def option_name(field: str, kind: Any) -> str:
-    """The name of a field's option, from Python: that of its annotation, or its own."""
-    return next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), field).replace("-", "_")
 
 
 DEVICE = "Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."
