@@ -35,7 +35,7 @@ from lumigraph.datasets.scene import Scene
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.depth_maps import depth_map
 from lumigraph.derive.compression import LADDER
-from lumigraph.derive.compression.model import Model
+from lumigraph.derive.compression.model import CompressedModel
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, held_out_poses
 from lumigraph.evaluation.run import evaluate_run
@@ -503,7 +503,7 @@ def test_it_can_be_stored_in_fewer_bytes(taught, tmp_path):
     assert set(taught.method.storage()) <= set(taught.method.state_dict())
     sizes = []
     for rung in (LADDER[0], LADDER[-1]):
-        model = Model(run.method(taught.device), important, rung, STEPS)
+        model = CompressedModel(run.method(taught.device), important, rung, STEPS)
         if rung.pruned:
             model.tune(taught.data, 2, None)
         sizes.append(len(packed := model.packed()))
