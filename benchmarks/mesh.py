@@ -36,6 +36,7 @@ from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.shapes.triangles import Triangles
 from lumigraph.evaluation import evaluate
 from lumigraph.export.mesh import extract_mesh
+from lumigraph.export.options import MeshOptions
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
 from lumigraph.method import Method
@@ -91,7 +92,7 @@ def beside_truth(run: Run, views: int) -> dict:
     truth = truth_of_mesh(file, run) if file.is_file() else truth_of_world(run)
     method = run.method()
     begin = time.perf_counter()
-    mesh = extract_mesh(method, run.cameras()["train"], views=views).in_source(run.frame)
+    mesh = extract_mesh(method, run.cameras()["train"], MeshOptions(views=views)).in_source(run.frame)
     seconds = time.perf_counter() - begin
     points, normals = spread(mesh)
     away, there = truth.nearest(points)
@@ -161,7 +162,7 @@ def some_rays(cameras: Camera) -> Iterator[Rays]:
 def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
     """Median distances between what is exported of one run."""
     method, cameras = run.method(), run.cameras()["train"]
-    mesh = extract_mesh(method, cameras, views=views).in_source(run.frame)
+    mesh = extract_mesh(method, cameras, MeshOptions(views=views)).in_source(run.frame)
     points = extract_points(method, cameras, views=views).in_source(run.frame).positions
     surface, _ = spread(mesh)
     low, high = surface.min(0), surface.max(0)

@@ -12,15 +12,19 @@ from typing import TYPE_CHECKING, Any  # noqa: E402
 from .system import threads  # noqa: E402
 
 if TYPE_CHECKING:
+    from .api import Model as Model
+    from .api import call as call
+    from .api import capture as capture
+    from .api import open as open
+    from .api import train as train
     from .camera import Camera as Camera
     from .camera.lens import Lens as Lens
     from .camera.rays import Rays as Rays
     from .camera.rays import Rendering as Rendering
     from .camera.rays import Samples as Samples
-    from .commands.calls import call as call
-    from .commands.calls import capture as capture
-    from .commands.calls import open as open
-    from .commands.calls import train as train
+    from .commands.results import Evaluation as Evaluation
+    from .commands.results import Exported as Exported
+    from .commands.results import Film as Film
     from .datasets.collection import Collection as Collection
     from .datasets.dataset import Dataset as Dataset
     from .datasets.scene import Scene as Scene
@@ -47,10 +51,14 @@ _homes = {
     "Camera": "camera",
     "Collection": "datasets.collection",
     "Dataset": "datasets.dataset",
+    "Evaluation": "commands.results",
+    "Exported": "commands.results",
+    "Film": "commands.results",
     "Gaussians": "gaussians",
     "Lens": "camera.lens",
     "LumigraphError": "errors",
     "Method": "method",
+    "Model": "api",
     "RayMethod": "method",
     "Opened": "run",
     "Rays": "camera.rays",
@@ -59,16 +67,16 @@ _homes = {
     "Samples": "camera.rays",
     "Scene": "datasets.scene",
     "Shapes": "datasets.shapes",
-    "call": "commands.calls",
-    "capture": "commands.calls",
+    "call": "api",
+    "capture": "api",
     "composite": "volume",
     "fit": "training",
-    "open": "commands.calls",
+    "open": "api",
     "open_any": "large",
     "open_dataset": "opening",
     "open_scene": "opening",
     "rasterization": "gaussians.rasterization",
-    "train": "commands.calls",
+    "train": "api",
 }
 __all__ = sorted(_homes)
 

@@ -19,7 +19,7 @@ from lumigraph.commands.cli import main
 from lumigraph.commands.compress import bytes_in, verdict
 from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.compress import bytes_of, decibels, rendered, squared_error
-from lumigraph.derive.compression.model import RUNG_POSITIONS, Model, rung_at
+from lumigraph.derive.compression.model import RUNG_POSITIONS, CompressedModel, rung_at
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import held_out_poses
 from lumigraph.opening import open_scene
@@ -160,7 +160,7 @@ def test_each_place_on_the_ladder_is_smaller_than_the_one_before(cloud_run):
     for place in RUNG_POSITIONS[::6]:
         method = cloud_run.method()
         weights = {"cloud.harmonics": torch.rand(len(method.cloud), generator=torch.Generator().manual_seed(0))}
-        sizes.append(len(Model(method, weights, rung_at(place), 30).packed()))
+        sizes.append(len(CompressedModel(method, weights, rung_at(place), 30).packed()))
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < sizes[0] / 1.5
 
 
@@ -175,7 +175,7 @@ def test_importance_is_what_a_picture_gains(cloud_run):
 def test_tuning_mends_what_storing_broke(cloud_run):
     scene, method = tiny.scene(), cloud_run.method()
     weights = {"cloud.harmonics": torch.ones(len(method.cloud))}
-    model = Model(method, weights, LADDER[-1], 30)
+    model = CompressedModel(method, weights, LADDER[-1], 30)
     broken = squared_error(method, scene, "train", 9)
     model.tune(scene, 40, None)
     assert squared_error(method, scene, "train", 9) < 0.95 * broken

@@ -34,7 +34,7 @@ from lumigraph.datasets.scene import Scene
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.depth_maps import depth_map
 from lumigraph.derive.compression import LADDER
-from lumigraph.derive.compression.model import Model
+from lumigraph.derive.compression.model import CompressedModel
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate, held_out_poses
 from lumigraph.evaluation.run import evaluate_run
@@ -42,6 +42,7 @@ from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.export import points as export_points
 from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
+from lumigraph.export.options import MeshOptions
 from lumigraph.export.page import splats_page, views_page
 from lumigraph.lab.benchmark.cell import CellSettings, evaluated
 from lumigraph.lab.explain.ray import along_ray
@@ -427,7 +428,7 @@ def test_it_becomes_points_and_a_mesh(lenient):
         mesh = lenient.method.mesh()
         assert isinstance(mesh, Mesh)
     else:
-        mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, way="depth", views=6)
+        mesh = extract_mesh(lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, way="depth", views=6))
     around(torch.from_numpy(mesh.vertices))
     assert len(mesh.faces) > 3 and mesh.faces.max() < len(mesh.vertices) == len(mesh.colours)
 
@@ -439,14 +440,16 @@ def test_its_density_becomes_a_mesh(lenient):
     with torch.no_grad():
         density = lenient.method.density(torch.cartesian_prod(grid, grid, grid))
     level = float(density.max()) / 4
-    mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, way="density", level=level, views=6, smooth=0)
+    mesh = extract_mesh(
+        lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, way="density", level=level, views=6, smooth=0)
+    )
     around(torch.from_numpy(mesh.vertices))
 
 
 def test_its_distance_becomes_a_mesh(lenient):
     if not can(lenient.method, HasDistance):
         return
-    mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, views=6, smooth=0)
+    mesh = extract_mesh(lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, views=6, smooth=0))
     around(torch.from_numpy(mesh.vertices))
     with torch.no_grad():
         distance = lenient.method.distance(torch.from_numpy(mesh.vertices).float().to(lenient.device))
@@ -501,7 +504,7 @@ def test_it_can_be_stored_in_fewer_bytes(taught, tmp_path):
     assert set(taught.method.storage()) <= set(taught.method.state_dict())
     sizes = []
     for rung in (LADDER[0], LADDER[-1]):
-        model = Model(run.method(taught.device), important, rung, STEPS)
+        model = CompressedModel(run.method(taught.device), important, rung, STEPS)
         if rung.pruned:
             model.tune(taught.data, 2, None)
         sizes.append(len(packed := model.packed()))

@@ -31,6 +31,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
+from lumigraph.export.options import MeshOptions
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, simplified, smoothed, zero_level
 from lumigraph.files.ply import read_rows
@@ -54,7 +55,7 @@ def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def solid_ball() -> Mesh:
-    return extract_mesh(Solid(ball()), around(), cell=CELL, level=SOLID / 2)
+    return extract_mesh(Solid(ball()), around(), MeshOptions(cell_size=CELL, level=SOLID / 2))
 
 
 @pytest.mark.parametrize("kind", [Measured, Solid, Seen], ids=["distance", "density", "depth"])
@@ -63,7 +64,7 @@ def test_a_mesh_is_closed_and_lies_on_the_surface(kind, name):
     distance = {"ball": ball(), "torus": torus()}[name]
     volume = {"ball": 4 / 3 * math.pi * 0.6**3, "torus": 2 * math.pi**2 * 0.55 * 0.2**2}[name]
     assert best_way(kind(distance))[0] == {Measured: "distance", Solid: "density", Seen: "depth"}[kind]
-    mesh = extract_mesh(kind(distance), around(), cell=CELL)
+    mesh = extract_mesh(kind(distance), around(), MeshOptions(cell_size=CELL))
     solid = as_trimesh(mesh)
     assert solid.is_watertight and solid.is_winding_consistent
     assert solid.euler_number == {"ball": 2, "torus": 0}[name]
@@ -93,7 +94,7 @@ def test_the_chamfer_distance_is_far_below_a_hundredth_of_the_diagonal(solid_bal
 
 @pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
 def test_colours_are_those_of_the_field(kind):
-    mesh = extract_mesh(kind(ball()), around(), cell=CELL)
+    mesh = extract_mesh(kind(ball()), around(), MeshOptions(cell_size=CELL))
     expected = 255 * painted(torch.from_numpy(mesh.vertices).float()).numpy()
     assert np.abs(mesh.colours - expected).mean() < 1.5 and np.abs(mesh.colours - expected).max() < 6
 
@@ -107,20 +108,20 @@ def test_faces_look_outward(solid_ball):
 @pytest.mark.parametrize(("keep", "pieces"), [(0.01, 2), (0.05, 1)])
 def test_small_pieces_are_dropped(keep, pieces):
     method = Solid(together(ball(), ball(0.1, (0.0, 0.0, 0.85))))  # a share of 0.028 of the area
-    mesh = extract_mesh(method, around(), cell=CELL, keep=keep, smooth=0)
+    mesh = extract_mesh(method, around(), MeshOptions(cell_size=CELL, keep=keep, smooth=0))
     assert as_trimesh(mesh).body_count == pieces
 
 
 def test_there_are_no_caves_inside():
-    mesh = as_trimesh(extract_mesh(Solid(shell()), around(), cell=CELL, level=SOLID / 2))
+    mesh = as_trimesh(extract_mesh(Solid(shell()), around(), MeshOptions(cell_size=CELL, level=SOLID / 2)))
     assert mesh.body_count == 1 and mesh.volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.02)
 
 
 @pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
 def test_what_no_camera_sees_is_closed_or_cut(kind):
     above = around(lowest=20)
-    closed = as_trimesh(extract_mesh(kind(ball()), above, cell=CELL, closed=True))
-    cut = as_trimesh(extract_mesh(kind(ball()), above, cell=CELL, closed=False))
+    closed = as_trimesh(extract_mesh(kind(ball()), above, MeshOptions(cell_size=CELL, unseen="close")))
+    cut = as_trimesh(extract_mesh(kind(ball()), above, MeshOptions(cell_size=CELL, unseen="cut")))
     assert closed.is_watertight and closed.vertices[:, 2].min() < -0.55
     assert not cut.is_watertight and -0.5 < cut.vertices[:, 2].min() < -0.1
     assert np.abs(np.linalg.norm(cut.vertices, axis=-1) - 0.6).max() < CELL
@@ -128,7 +129,9 @@ def test_what_no_camera_sees_is_closed_or_cut(kind):
 
 def test_a_surface_that_leaves_the_box_is_closed_there_or_open():
     wide = Solid(ball(), Frame(bounds=((-1.0, -1.0, -0.3), (1.0, 1.0, 1.0)), near=0.1))
-    closed, cut = (extract_mesh(wide, around(), cell=CELL, closed=x) for x in (True, False))
+    closed, cut = (
+        extract_mesh(wide, around(), MeshOptions(cell_size=CELL, unseen="close" if x else "cut")) for x in (True, False)
+    )
     assert as_trimesh(closed).is_watertight and not as_trimesh(cut).is_watertight
     assert all(abs(x.vertices[:, 2].min() + 0.3) < 1.5 * CELL for x in (closed, cut))
 
@@ -136,12 +139,12 @@ def test_a_surface_that_leaves_the_box_is_closed_there_or_open():
 @pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
 def test_a_crop_is_all_that_is_meshed(kind):
     crop = Sphere((0.5, 0.0, 0.0), 0.4)
-    mesh = as_trimesh(extract_mesh(kind(ball()), around(), cell=CELL, crop=crop, smooth=0))
+    mesh = as_trimesh(extract_mesh(kind(ball()), around(), MeshOptions(cell_size=CELL, smooth=0), crop=crop))
     away = np.linalg.norm(mesh.vertices - crop.middle, axis=-1)
     assert mesh.is_watertight and away.max() < 0.4 + CELL
     assert np.linalg.norm(mesh.vertices[away < 0.35], axis=-1) == pytest.approx(0.6, abs=CELL)
     with pytest.raises(LumigraphError, match="outside the scene"):
-        extract_mesh(kind(ball()), around(), cell=CELL, crop=Sphere((9.0, 0.0, 0.0), 0.4))
+        extract_mesh(kind(ball()), around(), MeshOptions(cell_size=CELL), crop=Sphere((9.0, 0.0, 0.0), 0.4))
 
 
 def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
@@ -149,7 +152,7 @@ def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     assert meshed_box(frame, None).upper == pytest.approx((0.6,) * 3)
     assert meshed_box(frame, 100.0) == CropBox((-4.0,) * 3, (4.0,) * 3)
     assert meshed_box(replace(frame, reach=1.0), None).upper == pytest.approx((0.4,) * 3)
-    mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, extent=2.0)
+    mesh = extract_mesh(Seen(ball(), frame), around(), MeshOptions(cell_size=CELL, extent=2.0))
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
 
 
@@ -206,7 +209,7 @@ def is_manifold(faces: np.ndarray) -> bool:
 def test_an_open_surface_is_cut_where_one_camera_alone_sees_it():
     floor = Seen(lambda points: points[:, 2] + 0.02 * (9 * points[:, :2]).sin().sum(-1), OPEN)
     cameras = around(9, lowest=40.0, distance=1.5)
-    one, all_of_them = (extract_mesh(floor, x, cell=CELL, smooth=0) for x in (cameras[:1], cameras))
+    one, all_of_them = (extract_mesh(floor, x, MeshOptions(cell_size=CELL, smooth=0)) for x in (cameras[:1], cameras))
     assert len(one.faces) > 1000  # nobody can confirm what it sees
     assert is_manifold(all_of_them.faces) and as_trimesh(all_of_them).body_count == 1
     points = torch.from_numpy(all_of_them.vertices).float()
@@ -224,7 +227,9 @@ def test_what_masks_leave_out_is_no_surface(kind):
     alone = render_depth_maps(Seen(ball()).render, cameras, scene.frame.background)
     store = SimpleNamespace(mask=lambda index: alone[index].solid)
     photographs = Mock(Scene, images=store, splits={"train": torch.arange(len(cameras))})
-    both, masked = (extract_mesh(scene, cameras, cell=CELL, photographs=x) for x in (None, photographs))
+    both, masked = (
+        extract_mesh(scene, cameras, MeshOptions(cell_size=CELL), photographs=x) for x in (None, photographs)
+    )
     assert both.vertices[:, 2].min() < -0.7 and both.vertices[:, 0].max() > 0.9
     assert as_trimesh(masked).is_watertight and as_trimesh(masked).body_count == 1
     assert as_trimesh(masked).volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.1)
@@ -247,7 +252,7 @@ def test_the_outline_of_a_mask_becomes_even():
 
 
 def test_fewer_faces_keep_shape_and_colours():
-    mesh = extract_mesh(Seen(ball()), around(), cell=CELL, faces=1000)
+    mesh = extract_mesh(Seen(ball()), around(), MeshOptions(cell_size=CELL, faces=1000))
     solid = as_trimesh(mesh)
     assert 900 < len(mesh.faces) <= 1000 and solid.is_watertight
     assert solid.volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.02)
@@ -458,22 +463,22 @@ def test_a_splat_file_is_looked_at_from_a_dome(tmp_path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"cell": 1e-4}, "--cell-size"),
-        ({"cell": 1.5}, "--cell-size"),
+        ({"cell_size": 1e-4}, "--cell-size"),
+        ({"cell_size": 1.5}, "--cell-size"),
         ({"way": "density"}, "holds no density"),
     ],
 )
 def test_nothing_to_make_a_mesh_of(options, said):
     method = Seen(ball()) if options.get("way") == "density" else Solid(ball())
     with pytest.raises(LumigraphError, match=said):
-        extract_mesh(method, around(8, 32), **{"cell": CELL} | options)
+        extract_mesh(method, around(8, 32), MeshOptions(**{"cell_size": CELL} | options))
 
 
 @pytest.mark.parametrize("options", [{}, {"level": SOLID / 2}, {"way": "depth"}])
 def test_a_box_without_a_surface(options):
     frame = Frame(bounds=((0.5, 0.5, 0.5), (1.0, 1.0, 1.0)), near=0.1)
     with pytest.raises(LumigraphError, match="inside the box"):
-        extract_mesh(Solid(ball(), frame), around(8, 32), **options)
+        extract_mesh(Solid(ball(), frame), around(8, 32), MeshOptions(**options))
 
 
 @pytest.mark.parametrize("make", [extract_mesh, extract_points])

@@ -36,14 +36,14 @@ def test_a_picture_shows_itself_beside_its_depth():
 
 
 def test_a_run_is_a_page_to_turn_above_a_still(ball_run, monkeypatch):
-    shown = ball_run._repr_html_()
+    shown = lumigraph.Model(ball_run)._repr_html_()
     assert "voxel-grid" in shown and "60 steps in " in shown
     assert 'sandbox="allow-scripts"' in shown and "&quot;pictures&quot;" in shown  # views, for a field
     assert still_of(shown).size == (tiny.SIZE, tiny.SIZE)
     for limit in ("MAX_PAGE_BYTES", "MAX_SECONDS"):
         with monkeypatch.context() as patch:
             patch.setattr(notebook_page, limit, 0)
-            shown = ball_run._repr_html_()
+            shown = lumigraph.Model(ball_run)._repr_html_()
         assert "<iframe" not in shown and still_of(shown).size == (tiny.SIZE, tiny.SIZE)
 
 
@@ -55,7 +55,7 @@ def test_names_cannot_break_the_view(ball_run, monkeypatch):
     strange = replace(ball_run.settings, scene=replace(ball_run.settings.scene, source="<script>"))
     monkeypatch.setattr(ball_run, "settings", strange)
     monkeypatch.setattr(notebook_page, "MAX_SECONDS", 0)
-    assert "<script>" not in ball_run._repr_html_()
+    assert "<script>" not in lumigraph.Model(ball_run)._repr_html_()
 
 
 def test_splats_are_drawn_inside_a_notebook(tmp_path, page, faults):
@@ -77,7 +77,7 @@ def test_splats_are_drawn_inside_a_notebook(tmp_path, page, faults):
 
 
 def test_a_run_before_its_first_state_shows_itself(tmp_path):
-    assert "0 steps" in tiny.new_run(tmp_path / "run")._repr_html_()
+    assert "0 steps" in lumigraph.Model(tiny.new_run(tmp_path / "run"))._repr_html_()
 
 
 def test_the_notebook_of_the_documents_runs(ball_folder, tmp_path, monkeypatch):

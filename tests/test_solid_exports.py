@@ -19,6 +19,7 @@ from lumigraph import methods
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.export.mesh import extract_mesh
+from lumigraph.export.options import MeshOptions
 from lumigraph.export.points import extract_points
 from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, can
@@ -83,7 +84,7 @@ def test_a_mesh_is_the_surface(field, way):
     """Cells have a side of 0.083; measured medians are -0.02 to 0, and 90 % lie within 0.05."""
     if way == "density" and not can(field, HasDensity):
         return
-    mesh = extract_mesh(field, patterned().cameras, cell=CELL, way=way)
+    mesh = extract_mesh(field, patterned().cameras, MeshOptions(cell_size=CELL, way=way))
     found = off(mesh.vertices)
     assert len(mesh.faces) > 1000 and abs(np.median(found)) < 0.03
     assert np.quantile(np.abs(found), 0.9) < CELL

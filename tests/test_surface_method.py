@@ -13,6 +13,7 @@ from lumigraph.camera import dome, ring
 from lumigraph.components.sampling.surface_method import AMBIENT, DIFFUSE, SurfaceMethod
 from lumigraph.datasets.scene import Frame
 from lumigraph.export.mesh import extract_mesh
+from lumigraph.export.options import MeshOptions
 
 pytestmark = budget("methods", 6)
 RADIUS, BACKGROUND = 0.6, (0.2, 0.4, 0.8)
@@ -69,7 +70,7 @@ def test_grey_is_brightest_where_the_surface_faces_the_camera(ball):
 def test_its_zero_level_becomes_a_mesh(ball):
     """Without its renderings: every vertex lies on the ball, also where no camera looked."""
     cameras = dome(ring(ball.frame.bounds, size=24, count=4))
-    mesh = extract_mesh(ball, cameras, cell=1 / 12, smooth=0, views=4, size=24)
+    mesh = extract_mesh(ball, cameras, MeshOptions(cell_size=1 / 12, smooth=0, views=4, size=24))
     radius = np.linalg.norm(mesh.vertices, axis=-1)
     assert np.abs(radius - RADIUS).max() < 0.01 and len(mesh.faces) > 500
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)

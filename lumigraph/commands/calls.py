@@ -1,178 +1,114 @@
-"""Commands as calls from Python: photographs to a scene, a scene to a run, a run to films and files.
+"""Commands of values from Python: `command("export mesh", run, "a.glb", from_="depth")` is the dataclass of it.
 
-    run = lumigraph.train("photos", "gaussian-splatting", seconds=60)
-    run.film("film.mp4")
-    run.export("web", "page.html")
-
-Each call is a command of the command line. Its options are keywords of the same names and units, with `_` for `-`:
-`--few-views yes` is few_views="yes", `--no-holes` is holes=False, `--from depth` is from_="depth", `--set time=0.3` is
-set={"time": 0.3}. `lumigraph COMMAND --help` lists them. Long work shows its progress on stderr.
+Options have the names of the command line, with `_` for `-`: `--few-views yes` is few_views="yes", `--no-holes` is
+holes=False, `--from depth` is from_="depth", `--set time=0.3` is set={"time": 0.3}. Values are checked against the
+types and ranges of the fields. No text is parsed as a command line.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields, is_dataclass, replace
+from typing import Any, TypeVar, get_args, get_origin
 
-from .. import methods
-from ..datasets.dataset import Dataset
-from ..datasets.scene import Scene
+from tyro.conf import Fixed, Positional
+
 from ..errors import LumigraphError
-from ..large import open_any
-from ..method import Method
-from ..opening import open_scene
-from ..run import Opened
+from ..files.names import counted
+from ..files.options import option_name
+from ..files.ranges import coherent, hints, members, typed
+from ..system.children import Request
 from ..system.work import at_work
-from .capture import scene_folder
-from .cli import parse
 from .common import kept_rows
-from .notebook_bar import NotebookBar, in_notebook
+from .request import kind_of
 
-FRAMES = re.compile("[╭╮╰╯│─]+|-{3,}|For full helptext, run .*")  # around faults of options
-Progress = Callable[[int, float, dict[str, Any]], object]
+T = TypeVar("T")
 
 
-def call(command: str, /, *arguments: object, **options: Any) -> dict[str, str]:
-    """Run a command by its name, as "export mesh" or "bench views", with its arguments in order and its options.
+def command(name: str, /, *arguments: object, **options: Any) -> Any:
+    """The command of a name, as "render" or "export mesh", with its positional arguments in order and its options.
 
-    Returns what the command line prints: text by name.
-    Raises LumigraphError for what the command refuses, and KeyboardInterrupt after Ctrl-C, with the work saved.
+    Options of None are as if left out. Raises LumigraphError, naming the option, for values that the command refuses.
     """
-    return conducted(understood([*command.split(), *map(str, arguments), *typed(options)]))
+    values = {key.rstrip("_"): value for key, value in options.items() if value is not None}
+    values |= by_name(name, arguments, values)
+    kind, where = kind_of(Request(name, values)), f"`lumigraph {name}`"
+    made = filled(kind, values, where)
+    if values:
+        raise LumigraphError(
+            f"{where} has no option {next(iter(values))}; `lumigraph {name} --help` lists what there is"
+        )
+    coherent(made)
+    return made
 
 
-def capture(photographs: str | Path | Iterable[str | Path], output: str | Path | None = None, **options: Any) -> Scene:
-    """Find the camera poses of photographs or of a video, and open the scene.
+def by_name(name: str, arguments: tuple[object, ...], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Positional arguments by the names of their fields; a field of several values takes all that are left."""
+    places = [
+        (field, kind)
+        for field, kind in hints(kind_of(Request(name))).items()
+        if Positional in get_args(kind)[1:] and field not in options
+    ]
+    given, rest = dict[str, Any](), list(arguments)
+    for field, kind in places:
+        if rest:
+            given[field], rest = (rest, []) if row_of(kind) else (rest[0], rest[1:])
+    if rest:
+        raise LumigraphError(f"`lumigraph {name}` is given {counted(len(rest), 'argument')} too many")
+    return given
 
-    photographs: a folder, a video, or image files
-    output:  folder of the scene; None: scenes/NAME. What lies there already of the same photographs is not done again
-    options: those of `lumigraph capture`
+
+def filled(kind: Any, options: dict[str, Any], where: str, default: Any = None) -> Any:
+    """A dataclass, and dataclasses that it holds, of options by name, which are taken out of `options`.
+
+    default: value to begin with, in place of the defaults of the fields
     """
-    many = [photographs] if isinstance(photographs, str | Path) else list(photographs)
-    folder = Path(output) if output is not None else scene_folder(tuple(map(Path, many)))
-    call("capture", *many, output=folder, **options)
-    return open_scene(folder)
+    given = dict[str, Any]()
+    for field in fields(kind):
+        hint = hints(kind)[field.name]
+        name = option_name(field.name, hint)
+        inner = next((x for x in members(hint) if is_dataclass(x)), None)
+        if Fixed in get_args(hint)[1:]:
+            continue
+        if inner is not None:
+            start = getattr(default, field.name, None) or field.default
+            given[field.name] = filled(inner, options, where, start if is_dataclass(start) else None)
+        elif name in options:
+            given[field.name] = typed(hint, plain(options.pop(name), hint), f"Option {name} of {where}")
+        elif default is None and field.default is MISSING and field.default_factory is MISSING:
+            raise LumigraphError(f"{where} lacks {name}; give it as an argument")
+    return kind(**given) if default is None else replace(default, **given)
 
 
-def train(
-    scene: str | Path | Dataset,
-    method: str | type[Method] = "gaussian-splatting",
-    output: str | Path | None = None,
-    *,
-    progress: Progress | None = None,
-    **options: Any,
-) -> Opened:
-    """Train a method, and open the run.
-
-    scene:    a path, "procedural:NAME", or a dataset as `capture` or `open_scene` opened it, which is opened again
-    method:   its name, or a class of your own
-    output:   folder of the run; None: runs/SCENE-METHOD-N
-    progress: told after each step: its number, the share of the budget that is spent, and the line of metrics.jsonl,
-              which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes.
-              None: a bar in a notebook, lines on stderr elsewhere
-    options:  those of `lumigraph train METHOD`
-    """
-    if not isinstance(scene, str | Path):
-        if not scene.source:
-            raise LumigraphError("This dataset came from no path, so a run could not open it again; train it by `fit`")
-        options = {**getattr(scene, "options", {}), **options}
-        scene = scene.source
-    if isinstance(method, type):
-        methods.register(method)
-        method = methods.name_of(method)
-    command = understood(["train", method, str(scene), *typed({"output": output, **options})])
-    bar = NotebookBar() if progress is None and in_notebook() else None
-    told = progress or bar
-    rows = conducted(command, lambda: command.run(Told(told) if told else None))
-    if bar:
-        bar.end()
-    return open_any(rows["run"])
+def row_of(kind: Any) -> Any:
+    """The tuple in an annotation of an option with several values; None for any other."""
+    return next((x for x in members(kind) if get_origin(x) is tuple), None)
 
 
-def open(path: str | Path) -> Opened:
-    """Open a run, a splat file or a composition. Raises LumigraphError for anything else."""
-    return open_any(path)
-
-
-def film(opened: Opened, file: str | Path, /, **options: Any) -> Path:
-    """Render a film; see `Opened.film`."""
-    call("render", opened.path, output=file, **options)
-    return Path(file)
-
-
-def export(opened: Opened, kind: str, file: str | Path, /, **options: Any) -> Path:
-    """Write files for other programs; see `Opened.export`."""
-    call(f"export {kind}", opened.path, file, **options)
-    return Path(file)
-
-
-def evaluate(opened: Opened, **options: Any) -> dict[str, Any]:
-    """Compare with held-out data; see `Opened.evaluate`."""
-    from ..evaluation import stem
-    from ..run.records import read_evaluation
-
-    options = {"overwrite": True, **options}
-    call("eval", opened.path, **options)
-    return read_evaluation(opened.path / f"{stem(options.get('split', 'test'))}.json")
-
-
-def derive(command: str, opened: Opened, output: str | Path, /, *arguments: str, **options: Any) -> Opened:
-    """Make a run, or a file, of another one by `convert`, `compress` or `clean`, and open it."""
-    call(command, opened.path, *arguments, output=output, **options)
-    return open_any(output)
-
-
-def typed(options: Mapping[str, Any]) -> list[str]:
-    """Options as words of the command line. None: as if left out."""
-    words = list[str]()
-    for name, value in options.items():
-        option = "--" + name.rstrip("_").replace("_", "-")
-        if isinstance(value, bool):
-            words.append(option if value else f"--no-{option[2:]}")
-        elif isinstance(value, Mapping):
-            words += [word for key, one in value.items() for word in (option, f"{key}={one}")]
-        elif isinstance(value, Sequence) and not isinstance(value, str):
-            words += [option, *map(str, value)]
-        elif value is not None:
-            words += [option, str(value)]
-    return words
-
-
-def understood(words: list[str]) -> Any:
-    """The command that words of the command line are. Raises LumigraphError where they are none."""
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        try:
-            return parse(words)
-        except SystemExit:
-            pass  # with its fault in `said`
-    fault = " ".join(FRAMES.sub(" ", said.getvalue()).split())
-    raise LumigraphError(f"{fault or words}; `lumigraph {words[0]} --help` lists what there is")
+def plain(value: Any, kind: Any) -> Any:
+    """A value of Python as JSON has it: paths as text, arrays as lists, {"time": 0.3} as ["time=0.3"]."""
+    if isinstance(value, Mapping):
+        value = [f"{name}={one}" for name, one in value.items()]
+    elif isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    elif hasattr(value, "tolist"):  # of NumPy or PyTorch
+        value = value.tolist()
+    if row := row_of(kind):
+        several = [value] if isinstance(value, str | int | float) else value
+        return [plain(one, get_args(row)[0]) for one in several]
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if number and str in members(kind) else value
 
 
 @at_work()
-def conducted(command: Any, run: Callable[[], int] | None = None) -> dict[str, str]:
-    """The rows that a command prints, kept from the terminal. run: in place of the command's own"""
+def quietly(work: Callable[[], T]) -> tuple[T, dict[str, Any]]:
+    """The result of a command's function, and the rows that it would print."""
     with kept_rows() as rows:
-        code = (run or command.run)()
+        return work(), rows
+
+
+def finished(code: int) -> None:
+    """Raise KeyboardInterrupt for the exit code of a command that Ctrl-C ended, with its work saved."""
     if code:
         raise KeyboardInterrupt
-    return {name: str(value) for name, value in rows.items()}
-
-
-class Told:
-    """A Watch that tells a function of each step, and never asks training to yield."""
-
-    asked = False
-
-    def __init__(self, progress: Progress):
-        self.progress = progress
-
-    def give_way(self, stopping: Callable[[], object]) -> None: ...
-
-    def note(self, step: int, progress: float, row: dict[str, Any]) -> bool:
-        return bool(self.progress(step, progress, row))

@@ -52,7 +52,7 @@ class Clean:
         beside = place.with_name(f"{place.name}.png")
         picture = beside if names_splats(self.output) else self.output / "clean.png"
         claim(picture, "comparison", self.overwrite, [self.source])
-        method = opened.method(device)
+        method = opened.ready(device)
         gaussians = needs(method, HasGaussians).gaussians()
         strength = STRENGTH if self.strength is None else self.strength
         floating = floaters(gaussians, photographers(opened, method), opened.frame, strength)

@@ -29,6 +29,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
+from ..files.options import option_name
 from ..files.ranges import coherent, domain, is_surprising, outside, shown
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
@@ -37,7 +38,7 @@ from .bench import Bench
 from .canonicalise import Canonicalise
 from .capture import CaptureCommand
 from .clean import Clean
-from .common import say
+from .common import say, value_of
 from .compose import Compose
 from .compress import Compress
 from .convert import Convert
@@ -105,7 +106,7 @@ def with_range(kind: Any) -> Any:
 def held(command: Any) -> Any:
     """A command as it was typed. Raises LumigraphError for a number beyond its range, and for those that disagree."""
     for name, kind, value in outside(command):
-        called = next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), name).replace("_", "-")
+        called = option_name(name, kind).replace("_", "-")
         typed = " ".join(map(shown, value)) if isinstance(value, tuple) else shown(value)
         numbers = "numbers" if isinstance(value, tuple) else "a number"
         raise LumigraphError(f"--{called} cannot be {typed}; give it {numbers} from {domain(kind)}")
@@ -142,6 +143,7 @@ COMMANDS: dict[str, type] = {
     "bench": Bench,
     "gallery": Gallery,
 }
+DECISIVE = {"device": "auto", "preset": "auto", "field": ""}  # options on which defaults of others depend
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 
   lumigraph app                         photographs in and scene out, in a browser
@@ -226,7 +228,8 @@ def parse(arguments: list[str]) -> Any:
     there = {*methods.available(), *(methods.ALIASES if first == "train" else ())}
     named = [x for x in rest if x.replace("_", "-") in there] if first in ("train", "convert", "track") else []
     if named:  # the options of the method too
-        commands[first] = with_options_of(named[0], rest, commands[first])
+        given = {name: value_of(f"--{name}", rest, default) for name, default in DECISIVE.items()}
+        commands[first] = with_options_of(named[0], commands[first], **given)
     if first == "train" and rest[:1] == ["captions"]:  # a model and no method
         commands[first] = importlib.import_module(".train_captions", __package__).TrainCaptions
     kinds = []

@@ -8,12 +8,13 @@ from typing import Annotated, Any, Literal
 
 from ..files.ranges import Count
 from ..system.console import bold
-from .common import choose_device, show
+from .common import choose_device
 from .options import DeviceOption, Overwrite, RunOption, Set, controlled, option
+from .results import Evaluation, Reports
 
 
 @dataclass(frozen=True)
-class Eval:
+class Eval(Reports):
     """Compare a run with held-out photographs, or its surface with the training shapes.
 
     Writes RUN/eval.json (per view and mean PSNR, SSIM and fine detail, also by resolution where there are several, the
@@ -40,13 +41,14 @@ class Eval:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Evaluation:
         from ..evaluation import claim_evaluation, evaluate_run, stem
         from ..large import BlockRun, open_run
         from ..metrics import scores_of
         from ..metrics.detail import FineDetail
         from ..metrics.lpips import load_lpips, named_files
         from ..metrics.rows import last_psnr
+        from ..run.records import read_evaluation
         from .outcome import beside_training, next_commands
 
         run = open_run(self.run_folder)
@@ -58,7 +60,7 @@ class Eval:
             data: Any = run.dataset(self.scene, self.split)
             method = controlled(run, run.method(device, data.about.get("exposure")), self.settings)
         else:
-            method = controlled(run, run.method(device), self.settings)
+            method = controlled(run, run.ready(device), self.settings)
             data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
@@ -71,8 +73,8 @@ class Eval:
         learnt = last_psnr(run.metrics())
         if learnt is not None and self.split != "train" and "psnr" in result:
             rows["photographs learnt from"] = beside_training(learnt, result, run, method)
-        show(rows | next_commands(run, "eval"))
-        return 0
+        path = name.with_name(f"{name.name}.json")
+        return Evaluation(path, read_evaluation(path), rows=rows | next_commands(run, "eval"))
 
 
 def compared(result: dict[str, Any]) -> dict[str, str]:

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from ..errors import LumigraphError, LumigraphWarning
+from ..export.options import FOR_PHONES, MeshOptions
 from ..files import claim
-from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, Share, SphereSize, between
-from .common import show
+from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Seconds, SphereSize, between
+from .common import say
 from .export_probes import ExportProbes
 from .export_web import ExportWeb
 from .options import (
@@ -32,13 +33,20 @@ from .options import (
     photographers,
     told_origin,
 )
-
-FOR_PHONES = 100_000  # triangles that a phone shows with ease
-TEXTURED = 50_000  # triangles whose texture holds the finer detail
+from .results import Exported, Reports
 
 
 @dataclass(frozen=True)
-class ExportMesh:
+class Files:
+    """Source and output of an export."""
+
+    source: SourceOption
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new file."""
+
+
+@dataclass(frozen=True)
+class ExportMesh(Reports, MeshOptions, Files):
     """Export a triangle mesh with vertex colours or a texture, in the frame of the photographs or upright.
 
     The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
@@ -47,43 +55,6 @@ class ExportMesh:
     Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 
-    source: SourceOption
-    output: Annotated[Positional[Path], needed("FILE")]
-    """The new file."""
-    extent: Annotated[
-        Annotated[float, between(0.001, 1000)] | None, option("TIMES", "1 for objects, 1.5 for the rest")
-    ] = None
-    """Size of the meshed region, times the box of interest in `lumigraph info`; or give --box or --sphere."""
-    cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
-    """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
-    way: Annotated[
-        Literal["auto", "distance", "density", "own", "depth"],
-        arg(name="from", help_behavior_hint="(default: the first of these that the method has)"),
-    ] = "auto"
-    """Source of the surface: the signed distance, the density field, the method's own mesh, or rendered depth."""
-    level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
-    """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
-    smooth: Annotated[int, between(0, 1000), option("N")] = 10
-    """Rounds of smoothing; more round off detail, 0 is none."""
-    faces: Annotated[
-        Annotated[int, between(4, 1_000_000_000)] | None,
-        option("N", f"all, for phones {FOR_PHONES:,}, with --texture {TEXTURED:,}"),
-    ] = None
-    """Number of triangles after simplification; fewer make a smaller file."""
-    texture: bool = False
-    """Give the mesh a texture and a normal map (.glb, .obj, .usdz), from the photographs where they are at hand."""
-    texture_size: Annotated[int, between(64, 32_768), option("TEXELS")] = 2048
-    """Width and height of the texture; larger shows finer print, and takes more memory and a larger file."""
-    lit: bool = False
-    """Let lights of a viewer act on a textured mesh; otherwise it shines in the photographs' own light."""
-    keep: Annotated[Share, option("SHARE")] = 0.01
-    """Smallest piece to keep, as a share of the largest one's area; larger removes more fragments."""
-    unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
-    """Unseen surface: close it for a watertight mesh, or cut it."""
-    size: Annotated[Pixels, option("PIXELS")] = 400
-    """Longer side of the pictures for colours and depth, at most that of the photographs; larger is finer, slower."""
-    views: Annotated[Count, option("N")] = 64
-    """Largest number of these pictures, and of photographs for a texture."""
     moments: Annotated[Annotated[int, between(2, 1000)] | None, option("N", "one, as --set time says")] = None
     """Number of moments of a scene that moves, evenly spread: a mesh each, FILE-000 and on."""
     scene: PhotographsOption = None
@@ -94,7 +65,7 @@ class ExportMesh:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.mesh_file import files_of
 
         if self.moments is not None:
@@ -102,46 +73,41 @@ class ExportMesh:
         for path in files_of(self.output, self.texture):
             claim(path, "mesh", self.overwrite, [self.source])
         opened, mesh, why = self.extracted()
-        show(self.written(opened, mesh, why))
-        return 0
+        return self.written(opened, mesh, why)
 
-    def _sequence(self, count: int) -> int:
+    def _sequence(self, count: int) -> Exported:
         """Write a mesh of each of some moments."""
         from ..large import open_any
 
         times = open_any(self.source).frame.times
         if times is None:
             raise LumigraphError(f"{self.source} does not move, so it has one mesh; leave out --moments")
+        made = []
         for i in range(count):
             time = times[0] + (times[1] - times[0]) * i / (count - 1)
             output = self.output.with_stem(f"{self.output.stem}-{i:03}")
-            replace(self, output=output, moments=None, settings=(*self.settings, f"time={time:.9g}")).run()
-        return 0
+            one = replace(self, output=output, moments=None, settings=(*self.settings, f"time={time:.9g}")).made()
+            say(f"{i + 1} of {count}: {one}, {one.rows['triangles']}")
+            made.append(one)
+        files = tuple(file for one in made for file in one.files)
+        counts = {name: sum(one.counts[name] for one in made) for name in made[0].counts}
+        rows = {"files": f"{made[0]} to {made[-1]}", "triangles": f"{counts['triangles']:,}, all moments together"}
+        return Exported(made[0].path, counts, files, rows=rows)
 
     def extracted(self) -> tuple[Any, Any, str]:
         """The opened source, its mesh in the frame of exports, and the source of the surface as text."""
         from ..export.mesh import best_way, extract_mesh
 
-        for_phones = self.output.suffix.lower() == ".usdz" and not self.texture
         opened, method, cameras = open_method(self.source, self.device, self.settings, self.scaling)
         method = at_one_moment(method)
-        way, why = best_way(method) if self.way == "auto" else (self.way, f"{self.way}, as --from says")
+        why = best_way(method)[1] if self.way == "auto" else f"{self.way}, as --from says"
+        for_phones = self.output.suffix.lower() == ".usdz" and not self.texture and self.faces is None
         mesh = extract_mesh(
             self.part.without_floaters(method, opened),
             opened.survey(cameras["train"]),
-            extent=self.extent,
-            crop=self.part.crop(opened.frame),
-            cell=None if self.cell_size is None else self.cell_size / opened.frame.to_export.scale,
-            level=self.level,
-            way=way,
-            smooth=self.smooth,
-            faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
-            keep=self.keep,
-            closed=None if self.unseen is None else self.unseen == "close",
-            size=self.size,
-            views=self.views,
-            texture=self.texture_size if self.texture else None,
-            photographs=self.photographs(opened),
+            replace(self, faces=FOR_PHONES) if for_phones else self,
+            self.part.crop(opened.frame),
+            self.photographs(opened),
         )
         return opened, mesh.in_source(opened.frame), why
 
@@ -159,8 +125,8 @@ class ExportMesh:
                 warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
             return None
 
-    def written(self, opened: Any, mesh: Any, why: str, pieces: Any = None) -> dict[str, str]:
-        """Write the files. Returns results for the terminal. why: source of the surface, and the reason"""
+    def written(self, opened: Any, mesh: Any, why: str, pieces: Any = None) -> Exported:
+        """Write the files. why: source of the surface, and the reason; pieces: for collisions, by name"""
         from ..export.mesh_file import WITH_ORIGIN, write_mesh
 
         up = opened.frame.to_source.rotation[:, 2].numpy()
@@ -176,7 +142,9 @@ class ExportMesh:
             "extent": " x ".join(f"{x:.4g}" for x in high - low) + f" {frame}",
             "size": f"{sum(file.stat().st_size for file in written) / 1e6:.1f} MB",
         }
-        return rows | ({"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {}) | place
+        rows |= {"texture": f"{self.texture_size} x {self.texture_size} texels"} if self.texture else {}
+        counts = {"triangles": len(mesh.faces), "vertices": len(mesh.vertices)}
+        return Exported(self.output, counts, tuple(written), rows=rows | place)
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -217,7 +185,7 @@ class Levels:
 
 
 @dataclass(frozen=True)
-class ExportSplats:
+class ExportSplats(Reports):
     """Export a trained cloud of Gaussians for splat viewers, or convert a splat file to another format.
 
     The ending chooses the format: .ply (lossless), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no view-dependent
@@ -237,12 +205,12 @@ class ExportSplats:
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..exchange.fourdgs import is_moving_file
 
         return self._moving() if is_moving_file(self.output) else self._one_moment()
 
-    def _moving(self) -> int:
+    def _moving(self) -> Exported:
         """Write every moment of a run or file that moves."""
         from ..exchange.fourdgs import write_moving
         from ..large import open_any
@@ -253,7 +221,7 @@ class ExportSplats:
         claim(self.output, "splats", self.overwrite, [self.source])
         opened = open_any(self.source)
         self.scaling.remember(opened)
-        method = controlled(opened, opened.method(), self.settings)
+        method = controlled(opened, opened.ready("cpu"), self.settings)
         if "time" in method.settings:
             raise LumigraphError("A .4dgs holds every moment; leave out --set time, or name a .spz for one of them")
         moving = needs(method, HasMovingGaussians).moving(self.duration)
@@ -268,10 +236,9 @@ class ExportSplats:
             "duration": f"{moving.duration:g} s",
             "size": f"{size / 1e6:.1f} MB, {size / max(len(moving), 1):.1f} bytes each",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"still": still, "moving": moving.moving}, rows=rows)
 
-    def _one_moment(self) -> int:
+    def _one_moment(self) -> Exported:
         """Write a cloud as it is at one moment."""
         from ..exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ..exchange.streamed_sog import Detail
@@ -295,7 +262,7 @@ class ExportSplats:
         else:
             opened = open_any(self.source)
             self.scaling.remember(opened)
-            method = controlled(opened, opened.method(), self.settings)
+            method = controlled(opened, opened.ready("cpu"), self.settings)
             gaussians = needs(method, HasGaussians).gaussians()
             crop = self.part.crop(method.frame)
             gaussians = self.part.of_gaussians(gaussians, crop, method.frame, photographers(opened, method))
@@ -307,12 +274,11 @@ class ExportSplats:
             "Gaussians": f"{len(written):,}",
             "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
         }
-        show(rows)
-        return 0
+        return Exported(output, {"gaussians": len(written)}, rows=rows)
 
 
 @dataclass(frozen=True)
-class ExportOctree:
+class ExportOctree(Reports):
     """Export the octree of a plenoctrees run as one .npz, for volrend and svox.
 
     It is in the frame of the photographs. If that is rotated against the scene's, it is in the scene's frame, because
@@ -328,7 +294,7 @@ class ExportOctree:
     overwrite: Overwrite = False
     settings: Set = ()
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         if self.output.suffix.lower() != ".npz":
             raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
         claim(self.output, "octree", self.overwrite, [self.source])
@@ -337,7 +303,7 @@ class ExportOctree:
         from ..method.capabilities import HasOctree, needs
 
         opened = open_any(self.source)
-        octree = needs(controlled(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
+        octree = needs(controlled(opened, opened.ready("cpu"), self.settings), HasOctree).octree(self.depth)
         in_source = write_octree(self.output, octree, opened.frame)
         rows = {
             "file": str(self.output),
@@ -345,12 +311,11 @@ class ExportOctree:
             "frame": "of the photographs" if in_source else "of the scene, for the format has no rotation",
             "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"nodes": len(octree.child)}, rows=rows)
 
 
 @dataclass(frozen=True)
-class ExportPoints:
+class ExportPoints(Reports):
     """Export coloured points with normals, spread evenly over the surfaces that the photographs show.
 
     They are in the frame of the photographs. Floaters are left out: several cameras must see each point.
@@ -372,7 +337,7 @@ class ExportPoints:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         if self.output.suffix.lower() != ".ply":
             raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
         claim(self.output, "points", self.overwrite, [self.source])
@@ -389,15 +354,14 @@ class ExportPoints:
             "points": f"{len(points.positions):,}",
             "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
         }
-        show(rows | place)
-        return 0
+        return Exported(self.output, {"points": len(points.positions)}, rows=rows | place)
 
 
 GridSide = Annotated[int, between(2, 64)]
 
 
 @dataclass(frozen=True)
-class ExportLightField:
+class ExportLightField(Reports):
     """Render a two-plane light field: an n x n grid of pictures around a camera, sheared to a common focal plane.
 
     A folder: pictures named as in the Stanford light field archive (out_ROW_COLUMN_Y_X.png) and transforms.json, by
@@ -423,7 +387,7 @@ class ExportLightField:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.light_field import SPAN, focal_distance, quilt, write_light_field
         from ..figures import save_picture
         from ..files import claim_folder
@@ -447,11 +411,11 @@ class ExportLightField:
             claim(output, "quilt", self.overwrite, [self.source])
             spacing = span / (columns * lines - 1)
             save_picture(output, quilt(method, camera, columns, lines, spacing, focus), "quilt")
-            show({"quilt": str(output), "views": str(columns * lines), **rows})
-            return 0
+            views = columns * lines
+            return Exported(output, {"views": views}, rows={"quilt": str(output), "views": str(views), **rows})
         write_light_field(self.output, method, camera, self.grid, span / (self.grid - 1), focus, opened.frame)
-        show({"light field": str(self.output), "pictures": f"{self.grid} x {self.grid}", **rows})
-        return 0
+        rows = {"light field": str(self.output), "pictures": f"{self.grid} x {self.grid}", **rows}
+        return Exported(self.output, {"views": self.grid**2}, rows=rows)
 
     def _number(self, opened: Any) -> int:
         """Row of the photograph of --view among those to learn from."""
@@ -468,7 +432,7 @@ Place = Annotated[
 
 
 @dataclass(frozen=True)
-class SphereExport:
+class SphereExport(Reports):
     """Base of exports of the whole sphere around a place."""
 
     source: SourceOption
@@ -502,13 +466,13 @@ class ExportPanorama(SphereExport):
     The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
     """
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.panorama import panorama, save_sphere
 
         _, method, place, heading, where = self.opened()
         save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
-        show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})
-        return 0
+        rows = {"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where}
+        return Exported(self.output, {"width": self.size, "height": self.size // 2}, rows=rows)
 
 
 CONTRACTED = (
@@ -518,7 +482,7 @@ CONTRACTED = (
 
 
 @dataclass(frozen=True)
-class ExportSnerg:
+class ExportSnerg(Reports):
     """Export a baked run as the folder of SNeRG's own viewer: scene_params.json and slices of its atlas as PNG.
 
     It is in the scene's frame with +y up. Such a folder also opens like a run. A folder of an open capture is
@@ -530,14 +494,14 @@ class ExportSnerg:
     output: Annotated[Positional[Path], needed("FOLDER")]
     """The new folder."""
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..exchange import size_of, snerg
         from ..files import claim_folder
         from ..large import open_any
         from ..method.capabilities import HasAtlas, needs
 
         claim_folder(self.output, "atlas")
-        atlas = needs(open_any(self.source).method(), HasAtlas).atlas()
+        atlas = needs(open_any(self.source).ready("cpu"), HasAtlas).atlas()
         snerg.write(self.output, atlas)
         if atlas.contracted:
             warnings.warn(CONTRACTED, LumigraphWarning, stacklevel=2)
@@ -547,8 +511,7 @@ class ExportSnerg:
             "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks",
             "size": f"{size_of(self.output) / 1e6:.1f} MB",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"voxels": x * y * z, "blocks": len(atlas.values)}, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -563,7 +526,7 @@ class ExportStereo(SphereExport):
     interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
     """Distance between the eyes, in units of the photographs' frame; larger makes the scene look smaller and deeper."""
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.panorama import EYE_DISTANCE_SHARE, save_sphere, stereo_pair, surrounding_distances, top_bottom
 
         opened, method, place, heading, where = self.opened()
@@ -583,8 +546,7 @@ class ExportStereo(SphereExport):
             "from": where,
             "eyes": f"{apart * unit:.4g} apart; half of all is nearer than {middle * unit:.4g}",
         }
-        show(rows)
-        return 0
+        return Exported(self.output, {"width": self.size, "height": self.size}, rows=rows)
 
 
 PIECE_NAMES = {"unreal": "UCX_{name}_{number:02}", "godot": "{name}_{number:02}-convcolonly"}
@@ -605,7 +567,7 @@ class ExportCollision(ExportMesh):
     pieces: Annotated[Annotated[int, between(1, 1000)] | None, option("N", "as many as the concavity needs")] = None
     """Largest number of pieces."""
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.collision import convex_pieces
 
         claim(self.output, "mesh", self.overwrite, [self.source])
@@ -613,8 +575,8 @@ class ExportCollision(ExportMesh):
         found = convex_pieces(mesh, self.concavity, self.pieces)
         named = {PIECE_NAMES[self.engine].format(name="source", number=i): piece for i, piece in enumerate(found)}
         rows = {"pieces": f"{len(found)}, {sum(len(faces) for _, faces in found):,} triangles"}
-        show(self.written(opened, mesh, why, named) | rows)
-        return 0
+        made = self.written(opened, mesh, why, named)
+        return replace(made, counts={**made.counts, "pieces": len(found)}, rows={**made.rows, **rows})
 
     def check(self) -> None:
         super().check()

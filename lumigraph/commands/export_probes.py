@@ -10,7 +10,6 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Positive, between
-from .common import show
 from .options import (
     DeviceOption,
     Keeping,
@@ -26,12 +25,13 @@ from .options import (
     photographers,
     told_origin,
 )
+from .results import Exported, Reports
 
 Along = Annotated[int, between(1, 65_535)]
 
 
 @dataclass(frozen=True)
-class ExportProbes:
+class ExportProbes(Reports):
     """Export light probes: spherical harmonics of light and octahedral distances on a grid, as JSON and PNG.
 
     The grid fills the box of interest, or --box. Light is linear, in the frame of the photographs. Probes in matter
@@ -62,7 +62,7 @@ class ExportProbes:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.probes import bake_probes
         from ..files import claim, claim_folder
         from ..light.probes import FREE, MATTER, UNSEEN, write_probes
@@ -79,17 +79,16 @@ class ExportProbes:
         grid = bake_probes(method, seers, box, spacing, self.counts, self.order, self.resolution)
         origin, place = told_origin(opened.frame, self.origin)
         write_probes(self.output, grid, origin and origin.to_json())
-        state = grid.state
+        named = {"free": FREE, "matter": MATTER, "unseen": UNSEEN}
+        counts = {name: int((grid.state == state).sum()) for name, state in named.items()}
         rows = {
             "probes": str(self.output),
             "grid": " x ".join(map(str, grid.counts)),
-            "states": f"{int((state == FREE).sum()):,} free, {int((state == MATTER).sum()):,} in matter, "
-            f"{int((state == UNSEEN).sum()):,} seen by no camera",
+            "states": "{free:,} free, {matter:,} in matter, {unseen:,} seen by no camera".format(**counts),
         }
         if self.page is not None:
             rows |= {"page": self._page(opened, method, cameras, grid)}
-        show(rows | place)
-        return 0
+        return Exported(self.output, counts, (self.output, *([self.page] if self.page else [])), rows=rows | place)
 
     def _page(self, opened: Any, method: Any, cameras: Any, grid: Any) -> str:
         """Write the page. Returns its name."""

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ..errors import LumigraphError
+from ..export.options import MeshOptions
 from ..files import claim
 from ..files.ranges import Seconds, between
 from .common import choose_device, show
@@ -27,13 +28,14 @@ from .options import (
     option,
     photographers,
 )
+from .results import Exported, Reports
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "volume", "mesh", "views"]
 
 
 @dataclass(frozen=True)
-class ExportWeb:
+class ExportWeb(Reports):
     """Export one HTML file that opens from disk, in any browser, without a server or a network.
 
     Gaussians are drawn as splats, with a slider of the moment where they move; octrees and atlases by ray marching.
@@ -73,7 +75,7 @@ class ExportWeb:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Exported:
         from ..export.page import backdrop
         from ..paths.opening import opening_of_scene
 
@@ -90,13 +92,12 @@ class ExportWeb:
         behind = backdrop(still, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
-        held = self._write(kind, method if kind == "splats" else still, opened, cameras["train"], opening)
+        held, counts = self._write(kind, method if kind == "splats" else still, opened, cameras["train"], opening)
         size = f"{self.output.stat().st_size / 1e6:.1f} MB"
-        show(rows | {"page": str(self.output), "holds": held, "size": size})
-        return 0
+        return Exported(self.output, counts, rows=rows | {"page": str(self.output), "holds": held, "size": size})
 
-    def _write(self, kind: str, method: Any, opened: Any, cameras: Any, opening: Any) -> str:
-        """Write the page. Returns its contents in words."""
+    def _write(self, kind: str, method: Any, opened: Any, cameras: Any, opening: Any) -> tuple[str, dict[str, int]]:
+        """Write the page. Returns its contents in words, and in numbers."""
         from ..export.mesh import extract_mesh
         from ..export.page import mesh_page, moving_page, splats_page, views_page, volume_page
         from ..method.capabilities import HasGaussians, HasMovingGaussians, can, needs
@@ -108,22 +109,24 @@ class ExportWeb:
                 moving = moving[self.part.kept(moving.cloud, crop, method.frame, seers)]
                 moving_page(self.output, moving, opening)
                 still = len(moving) - moving.moving
-                return f"{still:,} Gaussians that stand still, {moving.moving:,} spans of those that move"
+                held = f"{still:,} Gaussians that stand still, {moving.moving:,} spans of those that move"
+                return held, {"still": still, "moving": moving.moving}
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, crop, method.frame, seers)
             splats_page(self.output, gaussians, opening)
-            return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}"
+            held = f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}"
+            return held, {"gaussians": len(gaussians)}
         if kind == "volume":
             volume, held = browsable(method, self.degree)
             volume_page(self.output, volume, opening)
-            return held
+            return held, {name: volume.settings[name] for name in ("leaves", "blocks") if name in volume.settings}
         if kind == "views":
             views_page(self.output, self.part.of_method(method, opened), cameras, opening, self.views, self.size)
-            return f"{self.views} views"
+            return f"{self.views} views", {"views": self.views}
         whole, crop = self.part.without_floaters(method, opened), self.part.crop(method.frame)
-        mesh = extract_mesh(whole, cameras, crop=crop, faces=FACES)
+        mesh = extract_mesh(whole, cameras, MeshOptions(faces=FACES), crop)
         mesh_page(self.output, mesh, opening)
-        return f"{len(mesh.faces):,} triangles"
+        return f"{len(mesh.faces):,} triangles", {"triangles": len(mesh.faces)}
 
     def _kind(self, opened: Any, method: Any) -> str:
         from ..method.capabilities import HasGaussians, can

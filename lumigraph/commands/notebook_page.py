@@ -7,10 +7,14 @@ import html
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from ..errors import LumigraphError
+from ..large import held_open
 from ..method.capabilities import HasGaussians, can
 from ..run import Opened
+from .calls import quietly
+from .export_web import ExportWeb
 
 MAX_PAGE_BYTES = 8e6  # of a page in a notebook's file
 MAX_SECONDS = 6.0  # that rendering the pictures of a page may take
@@ -40,7 +44,7 @@ def shown(opened: Opened) -> str:
 
 def small_page(opened: Opened) -> str | None:
     """Page of splats, or of as many views as are rendered in MAX_SECONDS; None where it is larger or takes longer."""
-    options: dict[str, object] = {"as_": "splats"}
+    options: dict[str, Any] = {"kind": "splats"}
     if not can(opened.ready(), HasGaussians):
         opened.still(VIEW_PIXELS)  # compiles kernels
         begin = time.monotonic()
@@ -49,7 +53,8 @@ def small_page(opened: Opened) -> str | None:
         if views < MIN_VIEWS:
             return None
         longest = int(opened.cameras()["train"].size.max())
-        options = {"as_": "views", "views": views, "size": min(VIEW_PIXELS, longest)}
-    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:
-        page = opened.export("web", Path(folder) / "page.html", title=opened.title, **options)
+        options = {"kind": "views", "views": views, "size": min(VIEW_PIXELS, longest)}
+    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder, held_open(opened):
+        page = Path(folder) / "page.html"
+        quietly(ExportWeb(opened.path, page, title=opened.title, **options).made)
         return page.read_text("utf-8") if page.stat().st_size <= MAX_PAGE_BYTES else None

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import Fixed, Positional, Suppress, UseAppendAction, arg
 
 from ..errors import LumigraphError
+from ..files.options import needed as needed
+from ..files.options import option as option
 from ..files.ranges import Coordinate, Positive, Seed, Share, Steps
 from ..files.readers import LISTED, NAMES
 
@@ -19,17 +21,6 @@ if TYPE_CHECKING:
     Reader = str
 else:
     Reader = Literal[NAMES]
-
-
-def option(metavar: str, default: str | None = None, about: str | None = None, name: str | None = None) -> Any:
-    """An option in --help: its placeholder, its default in words, its description, its name if not the field's."""
-    hint = default and f"(default: {default})"
-    return arg(metavar=metavar, help_behavior_hint=hint, help=about, name=name)
-
-
-def needed(metavar: str, about: str | None = None, name: str | None = None) -> Any:
-    """An argument without a default in --help."""
-    return option(metavar, "", about, name)
 
 
 DEVICE = "Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."
@@ -70,7 +61,7 @@ def open_method(
     opened = open_any(source)
     if scaling is not None:
         scaling.remember(opened)
-    method = controlled(opened, opened.method(choose_device(device)), settings)
+    method = controlled(opened, opened.ready(choose_device(device)), settings)
     return opened, method, {split: method.refined(cameras) for split, cameras in opened.cameras().items()}
 
 

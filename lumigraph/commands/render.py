@@ -10,9 +10,9 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, FramesPerSecond, Pixels
-from .common import show
 from .compress import size as file_size
 from .options import Animate, DeviceOption, Overwrite, Set, animate, needed, open_method, option
+from .results import Film, Reports
 
 # As in `paths`, which help must not import.
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "still", "held-out")
@@ -25,7 +25,7 @@ CHOSEN = {
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(Reports):
     """Render a film of a run, a splat file or a composition.
 
     Paths stay near the positions of the photographs. orbit goes round (or to and fro). sweep is an oval among cameras
@@ -56,7 +56,7 @@ class Render:
     animated: Animate = ()
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
+    def made(self) -> Film:
         from ..export.film import claim_film, depth_beside, film
         from ..export.video import kind_of
         from ..method.capabilities import HasGaussians, can
@@ -79,12 +79,24 @@ class Render:
         shown = animate(opened, method, self.animated, len(cameras))
         about = film(shown, cameras, output, fps, self.depth, self.pictures)
         width, height = about["size"]
+        frames, seconds = about["frames"], about["seconds_per_frame"]
+        beside = depth_beside(output) if self.depth else None
         rows = {"film": f"{output}, {file_size(output.stat().st_size)}"}
         rows |= {"path": CHOSEN[path]} if self.path == AUTO else {}
-        rows |= {"depth": str(depth_beside(output))} if self.depth else {}
+        rows |= {"depth": str(beside)} if beside else {}
         rows |= {"pictures": f"{output.with_suffix('')}/0000.{self.pictures} …"} if self.pictures else {}
-        show(rows | {"frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each"})
-        return 0
+        rows |= {"frames": f"{frames} of {width}x{height}, {seconds:.3f} s each"}
+        return Film(
+            output,
+            frames,
+            fps,
+            (width, height),
+            seconds * frames,
+            cameras=output.with_suffix(".json"),
+            depth=beside,
+            pictures=output.with_suffix("") if self.pictures else None,
+            rows=rows,
+        )
 
 
 def read_path(name: str, fps: float | None) -> Any:

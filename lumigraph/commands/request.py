@@ -27,18 +27,25 @@ def command_of(data: bytes) -> Any:
 
 
 def kind_of(request: Request) -> type:
-    """The dataclass of a command; of `train` with the method's own numbers."""
+    """The dataclass of a command; with the numbers of the method that its options name, for those that train one."""
+    from . import bench, explain, export
     from .cli import COMMANDS
-    from .export import What
     from .train import with_options_of
 
-    exports = {f"export {marks.name}": kind for kind, marks in map(get_args, get_args(What))}
-    kinds = {**COMMANDS, **exports}
-    if request.command not in kinds or request.command == "export":
+    groups = {"bench": bench.What, "explain": explain.What, "export": export.What}
+    below = {f"{group} {marks.name}": x for group, what in groups.items() for x, marks in map(get_args, get_args(what))}
+    kinds = {name: kind for name, kind in COMMANDS.items() if name not in groups} | below
+    if (kind := kinds.get(request.command)) is None:
         raise LumigraphError(f"There is no command {request.command[:60]!r}")
-    if request.command == "train":
-        return with_options_of(str(request.options.get("method")), ())
-    return kinds[request.command]
+    options, method = request.options, request.options.get("method")
+    if request.command not in ("train", "convert", "track") or method is None:
+        return kind
+    if (request.command, method) == ("train", "captions"):
+        from .train_captions import TrainCaptions
+
+        return TrainCaptions
+    named = {name: str(options[name]) for name in ("device", "preset", "field") if options.get(name)}
+    return with_options_of(str(method), kind, **named)
 
 
 def main() -> int:

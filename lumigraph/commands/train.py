@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,7 +31,6 @@ from .common import (
     scene_name,
     show,
     typed,
-    value_of,
 )
 from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, ViewerToken, needed, option
 
@@ -61,8 +59,8 @@ class BlockOptions:
     """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
     field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
 
-    def run(self, train: Any) -> int | None:
-        """Train all blocks of a scene. Returns the exit code; None for a scene that `train` learns as a whole.
+    def learn(self, train: Any) -> tuple[Path, int] | None:
+        """Train all blocks of a scene. Returns the run and the exit code; None for a scene that `train` learns whole.
 
         train: the command's other options, a `Train`
         """
@@ -85,7 +83,7 @@ class BlockOptions:
                 raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
         return self._all(train, source, places)
 
-    def _all(self, train: Any, source: str, places: Any) -> int:
+    def _all(self, train: Any, source: str, places: Any) -> tuple[Path, int]:
         import torch
 
         from ..large.planning import BlockRecipe, begin, make_plan
@@ -111,9 +109,9 @@ class BlockOptions:
         show_plan(output, plan, budget)
         gpus = 1.0 if device.type == "cuda" else 0.0
         memory = min(MEMORY_BYTES, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY_BYTES
-        return train_all(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
+        return output, train_all(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
 
-    def _again(self, train: Any, run: Path) -> int:
+    def _again(self, train: Any, run: Path) -> tuple[Path, int]:
         from ..large.planning import survey
         from ..large.training import update
 
@@ -124,10 +122,10 @@ class BlockOptions:
         ended = update(run, self.blocks, source, survey(source, train.reader), options, budget)
         if ended.done is None:
             say("Stopped and saved; the same command goes on")
-            return exit_code(ended.signal)
+            return run, exit_code(ended.signal)
         took = f"{ended.done.steps} steps in {ended.done.seconds:.1f} s, from {ended.done.photographs} photographs"
         show({"run": str(run), f"block {self.blocks}": took} | onward(run, source))
-        return 0
+        return run, 0
 
 
 def train_all(output: Path, plan: Any, workers: Any) -> int:
@@ -247,8 +245,14 @@ class Train:
     """Port that --view listens at."""
     token: ViewerToken = ""
 
-    def run(self, watch: Any = None) -> int:
-        """Train, and print the outcome. watch: who looks on, in place of the viewer of --view; see `fit`"""
+    def run(self) -> int:
+        return self.learn()[1]
+
+    def learn(self, watch: Any = None) -> tuple[Path, int]:
+        """Train, and print the outcome. Returns the run and the exit code.
+
+        watch: of `fit`, in place of the viewer of --view
+        """
         from ..datasets.dataset import check_kind
         from ..opening import confirm, kind_of, open_dataset
         from ..run import Run, build, check_new
@@ -257,8 +261,8 @@ class Train:
         from .view import end_training, keep_showing, watching
 
         blocks: BlockOptions | None = getattr(self, "blocks", None)
-        if blocks is not None and (code := blocks.run(self)) is not None:
-            return code
+        if blocks is not None and (made := blocks.learn(self)) is not None:
+            return made
         budget = given_budget(self.steps, self.seconds, self.quality)
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
@@ -291,7 +295,7 @@ class Train:
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
             show_outcome(run, outcome, method, data, end_training(viewer, method))
             keep_showing(viewer if self.stay else None, outcome.signal)
-        return exit_code(outcome.signal)
+        return run.folder, exit_code(outcome.signal)
 
     def chosen(self, data: Any) -> str:
         """Name of the method. The word `surface`, without options of the method, depends on the scene."""
@@ -305,14 +309,18 @@ class Train:
         return methods.BOUNDED[self.method]
 
 
-def with_options_of(name: str, arguments: Sequence[str], command: type = Train) -> type[Any]:
+def with_options_of(
+    name: str, command: type = Train, device: str = "auto", preset: str = "auto", field: str = ""
+) -> type[Any]:
     """A command, `train` or one like it, with a method's own numbers among its options. Where the method is trained in
-    blocks, `train` also has `BlockOptions`, and the numbers of the method that --field names for each block."""
+    blocks, `train` also has `BlockOptions`, and the numbers of the method that --field names for each block.
+
+    device, preset, field: values of these options, on which the defaults depend
+    """
     in_blocks = command is Train and methods.find(name).in_blocks
-    if in_blocks and (field := value_of("--field", arguments, "").replace("_", "-")) in methods.available():
-        name = field
+    if in_blocks and (learner := field.replace("_", "-")) in methods.available():
+        name = learner
     kind = methods.find(name)
-    device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
     extra: dict[str, tuple[Any, Any]] = {}
     if "quality" in {x.name for x in dataclasses.fields(command)}:

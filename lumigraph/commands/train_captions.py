@@ -25,14 +25,14 @@ class TrainCaptions:
     cubes and cones in five colours. The new folder has open_clip's layout and is a model for --guidance.
     """
 
-    network: Annotated[Positional[Literal["captions"]], needed("captions")]
+    method: Annotated[Positional[Literal["captions"]], needed("captions")]
     """The model."""
     output: Annotated[Path | None, option("FOLDER", "runs/captions-N")] = None
     """New folder for the model."""
     numbers: Annotated[CaptionNumbers, OmitArgPrefixes] = CaptionNumbers()
 
     def run(self) -> int:
-        output = self.output or next_free(f"runs/{self.network}")
+        output = self.output or next_free(f"runs/{self.method}")
         claim_folder(output, "guidance")
         learned = learn_captions(self.numbers)
         with replacing_folder(output, "guidance") as new:

@@ -7,8 +7,8 @@ from .run import evaluate_run as evaluate_run
 from .run import stem as stem
 from .shapes import ShapesEvaluation as ShapesEvaluation
 from .shapes import evaluate_shapes as evaluate_shapes
-from .views import Evaluation as Evaluation
 from .views import ViewScore as ViewScore
+from .views import ViewsEvaluation as ViewsEvaluation
 from .views import compare as compare
 from .views import evaluate as evaluate
 from .views import file_name as file_name

@@ -25,7 +25,7 @@ from ..metrics.lpips import Lpips
 from ..run import Trained
 from ..system.progress import counting
 from .shapes import ShapesEvaluation, evaluate_shapes
-from .views import Evaluation, evaluate, file_name, reveal
+from .views import ViewsEvaluation, evaluate, file_name, reveal
 from .walks import evaluate_walk
 from .words import evaluate_words
 
@@ -142,13 +142,13 @@ def evaluate_collection(
     views: int | None = None,
     lpips: Lpips | None = None,
     right_halves: bool = False,
-) -> Evaluation | ShapesEvaluation:
+) -> ViewsEvaluation | ShapesEvaluation:
     """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
 
     keep:  receives each view's name and rendering; names begin with the member's
     views: of each member at most
     """
-    scenes: dict[str, Evaluation] = {}
+    scenes: dict[str, ViewsEvaluation] = {}
     shapes: dict[str, ShapesEvaluation] = {}
     for name, member in data.members(split):
         told = reveal(method, member)
@@ -166,7 +166,7 @@ def evaluate_collection(
     return joined_views(scenes, members) if scenes else joined_shapes(shapes, members)
 
 
-def joined_views(parts: dict[str, Evaluation], about_members: dict[str, Any]) -> Evaluation:
+def joined_views(parts: dict[str, ViewsEvaluation], about_members: dict[str, Any]) -> ViewsEvaluation:
     views = [replace(view, name=f"{name}/{view.name}") for name, part in parts.items() for view in part.views]
     shown = {f"{name}/{view}": seen for name, part in parts.items() for view, seen in list(part.shown.items())[:2]}
     sizes = list(dict.fromkeys(view.resolution for view in views))
@@ -177,7 +177,7 @@ def joined_views(parts: dict[str, Evaluation], about_members: dict[str, Any]) ->
         "psnr": "per view, averaged by member, then over all",
     }
     seconds = sum(part.compile_seconds for part in parts.values())
-    return Evaluation(views, about, seconds, shown, members=tuple(parts.values()))
+    return ViewsEvaluation(views, about, seconds, shown, members=tuple(parts.values()))
 
 
 def joined_shapes(parts: dict[str, ShapesEvaluation], members: dict[str, Any]) -> ShapesEvaluation:

@@ -18,6 +18,7 @@ from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
 from ..export.mesh import POINTS_PER_CHUNK, extract_mesh, find_surface, from_distance, make_grid
+from ..export.options import MeshOptions
 from ..figures import Row, contact_sheet
 from ..geometry import evenly
 from ..method import Method
@@ -163,7 +164,8 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     box = CropBox(*frame.bounds)
     cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):
-        return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
+        options = MeshOptions(cell_size=cell * method.frame.to_export.scale, smooth=0)
+        return extract_mesh(method, dome(ring(frame.bounds)), options)
 
     vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, from_distance(method, cell), -1.0)
     if not len(faces):

@@ -76,7 +76,7 @@ class ViewScore:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class ViewsEvaluation:
     """All views of a split, and how they were compared.
 
     compile_seconds: spent ahead of the first view
@@ -88,10 +88,10 @@ class Evaluation:
     compile_seconds: float
     shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
     poses: tuple[Score, ...] = ()  # how far refined poses are from true ones, where these are known
-    members: tuple[Evaluation, ...] = ()
+    members: tuple[ViewsEvaluation, ...] = ()
 
     @property
-    def _averaged(self) -> Sequence[Evaluation | ViewScore]:
+    def _averaged(self) -> Sequence[ViewsEvaluation | ViewScore]:
         return self.members or self.views
 
     @property
@@ -142,21 +142,21 @@ class Evaluation:
         return mean(view.seconds for view in self.views)
 
     @property
-    def by_resolution(self) -> dict[str, Evaluation]:
+    def by_resolution(self) -> dict[str, ViewsEvaluation]:
         """The views of each size alone, sizes in the order in which they come."""
         return self._by("resolution")
 
     @property
-    def by_held_out(self) -> dict[str, Evaluation]:
+    def by_held_out(self) -> dict[str, ViewsEvaluation]:
         """The views alone of new cameras, of new moments or of both, of a capture that moves."""
         return self._by("held_out")
 
-    def _by(self, name: str) -> dict[str, Evaluation]:
+    def _by(self, name: str) -> dict[str, ViewsEvaluation]:
         """The views of each value of one of their fields."""
         values = dict.fromkeys(getattr(view, name) for view in self.views)
         return {value: self._where(name, value) for value in values if value is not None}
 
-    def _where(self, name: str, value: str) -> Evaluation:
+    def _where(self, name: str, value: str) -> ViewsEvaluation:
         views = [view for view in self.views if getattr(view, name) == value]
         members = tuple(part for member in self.members if (part := member._where(name, value)).views)
         return replace(self, views=views, members=members)
@@ -218,7 +218,7 @@ def evaluate(
     views: int | None = None,
     lpips: Lpips | None = None,
     right_halves: bool = False,
-) -> Evaluation:
+) -> ViewsEvaluation:
     """Render the views of a split and compare them with their photographs.
 
     keep:  receives each view's name and rendering
@@ -277,7 +277,7 @@ def evaluate(
         )
     stated = protocol(scene, split, compared, lpips, method, right_halves) | ({"poses": PROTOCOL} if found else {})
     poses = tuple(pose_scores(method, scene))
-    return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
+    return ViewsEvaluation(scores, stated, compile_seconds, shown | worst, poses)
 
 
 def check_sizes(scene: Scene, compared: list[int], halves: bool) -> None:

@@ -25,6 +25,7 @@ from ..method import Method
 from ..method.capabilities import HasDensity, HasDistance, HasMesh, can, needs
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .options import TEXTURED_FACES, MeshOptions
 from .surface import (
     BLOCK,
     Faces,
@@ -42,7 +43,6 @@ from .texture import Views, check_room, photographed, rendered, textured
 
 DEFAULT_CELLS = 256  # default, along the longest side of the box
 OPEN_BOX = 1.5  # times the box of interest, for rooms and open scenes
-TEXTURED_FACES = 50_000  # triangles of a mesh with a texture, without another budget
 MIN_CELLS, MAX_CELLS = 8, 2048  # cells along it that make sense
 PROBE_CELLS = 160  # probes along it that locate the surface
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
@@ -63,57 +63,37 @@ Way = Literal["distance", "density", "own", "depth"]
 def extract_mesh(
     method: Method,
     cameras: Camera,
-    *,
-    extent: float | None = None,
+    options: MeshOptions = MeshOptions(),
     crop: Crop | None = None,
-    cell: float | None = None,
-    level: float | None = None,
-    way: Way | None = None,
-    smooth: int = 10,
-    faces: int | None = None,
-    keep: float = 0.01,
-    closed: bool | None = None,
-    size: int = 400,
-    views: int = 64,
-    texture: int | None = None,
     photographs: Scene | None = None,
 ) -> Mesh:
     """The surface in the middle of a scene, in the scene's frame.
 
     cameras: the scene's own; what none of them sees is left out, or filled in
-    extent:  size of what is meshed, times the frame's box of interest; None for 1 around an object, 1.5 in the open
-    crop:    what is meshed instead, as far as the scene reaches
-    cell:    side of the cubes that are marched through, scene units; None for 1/256 of the box's longest side
-    level:   density of the surface, per scene unit; None for that where the cameras see surfaces
-    way:     source of the surface; None for `best_way`
-    smooth:  rounds of smoothing
-    faces:   number of triangles to come down to; None for all, or for TEXTURED_FACES with a texture
-    keep:    pieces with less than this share of the largest one's area are dropped
-    closed:  whether the surface is closed around what no camera sees, or cut there; None closes objects alone
-    size:    longer side of the cameras' pictures at most, pixels
-    views:   cameras at most
-    texture: texels a side of a texture; None for colours at vertices alone
+    crop:    what is meshed instead of the box of interest, as far as the scene reaches
     photographs: the scene whose training split `cameras` are. Pixels that its masks leave out of learning show no
              surface, and a texture is made of its colours. None for no masks, and a texture of the method's renderings
     Raises LumigraphError where nothing is solid, where a texture does not fit into memory, and for numbers that make
     no sense.
     """
+    texture = options.texture_size if options.texture else None
     if texture is not None:
         check_room(texture)
     method.eval()
-    closed = not method.frame.is_open if closed is None else closed
-    limits = meshed_box(method.frame, extent) if crop is None else within_reach(method.frame, crop)
+    closed = not method.frame.is_open if options.unseen is None else options.unseen == "close"
+    limits = meshed_box(method.frame, options.extent) if crop is None else within_reach(method.frame, crop)
     holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
-    grid, way = make_grid(limits, cell), way or best_way(method)[0]
-    faces = TEXTURED_FACES if faces is None and texture is not None else faces
-    made = own_mesh(method, holds, keep, smooth, faces) if way == "own" else None
+    cell = None if options.cell_size is None else options.cell_size / method.frame.to_export.scale
+    grid, way = make_grid(limits, cell), best_way(method)[0] if options.way == "auto" else options.way
+    faces = TEXTURED_FACES if options.faces is None and texture is not None else options.faces
+    made = own_mesh(method, holds, options.keep, options.smooth, faces) if way == "own" else None
     if made is not None and texture is None:
         return made
-    depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
+    depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
     sources: list[Views] = [lambda _: rendered(depth_maps)]
     learnt = depth_maps
     if photographs is not None:
-        chosen = evenly(range(len(cameras)), views)
+        chosen = evenly(range(len(cameras)), options.views)
         learnt = without_masked(depth_maps, photographs, chosen)
         sources.insert(0, lambda spacing: photographed(photographs, cameras, chosen, depth_maps, spacing))
     if made is not None and texture is not None:
@@ -127,7 +107,8 @@ def extract_mesh(
         if way == "distance":
             own = from_distance(method, grid.cell)
         else:
-            own = from_density(method, surface_level(method, learnt, holds) if level is None else level)
+            level = surface_level(method, learnt, holds) if options.level is None else options.level
+            own = from_density(method, level)
         value = near_depth(own, interpolated(value, grid, step))
     vertices, triangles = find_surface(grid, step, holds, value, -1.0 if closed else math.nan)
     if len(triangles):
@@ -142,14 +123,14 @@ def extract_mesh(
             triangles = triangles[seen_well[triangles].all(-1)]
         corners, triangles = manifold(triangles)
         if len(triangles):
-            vertices, triangles = larger_pieces(vertices[corners], triangles, keep, seen_well[corners])
+            vertices, triangles = larger_pieces(vertices[corners], triangles, options.keep, seen_well[corners])
     if not len(triangles):
         raise LumigraphError(
             "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "
             "try a lower --level"
         )
     with counting("Smoothing the surface"):
-        vertices = smoothed(vertices, triangles, smooth)
+        vertices = smoothed(vertices, triangles, options.smooth)
         detailed = vertices, triangles
         if faces is not None:
             vertices, triangles = simplified(vertices, triangles, faces)

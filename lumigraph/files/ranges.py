@@ -191,6 +191,8 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
             ranged = domain(wanted) if re.match(r"Expected `\w+` [<>]", fault) else ""
             should = f"be from {ranged}" if ranged else fault.replace("Expected", "be", 1)
             should = "be a name" if "matching regex" in should else should
+            if choices := [x for one in members(wanted) if get_origin(one) is Literal for x in get_args(one)]:
+                should = f"be {' or '.join(map(str, choices))}"
             what = f"{name or 'it'} is {shown(found)}, and should {should}"
         raise LumigraphError(f"{where} does not hold what it should: {what}") from error
     if key is not None:

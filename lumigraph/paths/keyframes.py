@@ -51,7 +51,7 @@ class Keyframe:
 
 
 @dataclass(frozen=True)
-class Film:
+class FilmRecord:
     """Cameras in the JSON beside a film, see `export.film`."""
 
     poses: list[tuple[Row, Row, Row]]
@@ -123,7 +123,7 @@ class CameraPath:
                 rest = {name: value for name, value in fields.items() if name != "format"}
                 return typed(cls, rest, path, closed=True)
             if {"poses", "lens", "size", "source_from_scene"} <= fields.keys():
-                film = typed(Film, fields, path)
+                film = typed(FilmRecord, fields, path)
                 return cls(keys_of_film(film, Lens.from_json(film.lens, path)), fps=film.fps)
         except LumigraphError as error:
             text = str(error)
@@ -244,7 +244,7 @@ def check(key: Keyframe, name: str) -> None:
         raise LumigraphError(f"{name} sees {key.fov:g} degrees; a flat picture shows {limits}")
 
 
-def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:
+def keys_of_film(film: FilmRecord, lens: Lens) -> tuple[Keyframe, ...]:
     """Every frame of a film as a keyframe. Raises LumigraphError where its parts do not fit together."""
     if not isinstance(lens, Pinhole):
         raise LumigraphError("The film was made through a bent lens, and paths are flown behind a flat picture")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +35,7 @@ class Opened(ABC):
 
     path: Path
     frame: Frame
-    _ready: tuple[Any, Method] | None = None  # version and device of the method that renders
+    _ready: tuple[Any, Method] | None = None  # version, device and unit of the method that renders
 
     @property
     def title(self) -> str:
@@ -53,8 +52,6 @@ class Opened(ABC):
         """Folder of saved camera paths."""
         return self.renders / "paths"
 
-    # Commands as calls: see `commands/calls.py`
-
     def render(self, camera: Camera, device: str = "auto", **controls: Any) -> Rendering:
         """Picture of one camera, with leading axes (height, width). The method is loaded once.
 
@@ -64,42 +61,14 @@ class Opened(ABC):
         with at_work(), torch.no_grad():
             return self.ready(device).given(**controls).render(camera)
 
-    def ready(self, device: str = "auto") -> Method:
+    def ready(self, device: torch.device | str = "auto") -> Method:
         """Method of the present version, loaded once."""
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        version = (self.version, device)
+        version = (self.version, str(device), self.frame.scale)
         if self._ready is None or self._ready[0] != version:
             self._ready = version, self.method(device)
         return self._ready[1]
-
-    def film(self, file: Path | str, /, **options: Any) -> Path:
-        """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
-        return calls().film(self, file, **options)
-
-    def export(self, kind: str, file: Path | str, /, **options: Any) -> Path:
-        """Write files for other programs. kind: mesh, splats, points, web, panorama and others, as in
-        `lumigraph export`; options: those of `lumigraph export KIND`."""
-        return calls().export(self, kind, file, **options)
-
-    def evaluate(self, **options: Any) -> dict[str, Any]:
-        """Compare with held-out photographs or shapes: the contents of eval.json. options: those of `lumigraph eval`.
-
-        Raises LumigraphError for what is no run.
-        """
-        return calls().evaluate(self, **options)
-
-    def convert(self, method: str, output: Path | str, /, **options: Any) -> Opened:
-        """Run of another method, initialised from this one. options: those of `lumigraph convert`."""
-        return calls().derive("convert", self, output, method, **options)
-
-    def compress(self, output: Path | str, /, **options: Any) -> Opened:
-        """Run of a fraction of the size. options: those of `lumigraph compress`."""
-        return calls().derive("compress", self, output, **options)
-
-    def clean(self, output: Path | str, /, **options: Any) -> Opened:
-        """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
-        return calls().derive("clean", self, output, **options)
 
     def facts(self) -> dict[str, object]:
         """Rows of the table below its picture in a notebook."""
@@ -109,10 +78,6 @@ class Opened(ABC):
         """Picture as PNG from the first camera. pixels: its longer side"""
         camera = self.cameras()["train"][0]
         return png(self.render(camera.resized(min(1.0, pixels / int(camera.size.max())))).rgb)
-
-    def _repr_html_(self) -> str:
-        """A notebook's view: a small page to turn, or a still, and a table of facts."""
-        return importlib.import_module("..commands.notebook_page", __package__).shown(self)
 
     @property
     def version(self) -> str:
@@ -223,8 +188,3 @@ class Trained(Opened):
         """Contents of eval.json, if it has been evaluated."""
         path = self.folder / "eval.json"
         return read_evaluation(path) if path.exists() else None
-
-
-def calls() -> Any:
-    """The module of calls, by name, for that room stands above this one."""
-    return importlib.import_module("..commands.calls", __package__)

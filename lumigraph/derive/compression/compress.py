@@ -34,7 +34,7 @@ from ...run.checkpoint import Checkpoints
 from ...run.derived import Compressed
 from ...system.progress import NumberedStages, clock, track
 from ...system.work import at_work
-from .model import LADDER, RUNG_POSITIONS, Model, rung_at
+from .model import LADDER, RUNG_POSITIONS, CompressedModel, rung_at
 
 JUDGED_VIEWS = 6  # training photographs that judge a rung; held-out ones judge the outcome alone
 IMPORTANCE_VIEWS = 40  # photographs from which importance is computed
@@ -126,7 +126,7 @@ class Ladder:
         self.stages = stages
         self.tuned = 0.0  # share of all tuning
 
-    def by_loss(self, most: float) -> Model:
+    def by_loss(self, most: float) -> CompressedModel:
         """The highest rung on which no more is lost, by halving; the lowest, where even there more is."""
         self.stages.begin()
         low, high, best = 0, len(LADDER) - 1, None
@@ -143,7 +143,7 @@ class Ladder:
         self.tune(model, 1 - self.tuned)
         return model
 
-    def by_size(self, most: int) -> Model:
+    def by_size(self, most: int) -> CompressedModel:
         """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
         take the next one."""
         self.stages.begin()
@@ -159,7 +159,7 @@ class Ladder:
             f"{self.run.folder} cannot be made as small as {told(most)}; the smallest reached is {told(smallest)}"
         )
 
-    def at(self, place: float) -> Model:
+    def at(self, place: float) -> CompressedModel:
         """The run on a rung, or between two."""
         rung, step = rung_at(place), self.run.state.step
         if self.aim.codebook is not None:
@@ -169,9 +169,9 @@ class Ladder:
             method.progress = Budget.from_json(self.run.settings.budget).progress(step, self.run.state.seconds)
             method.before_step(step, method.progress)  # how finely it looks, at this share of its training
             self.run.restore_weights(method)
-        return Model(method, self.importance, rung, step)
+        return CompressedModel(method, self.importance, rung, step)
 
-    def tune(self, model: Model, share: float) -> None:
+    def tune(self, model: CompressedModel, share: float) -> None:
         if share > 0:
             model.tune(self.truth.scene, *self.aim.part(share))
             self.tuned += share
@@ -210,7 +210,9 @@ def row_width(tensor: Tensor, layout: str) -> int:
     return {"rows": tensor[:1].numel(), "cells": tensor.shape[-1], "channels": channels}[layout]
 
 
-def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, aim: CompressionTarget) -> Compressed:
+def written(
+    run: Run, before: Method, model: CompressedModel, truth: Truth, output: Path, aim: CompressionTarget
+) -> Compressed:
     """Write the run; what it says of itself is measured on what was written, opened again."""
     views = min(aim.views or len(truth.scene.splits["test"]), len(truth.scene.splits["test"]))
     settings = replace(run.settings, said=run.settings.said | {"compressed": {"source": str(run.folder.resolve())}})

@@ -22,7 +22,7 @@ FINAL_RATE_SCALE = 0.1  # of that rate, at the end
 BETAS = 0.9, 0.99
 
 
-class Model:
+class CompressedModel:
     """A trained method on a rung of the ladder.
 
     step: of its training, at which tuning begins

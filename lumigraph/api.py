@@ -1,0 +1,214 @@
+"""Photographs to a scene, a scene to a run, a run to films and files, from Python.
+
+    run = lumigraph.train("photos", "gaussian-splatting", seconds=60)
+    run.film("film.mp4")
+    run.export("web", "page.html")
+
+Each call is a command of the command line, with the same options; `commands.calls` says how they are written. Long work
+shows its progress on stderr.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Num
+
+from . import methods
+from .camera import Camera
+from .camera.rays import Rendering
+from .commands.calls import command, finished, quietly
+from .commands.capture import scene_folder
+from .commands.notebook_bar import NotebookBar, in_notebook
+from .commands.notebook_page import shown
+from .commands.results import Evaluation, Exported, Film, Reports
+from .datasets.dataset import Dataset
+from .datasets.scene import Scene
+from .errors import LumigraphError
+from .large import held_open, open_any
+from .method import Method
+from .opening import open_scene
+from .run import Opened
+
+Progress = Callable[[int, float, dict[str, Any]], object]
+
+
+class Model:
+    """An opened run, splat file or composition. Its weights are loaded once, for all calls, until the run learns more.
+
+    All else that the opened object has is an attribute of this one: path, frame, cameras(), state, settings ...
+    What another program changes in the file of splats or of a composition shows after it is opened again.
+
+    opened: the object itself
+    """
+
+    def __init__(self, opened: Opened):
+        self.opened = opened
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "opened" or name.startswith("__"):  # of a copy that is being made
+            raise AttributeError(name)
+        return getattr(self.opened, name)
+
+    def __fspath__(self) -> str:
+        return str(self.opened.path)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self.opened.path)!r})"
+
+    def _repr_html_(self) -> str:
+        """A notebook's view: a small page to turn, or a still, and a table of facts."""
+        return shown(self.opened)
+
+    def render(self, cameras: Camera | Sequence[Camera], device: str = "auto", **controls: Any) -> Rendering:
+        """Pictures of cameras in the scene's frame, as those of `cameras()`, with depth in the unit of exports.
+
+        cameras:  one, for leading axes (height, width); several of one size, or a list, for (camera, height, width)
+        controls: values of the method's controls, such as time=0.3
+        The unit of depth is that of the photographs' frame, or metres where --scale-by was given in metres: a unit of
+        the scene's frame times `frame.to_export.scale`; see `Frame.scale`.
+        """
+        batches = [cameras] if isinstance(cameras, Camera) else cameras
+        several = [batch[i] for batch in batches for i in range(len(batch))]
+        if len({tuple(camera.size[0].tolist()) for camera in several}) != 1:
+            raise LumigraphError("These cameras have several sizes, or are none; make them equal by `resized`")
+        seen = [self.opened.render(camera, device, **controls) for camera in several]
+        unit = self.opened.frame.to_export.scale
+        seen = [replace(one, depth=one.depth * unit) for one in seen]
+        if isinstance(cameras, Camera) and len(cameras) == 1:
+            return seen[0]
+        return Rendering.cat([one.reshape(1, *one.depth.shape) for one in seen])
+
+    def film(self, file: Path | str, /, **options: Any) -> Film:
+        """Render a film: .mp4, .gif or .webp. options: those of `lumigraph render`, such as path, frames, size."""
+        return self._made("render", output=file, **options)
+
+    def export(self, kind: str, file: Path | str, /, **options: Any) -> Exported:
+        """Write files for other programs. kind: mesh, splats, points, web, panorama and others, as in
+        `lumigraph export`; options: those of `lumigraph export KIND`."""
+        return self._made(f"export {kind}", file, **options)
+
+    def evaluate(self, **options: Any) -> Evaluation:
+        """Compare with held-out photographs or shapes: the contents of eval.json, which is written anew.
+
+        options: those of `lumigraph eval`
+        Raises LumigraphError for what is no run.
+        """
+        return self._made("eval", **{"overwrite": True, **options})
+
+    def convert(self, method: str, output: Path | str, /, **options: Any) -> Model:
+        """Run of another method, initialised from this one. options: those of `lumigraph convert`."""
+        return self._derived("convert", output, method, **options)
+
+    def compress(self, output: Path | str, /, **options: Any) -> Model:
+        """Run of a fraction of the size. options: those of `lumigraph compress`."""
+        return self._derived("compress", output, **options)
+
+    def clean(self, output: Path | str, /, **options: Any) -> Model:
+        """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
+        return self._derived("clean", output, **options)
+
+    def metrics(self) -> dict[str, Num[np.ndarray, " row"]]:
+        """Training metrics as columns by name, "step" first; NaN in rows without a value. Empty where unknown.
+
+        `pandas.DataFrame(run.metrics())` is a table of them.
+        """
+        rows = self.opened.metrics()
+        names = dict.fromkeys(name for row in rows for name, value in row.items() if isinstance(value, int | float))
+        return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
+
+    def _made(self, name: str, *arguments: object, **options: Any) -> Any:
+        """Result of a command on what is opened."""
+        made: Reports = command(name, self.opened.path, *arguments, **options)
+        with held_open(self.opened):
+            return quietly(made.made)[0]
+
+    def _derived(self, name: str, output: Path | str, *arguments: object, **options: Any) -> Model:
+        """Run or file that a command makes of what is opened."""
+        made = command(name, self.opened.path, *arguments, output=output, **options)
+        with held_open(self.opened):
+            finished(quietly(made.run)[0])
+        return open(output)
+
+
+def open(path: str | Path) -> Model:
+    """Open a run, a splat file or a composition. Raises LumigraphError for anything else."""
+    return Model(open_any(path))
+
+
+def call(name: str, /, *arguments: object, **options: Any) -> dict[str, str]:
+    """Run a command by its name, as "export mesh" or "bench views", with its arguments in order and its options.
+
+    Returns the rows that the command line prints: text by name.
+    Raises LumigraphError for what the command refuses, and KeyboardInterrupt after Ctrl-C, with the work saved.
+    """
+    code, rows = quietly(command(name, *arguments, **options).run)
+    finished(code)
+    return {title: str(value) for title, value in rows.items()}
+
+
+def capture(photographs: str | Path | Iterable[str | Path], output: str | Path | None = None, **options: Any) -> Scene:
+    """Find the camera poses of photographs or of a video, and open the scene.
+
+    photographs: a folder, a video, or image files
+    output:  folder of the scene; None: scenes/NAME. What lies there already of the same photographs is not done again
+    options: those of `lumigraph capture`
+    """
+    many = [photographs] if isinstance(photographs, str | Path) else list(photographs)
+    folder = Path(output) if output is not None else scene_folder(tuple(map(Path, many)))
+    call("capture", *many, output=folder, **options)
+    return open_scene(folder)
+
+
+def train(
+    scene: str | Path | Dataset,
+    method: str | type[Method] = "gaussian-splatting",
+    output: str | Path | None = None,
+    *,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Model:
+    """Train a method, and open the run.
+
+    scene:    a path, "procedural:NAME", or a dataset as `capture` or `open_scene` opened it, which is opened again
+    method:   its name, or a class of your own
+    output:   folder of the run; None: runs/SCENE-METHOD-N
+    progress: told after each step: its number, the share of the budget that is spent, and the line of metrics.jsonl,
+              which most steps leave empty. Returns true to end training, as Ctrl-C does: the run is saved and resumes.
+              None: a bar in a notebook, lines on stderr elsewhere
+    options:  those of `lumigraph train METHOD`
+    """
+    if not isinstance(scene, str | Path):
+        if not scene.source:
+            raise LumigraphError("This dataset came from no path, so a run could not open it again; train it by `fit`")
+        options = {**getattr(scene, "options", {}), **options}
+        scene = scene.source
+    if isinstance(method, type):
+        methods.register(method)
+        method = methods.name_of(method)
+    made = command("train", method, scene, output=output, **options)
+    bar = NotebookBar() if progress is None and in_notebook() else None
+    told = progress or bar
+    (folder, code), _ = quietly(lambda: made.learn(Told(told) if told else None))
+    finished(code)
+    if bar:
+        bar.end()
+    return open(folder)
+
+
+class Told:
+    """A Watch that tells a function of each step, and never asks training to yield."""
+
+    asked = False
+
+    def __init__(self, progress: Progress):
+        self.progress = progress
+
+    def give_way(self, stopping: Callable[[], object]) -> None: ...
+
+    def note(self, step: int, progress: float, row: dict[str, Any]) -> bool:
+        return bool(self.progress(step, progress, row))

@@ -1,0 +1,110 @@
+"""Results of commands as values: the file that was written, its figures, and the rows that the terminal shows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .common import show
+
+
+@dataclass(frozen=True)
+class Result:
+    """A file or folder that a command wrote. It is an os.PathLike.
+
+    path: the file or folder
+    rows: text by name, as the terminal shows it
+    """
+
+    path: Path
+    rows: Mapping[str, Any] = field(repr=False, compare=False, kw_only=True)
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+
+@dataclass(frozen=True)
+class Film(Result):
+    """A film that was rendered.
+
+    size:     width and height, pixels
+    seconds:  rendering time of all frames
+    cameras:  JSON file of the cameras
+    depth:    the film of depth
+    pictures: folder of the frames as pictures
+    """
+
+    frames: int
+    fps: float
+    size: tuple[int, int]
+    seconds: float
+    cameras: Path
+    depth: Path | None = None
+    pictures: Path | None = None
+
+    @property
+    def seconds_per_frame(self) -> float:
+        """Rendering time of one frame."""
+        return self.seconds / self.frames
+
+
+@dataclass(frozen=True)
+class Exported(Result):
+    """Files that an export wrote.
+
+    counts: numbers of what they hold, by name: triangles, vertices, gaussians, points ...
+    files:  all files, `path` first; for a folder, the folder
+    """
+
+    counts: Mapping[str, int]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files."""
+        from ..exchange import size_of
+
+        return sum(map(size_of, self.files or (self.path,)))
+
+
+@dataclass(frozen=True)
+class Evaluation(Result, Mapping[str, Any]):
+    """Contents of eval.json: `evaluation["psnr"]`, and as attributes: `evaluation.psnr`."""
+
+    contents: Mapping[str, Any] = field(repr=False)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "contents" or name not in self.contents:
+            raise AttributeError(f"This evaluation has no {name!r}")
+        return self.contents[name]
+
+    def __getitem__(self, name: str) -> Any:
+        return self.contents[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.contents)
+
+    def __len__(self) -> int:
+        return len(self.contents)
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}  {value}" for name, value in self.rows.items())
+
+
+class Reports(ABC):
+    """A command with a result: `made` works and returns it, `run` prints its rows."""
+
+    @abstractmethod
+    def made(self) -> Result:
+        """Do the work, and return the result."""
+
+    def run(self) -> int:
+        """Do the work, and print the result. Returns the exit code."""
+        show(self.made().rows)
+        return 0
