@@ -31,7 +31,7 @@ from lumigraph.components.guidance.views import camera_around
 from lumigraph.datasets.words import Words
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
-from lumigraph.method import Method
+from lumigraph.method import Method, seeded
 from lumigraph.run import build
 from lumigraph.synthetic import captions
 from lumigraph.system.progress import track
@@ -65,8 +65,7 @@ def classifier(o: Options) -> nn.Module:
     groups = [pairs[i % len(pairs)] for i in range(o.classifier_pictures)]
     traced = torch.from_numpy(captions.pictures(groups, TRACED_PIXELS, CLASSIFIER_SEED))
     there = torch.tensor([[float(thing in group) for thing in captions.THINGS] for group in groups])
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(CLASSIFIER_SEED)
+    with seeded(CLASSIFIER_SEED):
         layers: list[nn.Module] = []
         for inputs, outputs in ((3, 16), (16, 32), (32, 64), (64, 96)):
             layers += [nn.Conv2d(inputs, outputs, 3, 2 if inputs > 3 else 1, 1, bias=False), nn.BatchNorm2d(outputs)]
