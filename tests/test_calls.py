@@ -122,24 +122,25 @@ def test_depth_is_in_the_unit_of_exports(own_run):
     assert torch.allclose(own_run.render(camera).depth, 2.5 * before)
 
 
-def test_weights_are_loaded_once_for_all_calls(own_run, ball_folder, tmp_path, monkeypatch):
+def test_weights_are_loaded_once_for_all_calls(own_run, tmp_path, monkeypatch):
     """A script of pictures, a film, exports and an evaluation neither opens the run again nor changes its weights."""
     loads, opens = [], []
     load, begin = Checkpoints.load_weights, Run.__init__
     monkeypatch.setattr(Checkpoints, "load_weights", lambda self, method: (loads.append(self), load(self, method)))
     monkeypatch.setattr(Run, "__init__", lambda self, folder: (opens.append(folder), begin(self, folder))[1])
+    monkeypatch.setattr(Run, "dataset", lambda *_: tiny.scene())
     own_run.render(own_run.cameras()["test"][0])
     weights = {name: value.clone() for name, value in own_run.ready().state_dict().items()}
     film = own_run.film(tmp_path / "film.gif", frames=2, size=16)
     mesh = own_run.export("mesh", tmp_path / "a.ply", size=16, views=4, cell_size=0.2, smooth=0)
     own_run.export("panorama", tmp_path / "b.png", size=64)
-    found = own_run.evaluate(views=2, scene=ball_folder)
+    found = own_run.evaluate(views=2)
     assert (len(loads), opens) == (1, [])
     assert all(torch.equal(value, weights[name]) for name, value in own_run.ready().state_dict().items())
     assert (film.frames, film.size) == (2, (16, 16)) and film.seconds_per_frame == film.seconds / 2 > 0
     assert Path(film).is_file() and film.cameras.is_file() and film.depth is None
     assert mesh.counts["triangles"] > 10 and mesh.bytes == Path(mesh).stat().st_size
-    assert found.psnr == found["psnr"] == lumigraph.open(own_run).evaluation()["psnr"] and len(found.views) == 2
+    assert found.psnr == found["psnr"] == lumigraph.open(own_run.path).evaluation()["psnr"] and len(found.views) == 2
     assert len(opens) == 1 and found.path.name == "eval.json"
 
 
