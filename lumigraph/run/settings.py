@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+import warnings
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import torch
 
 from .. import files, methods
 from ..budget import Budget
 from ..datasets.scene import Frame, Scene
-from ..errors import LumigraphError
-from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, typed, value_of
+from ..errors import LumigraphError, LumigraphWarning
+from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, shown, typed, value_of
 from ..files.reading import reads
 from ..method import Method
 from ..readers import CapturePart, Unposed
@@ -25,7 +27,7 @@ BYTES_FACTOR = 4  # copies of a parameter: itself, its gradient, and the two mom
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options of a run for `open_dataset`: see `capture.open_scene`, `meshes.read_shapes` and `Words.read`."""
+    """Options of a run for `open_dataset`: see `opening.open_scene`, `meshes.read_shapes` and `Words.read`."""
 
     downscale: Downscale | None = None
     reader: str | None = None
@@ -107,20 +109,22 @@ class Settings:
     def method_config(self, kind: type[Method], file: Path) -> Any:
         """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
         its range"""
-        return typed(kind.Config, without_constants(self.config, kind.Config), file, closed=True)
+        return typed(kind.Config, without_constants(self.config, kind.Config, file), file, closed=True)
 
 
-def without_constants(said: Any, kind: Any) -> Any:
-    """JSON of a Config without options of older versions that are constants now. The constant has the option's name in
-    capitals, in the module of the dataclass. An option of another value stays, and is refused as unknown."""
+def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
+    """JSON of a Config without options of older versions that are constants now: they have the option's name in
+    capitals, in the module of the dataclass. Warns of one that had another value."""
     if not (isinstance(said, dict) and is_dataclass(kind)):
         return said
-    known, module = hints(kind), vars(sys.modules[kind.__module__])  # type: ignore[arg-type]
-    return {
-        name: without_constants(value, known.get(name))
-        for name, value in said.items()
-        if name in known or module.get(name.upper(), MISSING) != value
-    }
+    known, module, kept = hints(kind), vars(sys.modules[kind.__module__]), {}  # type: ignore[arg-type]
+    for name, value in said.items():
+        if name in known or name.upper() not in module:
+            kept[name] = without_constants(value, known.get(name), file)
+        elif msgspec.to_builtins(constant := module[name.upper()]) != value:
+            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
+            warnings.warn(text, LumigraphWarning, stacklevel=2)
+    return kept
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
