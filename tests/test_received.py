@@ -317,7 +317,7 @@ def test_the_token_is_no_argument_of_the_browser():
     with door(Address("0.0.0.0", 8080, "secret")) as url:
         page = Path(url.removeprefix("file://"))
         assert "secret" not in url and "?token=secret" in page.read_text()
-        assert page.parent.stat().st_mode & 0o777 == 0o700
+        assert page.parent.stat().st_mode & 0o777 == 0o700 and page.stat().st_mode & 0o777 == 0o600
     assert not page.exists()
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..files import explained
+from ..files import explained, open_anew
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
 from .common import show
@@ -69,5 +69,8 @@ def door(address: Any) -> Iterator[str]:
         return
     with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:  # of mode 700
         page = Path(folder) / "app.html"
-        page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(address.url)}">')
+        with open_anew(page) as file:
+            file.write(
+                f'<!doctype html><meta http-equiv="refresh" content="0; url={html.escape(address.url)}">'.encode()
+            )
         yield page.as_uri()
