@@ -421,6 +421,11 @@ def test_a_ray_is_explained(taught):
         assert (each.density >= 0).all() and (each.end >= each.start).all()
 
 
+def coarse(lenient, **options) -> MeshOptions:
+    """Options of a mesh with cells of an eighth of the scene's unit."""
+    return MeshOptions(cell_size=lenient.method.frame.to_export.scale / 8, views=6, **options)
+
+
 def test_it_becomes_points_and_a_mesh(lenient):
     points = export_points.extract_points(lenient.method, lenient.cameras, 200, views=6)
     around(torch.from_numpy(points.positions))
@@ -428,7 +433,7 @@ def test_it_becomes_points_and_a_mesh(lenient):
         mesh = lenient.method.mesh()
         assert isinstance(mesh, Mesh)
     else:
-        mesh = extract_mesh(lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, way="depth", views=6))
+        mesh = extract_mesh(lenient.method, lenient.cameras, coarse(lenient, way="depth"))
     around(torch.from_numpy(mesh.vertices))
     assert len(mesh.faces) > 3 and mesh.faces.max() < len(mesh.vertices) == len(mesh.colours)
 
@@ -440,16 +445,14 @@ def test_its_density_becomes_a_mesh(lenient):
     with torch.no_grad():
         density = lenient.method.density(torch.cartesian_prod(grid, grid, grid))
     level = float(density.max()) / 4
-    mesh = extract_mesh(
-        lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, way="density", level=level, views=6, smooth=0)
-    )
+    mesh = extract_mesh(lenient.method, lenient.cameras, coarse(lenient, way="density", level=level, smooth=0))
     around(torch.from_numpy(mesh.vertices))
 
 
 def test_its_distance_becomes_a_mesh(lenient):
     if not can(lenient.method, HasDistance):
         return
-    mesh = extract_mesh(lenient.method, lenient.cameras, MeshOptions(cell_size=1 / 8, views=6, smooth=0))
+    mesh = extract_mesh(lenient.method, lenient.cameras, coarse(lenient, smooth=0))
     around(torch.from_numpy(mesh.vertices))
     with torch.no_grad():
         distance = lenient.method.distance(torch.from_numpy(mesh.vertices).float().to(lenient.device))
