@@ -86,6 +86,7 @@ def test_refused_uploads_are_sentences_on_the_page(served, page, faults, tmp_pat
     (photographs / "good.jpg").write_bytes(jpeg(0, (160, 120)))
     (photographs / "text.jpg").write_text("no photograph")
     page.goto(served.address.url)
+    page.get_by_role("heading", name="Drop photographs").wait_for()  # until then nobody listens
     drop(page, [photographs])
     page.get_by_role("alert").get_by_text("text.jpg is no photograph that can be read").wait_for()
     page.get_by_role("button", name="good.jpg").wait_for()

@@ -18,6 +18,7 @@ from lumigraph.commands.cli import main
 from lumigraph.components.training import adversarial
 from lumigraph.components.training.adversarial import Discriminator, doubled, halved, r1_penalty, widths_of
 from lumigraph.errors import LumigraphError
+from lumigraph.method import frozen
 from lumigraph.method.controls import Value
 from lumigraph.methods.eg3d import EG3D, labels
 from lumigraph.methods.eg3d.fields import PlaneField
@@ -73,9 +74,9 @@ def test_filters_keep_means_and_are_each_others_adjoints():
         torch.testing.assert_close(inner, torch.full_like(inner, 0.7))
 
 
-def test_a_held_network_passes_gradients_on_and_gets_none():
+def test_a_frozen_network_passes_gradients_on_and_gets_none():
     network, x = Discriminator(3, [4, 4], label=5, layers=1), random(2, 3, 8, 8).requires_grad_()
-    with adversarial.held(network):
+    with frozen(network):
         network(x, random(2, 5)).sum().backward()
     assert x.grad.abs().sum() > 0 and all(p.grad is None and p.requires_grad for p in network.parameters())
 
