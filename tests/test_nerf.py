@@ -49,7 +49,7 @@ def method(kind: type[RayMethod], frame: Frame | None = None, **options) -> RayM
 
 @cache
 def learnt(kind: type[RayMethod], **options) -> RayMethod:
-    """What has learnt the tiny scene. Nobody may change it; a test that would takes a copy."""
+    """Method that has learnt the tiny scene. Nobody may change it; a test that would takes a copy."""
     made = method(kind, **options)
     fit(made, tiny.scene(), steps=100, show=False, rehearsal=False)
     return made

@@ -39,7 +39,7 @@ PACKAGE = Path(lumigraph.__file__).parent
 
 
 class PanicException(BaseException):
-    """What a library in Rust raises."""
+    """Exception of a library in Rust."""
 
 
 @pytest.mark.parametrize(

@@ -322,7 +322,7 @@ def test_the_token_is_no_argument_of_the_browser():
 
 
 def test_an_item_that_is_moved_in_begins_nothing(tmp_path):
-    """As a project that was received while the app does not run."""
+    """A project that was received while the app does not run."""
     item = new_project(tmp_path, "Garden")
     received(item)
     app = App(tmp_path, Address("127.0.0.1", 8080), ["-S", "-c", "raise SystemExit"])  # noqa: F811
