@@ -43,7 +43,7 @@ def compiled(module: ModuleType) -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """What `python -m lumigraph` does in a process of its own, and its exit code; or what a reader's function does."""
+    """Run `python -m lumigraph`, or a reader's function, in a process of its own. Returns the exit code."""
     import traceback
 
     from lumigraph.__main__ import main

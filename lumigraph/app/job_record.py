@@ -24,12 +24,11 @@ from ..budget import Quality
 from ..files import read_json, write_json
 from ..files.ranges import Count, Downscale, Pixels, Seconds, Steps, Tally
 from ..system.cache import cache_folder
-from .projects import JOB_FILE, Item
+from .projects import JOB_FILE, PLAIN, Item
 
 KEY_FILE, KEY_BYTES = "app.key", 32  # in the user's cache folder
 NOT_SEALED = "This was not asked for by the app at this place; press the button to begin"
 Sentence = Annotated[str, msgspec.Meta(max_length=10_000)]
-PLAIN = r"[^./\\:\x00-\x1f][^/\\:\x00-\x1f]*"  # name of one file or folder that is not hidden
 PlainName = Annotated[str, msgspec.Meta(max_length=255, pattern=rf"\A{PLAIN}\Z")]
 RunName = Annotated[str, msgspec.Meta(max_length=255, pattern=rf"\A({PLAIN})?\Z")]
 ShareName = Literal["page", "film", "splats", "mesh", "points", "compare"]

@@ -36,6 +36,7 @@ SHELVES = "", RUNS, "scenes"  # folders whose folders are items
 SCENE_FILES = "transforms.json", "transforms_train.json", "sparse", "poses_bounds.npy"  # of photographs with poses
 MAX_TITLE_LENGTH = 120  # letters
 WRITTEN = PHOTOS, "left-out", SCENE, RUNS, SHARED  # folders of an item that the app writes into
+PLAIN = r"[^./\\:\x00-\x1f][^/\\:\x00-\x1f]*"  # name of one file or folder that is not hidden
 SEPARATOR = ":"  # between the folders of a key, as "/" cannot be in one part of a URL
 
 ItemKind = Literal["project", "run", "scene"]
@@ -174,7 +175,7 @@ def find_item(root: Path, key: str) -> Item:
 
 def is_plain_name(name: str) -> bool:
     """True for the name of one file or folder that is not hidden."""
-    return bool(name) and not name.startswith(".") and not re.search(r"[/\\:\x00-\x1f]", name)
+    return bool(re.fullmatch(PLAIN, name))
 
 
 def check_title(title: str) -> str:
