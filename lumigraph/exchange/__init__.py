@@ -1,4 +1,4 @@
-"""File formats of other programs: clouds of Gaussians, octrees, atlases; tensors in few bytes."""
+"""File formats of other programs: clouds of Gaussians, octrees, atlases; and packing, compressed tensors."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians 
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """The Gaussians in a file of one of SUFFIXES, or in one of FOLDERS, on the CPU, in the axes that PLY files keep; of
-    a streamed SOG the finest level.
+    """Read the Gaussians in a file of one of SUFFIXES, or a folder of FOLDERS, on the CPU, in the axes of PLY files;
+    for a streamed SOG the finest level.
 
-    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20, rotations of
-    length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
+    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20, quaternions
+    of length zero the identity. Raises LumigraphError for any other invalid file.
     """
     path = place_of(expanded(path))
     layout = layout_of(path)
@@ -56,12 +56,12 @@ def read_gaussians(path: Path | str) -> Gaussians:
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
-    """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG; to
+    """Write a cloud in the format of the suffix, atomically; to FOLDER/meta.json, a folder of SOG; to
     FOLDER/lod-meta.json, a streamed one, with the levels of `detail`.
 
-    `.ply` keeps every number as it is; docstrings of the others give their rounding. Those of REORDERED keep the set of
-    Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
-    LumigraphError where the ending is none of SUFFIXES, the cloud is not sound or the disk refuses.
+    `.ply` is lossless; docstrings of the others give their rounding. REORDERED formats keep the set of Gaussians and
+    not their order, `.splat` neither harmonics beyond degree 0 nor `antialiased`. Raises LumigraphError for a suffix
+    not in SUFFIXES, an invalid cloud, and a file that cannot be written.
     """
     path = expanded(path)
     ending = check_ending(path)
@@ -75,7 +75,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog
 
 
 def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """`files.claim` for a file of Gaussians, or for the whole folder that a path to one of FOLDERS lies in."""
+    """`files.claim` for a file of Gaussians, or for the whole folder of a path in one of FOLDERS."""
     if path.name not in FOLDERS:
         claim(path, "splats", overwrite, reads)
     elif any(exists(one) and exists(path) and place_of(one).samefile(path.parent) for one in reads):
@@ -103,18 +103,18 @@ def names_splats(path: Path | str) -> bool:
 
 
 def place_of(path: Path) -> Path:
-    """The folder of SOG where its meta.json or lod-meta.json is named, or a new one; otherwise the path itself."""
+    """Folder of SOG for a path to its meta.json or lod-meta.json; any other path unchanged."""
     layout = FOLDERS.get(path.name)
     return path.parent if layout and (layout.recognises(path.parent) or not exists(path)) else path
 
 
 def layout_of(folder: Path) -> str | None:
-    """The entry of FOLDERS that a folder matches; `None` for any other, and for a file."""
+    """Entry of FOLDERS that a folder matches; `None` for any other, and for a file."""
     return next((name for name, layout in FOLDERS.items() if folder.is_dir() and layout.recognises(folder)), None)
 
 
 def size_of(path: Path | str) -> int:
-    """Bytes of a file of Gaussians, or of all files of a folder, such as one of SOG, even while some come and go."""
+    """Bytes of a file of Gaussians, or of all files of a folder such as SOG, which may change meanwhile."""
     place, total = place_of(expanded(path)), 0
     inner = (Path(folder, name) for folder, _, names in os.walk(place) for name in names)
     for file in [place] if place.is_file() else inner:
@@ -124,7 +124,7 @@ def size_of(path: Path | str) -> int:
 
 
 def check_ending(path: Path) -> str:
-    """The one of SUFFIXES that a name has. Raises LumigraphError if it has none."""
+    """Suffix of a name, one of SUFFIXES. Raises LumigraphError for any other."""
     if path.name in FOLDERS:
         return ".sog"
     for suffix in SUFFIXES:

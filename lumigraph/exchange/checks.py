@@ -1,5 +1,5 @@
-"""Checks of clouds (all numbers are finite) and of files: sizes that a file declares are compared with its bytes and
-with free memory; a Bundle reads files of a folder or a .zip within these limits."""
+"""Checks of clouds (all numbers are finite) and of files: declared sizes against their bytes and free memory; a Bundle
+reads files of a folder or a .zip within these limits."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ MAX_RATIO, SMALL_BYTES = 100, 1 << 26  # largest compression of a cloud; unpacke
 
 
 def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = None, unpacked: int = 0) -> None:
-    """Raise LumigraphError for a cloud that the machine cannot hold, or that its file can only pretend to hold.
+    """Raise LumigraphError for a cloud that exceeds memory, or that its file is too short to contain.
 
-    count, harmonics: Gaussians that the file promises, and coefficients of each
-    packed, unpacked: bytes of a compressed file, and what they would become
+    count, harmonics: declared number of Gaussians, and coefficients of each
+    packed, unpacked: bytes of a compressed file, before and after decompression
     """
     if packed is not None and unpacked > max(SMALL_BYTES, MAX_RATIO * packed):
         raise LumigraphError(
@@ -42,9 +42,9 @@ def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = 
 
 
 def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
-    """The same cloud, with ±20 for infinite logits of opacity and no rotation for quaternions of length zero.
+    """The same cloud, with infinite logits of opacity as ±20 and quaternions of length zero as the identity.
 
-    Raises LumigraphError, which begins with `subject` and ends with `way_out`, if other numbers are not finite.
+    Raises LumigraphError, which begins with `subject` and ends with `way_out`, for other numbers that are not finite.
     """
     if (count := gaussians.harmonics.shape[1]) not in (1, 4, 9, 16):
         raise LumigraphError(f"{subject} has {count} harmonics per Gaussian; bring them to 1, 4, 9 or 16")
@@ -69,7 +69,7 @@ DATE = (1980, 1, 1, 0, 0, 0)  # the earliest of the format, constant so that equ
 
 
 class Bundle:
-    """Files by name, and the bytes that they take together. Raises LumigraphError for what is no archive."""
+    """Files of a folder or .zip by name, and their total size. Raises LumigraphError for an invalid archive."""
 
     def __init__(self, path: Path):
         self.path, self._archive = path, None
@@ -82,7 +82,7 @@ class Bundle:
             self._archive = zipfile.ZipFile(io.BytesIO(data))
 
     def read(self, name: str) -> bytes:
-        """A file at the top. Raises LumigraphError if it is not there, is damaged or unpacks beyond belief."""
+        """Read a top-level file. Raises LumigraphError if it is missing, damaged or unpacks to an implausible size."""
         if self._archive is None:
             file = self.path / name
             if Path(name).name != name or file.is_symlink() or not file.is_file():
@@ -100,7 +100,7 @@ class Bundle:
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
-    """An archive of files that are packed already, the same for the same files."""
+    """A deterministic archive of compressed files."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():

@@ -1,8 +1,8 @@
-"""The layout in which the first release of 3-D Gaussian splatting wrote its clouds (Kerbl 2023), known to all programs.
+"""The original PLY layout of 3-D Gaussian splatting (Kerbl 2023), which all programs read.
 
 One row of float32 per Gaussian: x y z, an unused normal (zeros), f_dc_0..2, f_rest_* with all of red's
-coefficients before green's and blue's, opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Nothing is
-lost. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. Two comments state that it is antialiased (ANTIALIASED).
+coefficients before green's and blue's, opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). It is
+lossless. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. Two comments state that it is antialiased (ANTIALIASED).
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 def read(path: Path, header: Header | None = None) -> Gaussians:
-    """Text and both binary orders, and any plain types. Raises LumigraphError if it holds points, or too little."""
+    """Read text and both binary orders, with any scalar types. Raises LumigraphError for point clouds and truncated
+    files.
+    """
     header = header or read_header(path)
     here = header.properties.get("vertex", [])
     missing = [name for name in [*MEAN, *COLOUR, *OPACITY, *SCALE, *ROTATION] if name not in here]
@@ -84,7 +86,7 @@ def save(path: Path, elements: dict[str, np.ndarray], antialiased: bool) -> None
 
 
 def rest_names(path: Path, properties: list[str]) -> list[str]:
-    """f_rest_0, f_rest_1, ... as far as they go. Raises LumigraphError if that is no whole degree from 0 to 3."""
+    """f_rest_0, f_rest_1, ..., all in the file. Raises LumigraphError unless they make a whole degree from 0 to 3."""
     count = sum(name.startswith("f_rest_") for name in properties)
     names = [f"f_rest_{i}" for i in range(count)]
     if count not in (0, 9, 24, 45) or not {*names} <= {*properties}:
@@ -96,7 +98,7 @@ def rest_names(path: Path, properties: list[str]) -> list[str]:
 
 
 def by_channel(rest: Float[np.ndarray, "gaussian coefficient 3"]) -> Float[np.ndarray, "gaussian rest"]:
-    """All of red's coefficients, then green's, then blue's."""
+    """Coefficients ordered by channel: all of red's, then green's, then blue's."""
     return rest.transpose(0, 2, 1).reshape(len(rest), rest.shape[1] * 3)
 
 

@@ -1,4 +1,4 @@
-"""Open what was trained or exported: runs of one field or in blocks, splat files, SNeRG's folders and compositions."""
+"""Open trained or exported models: runs of one field or in blocks, splat files, SNeRG folders and compositions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _held: ContextVar[Opened | None] = ContextVar("held", default=None)  # what `hel
 
 @contextlib.contextmanager
 def held_open(opened: Opened) -> Iterator[None]:
-    """A block in which `open_any` and `open_run` return this object for its path, with the weights that it holds."""
+    """Block in which `open_any` and `open_run` return this object for its path, with its loaded weights."""
     token = _held.set(opened)
     try:
         yield
@@ -30,7 +30,7 @@ def held_open(opened: Opened) -> Iterator[None]:
 
 
 def held_at(path: Path) -> Opened | None:
-    """The held object, if it is that of the path."""
+    """The object of `held_open`, if it has this path."""
     held = _held.get()
     return held if held is not None and held.path == path else None
 
@@ -38,9 +38,9 @@ def held_at(path: Path) -> Opened | None:
 @reads()
 def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a moving
-    one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
+    one (.4dgs), a folder of SNeRG's viewer, a composition (.json), a run placed by `lumigraph canonicalise` (.json).
 
-    within: what it is opened as a part of
+    within: composition of which it is a part
     Raises LumigraphError, in one sentence, for anything else.
     """
     path = Path(path)

@@ -1,4 +1,4 @@
-"""Begin a run of many blocks: its folder, the task of every block and a picture of the plan, before any training."""
+"""Create a block run: its folder, the task of every block and a map of the plan, before any training."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class BlockRecipe:
     """Training of every block.
 
     options: of `open_dataset` for the whole scene
-    budget:  of all blocks together, shared out evenly; None for a minute each, or a quality
+    budget:  of all blocks together, divided evenly; None for a minute each, or a quality
     here:    whether the device is this machine's
     """
 
@@ -58,7 +58,7 @@ class BlockRecipe:
     here: bool = True
 
     def budget_of_each(self, blocks: int) -> dict[str, Any]:
-        """Budget of one of so many blocks."""
+        """Budget of each of `blocks` blocks."""
         if self.quality:
             return {"quality": self.quality}
         if self.budget is None:
@@ -69,7 +69,7 @@ class BlockRecipe:
 
 
 def make_plan(source: str, places: Places, wish: str, recipe: BlockRecipe) -> Plan:
-    """The plan of a scene: its blocks, see `lay_out`, and what each of them learns."""
+    """Plan of a scene: its blocks, see `lay_out`, and the training of each."""
     blocks = lay_out(places, wish, source)
     turn: Any = tuple(tuple(float(x) for x in row) for row in places.upright)
     return Plan(
@@ -87,11 +87,11 @@ def make_plan(source: str, places: Places, wish: str, recipe: BlockRecipe) -> Pl
 
 
 def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int | None = None) -> Plan:
-    """Write a run's plan, with a task for every block; where it is there already, find that it is the same.
+    """Write a run's plan and a task for every block, or check that the folder has the same plan already.
 
-    places:  of all photographs, for the picture of the plan
+    places:  of all photographs, for the map of the plan
     threads: see `Task`
-    Returns the plan as the folder has it. Raises LumigraphError where something else lies there, or another plan.
+    Returns the plan in the folder. Raises LumigraphError for a folder with other contents or another plan.
     """
     if (folder / PLAN_FILE).exists():
         known = Plan.read(folder / PLAN_FILE)
@@ -109,7 +109,7 @@ def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int |
 
 
 def write_task(folder: Path, task: Task) -> None:
-    """Leave a task in a block's folder; one that is there already stays if it is the same."""
+    """Write a task to a block's folder, unless the same is there already."""
     if (folder / TASK_FILE).exists() and (there := Task.read(folder)).key == task.key and there.threads == task.threads:
         return
     files.write_json(folder / TASK_FILE, asdict(task))  # a run that begins there knows it for ours
@@ -121,8 +121,8 @@ def place_of(run: Path, block: Block) -> Path:
 
 
 def difference(known: Plan, wanted: Plan) -> str | None:
-    """The first thing that two plans differ in, in a user's words; None if they come to the same. Blocks that were
-    learnt again from other photographs do not count."""
+    """First difference between two plans, in a user's words; None if they are equivalent. Retrained blocks are
+    ignored."""
     mine, other = asdict(known), asdict(wanted)
     for name in ("method", "scene", "config", "budget", "seed", "device", "upright"):
         if not alike(mine[name], other[name]):
@@ -133,7 +133,7 @@ def difference(known: Plan, wanted: Plan) -> str | None:
 
 
 def draw_plan(places: Places, blocks: Sequence[Block]) -> Image.Image:
-    """North is where the second axis of the levelled source points; photographs that are held out are orange."""
+    """Map of the plan. North is the second axis of the levelled source; held-out photographs are orange."""
     turn = places.upright.T
     centres = np.array([block.centre for block in blocks]) @ turn
     radii = np.array([block.radius for block in blocks])

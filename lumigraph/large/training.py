@@ -1,9 +1,9 @@
 """Train all blocks of a run, in this process one after another or on Ray's workers; then align their appearances, or
-merge their clouds. Train one block again from other photographs.
+merge their clouds. Retrain one block on other photographs.
 
-Workers are on this machine, or on a cluster with storage that all its machines share. A block goes out as a path and
-comes back as a few numbers: photographs are read where they are learnt from, and states are files. So a worker, a
-machine or this process may be lost at any time; training continues from what was saved.
+Workers are on this machine, or on a cluster with shared storage. Only a block's path is sent, and a few numbers are
+returned: workers read photographs and write states on the shared storage. So a worker, a machine or this process may
+fail at any time; training continues from the saved states.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ RAY_ENVIRONMENT = {  # that Ray reads as it is loaded, unless the user's environ
 
 
 def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Conducted:
-    """Train all blocks of a run that are not done yet.
+    """Train all unfinished blocks of a run.
 
-    A block that fails leaves the others alone. Raises LumigraphError where another process works in the run, and where
-    workers cannot be had.
+    A block's failure does not affect the others. Raises LumigraphError where another process works in the run, and for
+    unavailable workers.
     """
     folders = {block.name: place_of(run, block) for block in plan.blocks}
     with held(run, "trained"), Watching(run, folders, show):
@@ -78,10 +78,10 @@ def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Condu
 
 
 def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
-    """Align the blocks' appearances and write their codes into blocks.json; of clouds, write the one that they make.
+    """Align the blocks' appearances and write their codes into blocks.json; for clouds, write the merged cloud.
 
-    again: names of blocks that were learnt again, which are aligned to the others as these are
-    Returns the plan as it is then. What is done already is not done again.
+    again: names of retrained blocks, which are aligned to the others
+    Returns the resulting plan. Finished steps are not repeated.
     """
     opened = BlockRun(folder)
     first = opened.placed(opened.blocks[0]).method
@@ -93,7 +93,7 @@ def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
 
 
 def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
-    """The plan with an appearance for every block; those that are known stay as they are (Tancik 2022, 4.3.3)."""
+    """Plan with an appearance code for every block; known ones stay unchanged (Tancik 2022, 4.3.3)."""
     names = [block.name for block in opened.blocks]
     known = {name: code for name, code in opened.plan.appearance.items() if name not in again}
     if all(name in known for name in names):
@@ -111,13 +111,13 @@ def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
 def update(
     run: Path, name: str, source: str, places: Places, options: dict[str, Any], budget: Budget | None, show: bool = True
 ) -> Ended:
-    """Learn a block of a run again, put it into its place, and align it to its neighbours.
+    """Retrain a block of a run, replace the old one, and align it to its neighbours.
 
     source, places: of the new photographs, in the frame of the old ones
     options: of `open_dataset` for them
-    budget:  None for the one that the block had
-    The new block replaces the old one when it is done; an interrupted update continues. Files of other blocks stay.
-    Raises LumigraphError for an unknown block, and where no photograph is of it.
+    budget:  None for the block's previous one
+    The old block is replaced when the new one is done; an interrupted update continues. Files of other blocks are not
+    changed. Raises LumigraphError for an unknown block, and for one without photographs in the source.
     """
     if not files.is_file(run / PLAN_FILE):
         raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
@@ -141,7 +141,7 @@ def update(
 
 
 def again(block: Block, source: str, places: Places, options: dict[str, Any], budget: Budget | None) -> Block:
-    """The block as it will learn from other photographs."""
+    """The block with other photographs."""
     chosen = members(places, Disc(block.centre, block.radius))
     learnt = np.array([split == "train" for split in places.splits])
     if (chosen & learnt).sum() < 2:
@@ -158,8 +158,8 @@ def again(block: Block, source: str, places: Places, options: dict[str, Any], bu
 class Workers:
     """Workers that train blocks.
 
-    count:   blocks at a time on this machine, each in a process of its own; None for this process alone
-    address: of a Ray cluster that is there already, HOST:PORT
+    count:   blocks at a time on this machine, each in its own process; None for this process alone
+    address: of a running Ray cluster, HOST:PORT
     cpus, gpus, memory: demand of a block: processors, GPUs, bytes
     """
 
@@ -171,7 +171,7 @@ class Workers:
 
 
 def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
-    """Learn blocks on workers. Raises LumigraphError where Ray is not there, or nothing answers at the address."""
+    """Train blocks on workers. Raises LumigraphError without Ray, and if the address does not answer."""
     ray = library("--workers" if workers.address is None else "--address")
     with connected(ray, workers), Interrupt() as interrupt:
         feasible(ray.nodes(), workers)
@@ -207,9 +207,9 @@ def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
 
 
 def on_worker(folder: str, method_files: Sequence[str] = ()) -> Done | str | None:
-    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped.
+    """Train a block on a worker. Returns its cost, a sentence if it failed, None if it was stopped.
 
-    method_files: of methods from elsewhere, on storage that all machines share
+    method_files: of external methods, on the shared storage
     """
     with contextlib.redirect_stderr(sys.stdout):
         try:
@@ -223,7 +223,7 @@ def on_worker(folder: str, method_files: Sequence[str] = ()) -> Done | str | Non
 
 @contextlib.contextmanager
 def connected(ray: Any, workers: Workers) -> Iterator[None]:
-    """A cluster: one on this machine for as long as the block lasts, or one that is there already."""
+    """Block with a connection to a Ray cluster: a new one on this machine, or a running one."""
     if workers.address is not None:
         answering(workers.address)
         place: dict[str, Any] = {"address": workers.address}
@@ -245,7 +245,7 @@ def connected(ray: Any, workers: Workers) -> Iterator[None]:
 
 
 def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
-    """Raise LumigraphError unless some machine of the cluster has what a block asks for; Ray would wait for one."""
+    """Raise LumigraphError unless some machine of the cluster meets a block's demand; Ray would wait for ever."""
     asked = {"CPU": workers.cpus, "GPU": workers.gpus, "memory": workers.memory}
     there = [node["Resources"] for node in nodes if node.get("Alive")]
     if not any(all(node.get(name, 0) >= least for name, least in asked.items()) for node in there):
@@ -256,7 +256,7 @@ def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
 
 
 def library(option: str) -> Any:
-    """Ray itself. Raises LumigraphError, saying how to install it, where it is not."""
+    """Import Ray. Raises LumigraphError, with the command to install it, if it is missing."""
     for name, value in RAY_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
@@ -267,7 +267,7 @@ def library(option: str) -> Any:
 
 
 def answering(address: str) -> None:
-    """Raise LumigraphError unless something listens at HOST:PORT."""
+    """Raise LumigraphError unless HOST:PORT accepts connections."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit()):
         raise LumigraphError(f"--address {address} is no HOST:PORT; `ray start --head` says which it is")
@@ -281,7 +281,7 @@ def answering(address: str) -> None:
 
 
 def sentence(fault: BaseException) -> str:
-    """Why a block was given up."""
+    """One sentence on a block's failure."""
     if "OutOfMemory" in type(fault).__name__:
         return "its worker ran out of memory again and again; give smaller blocks, or fewer --workers"
     return f"its worker was lost {MAX_LOSSES} times or failed ({first_line(fault)})"

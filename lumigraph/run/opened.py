@@ -1,4 +1,4 @@
-"""Opened: whatever can be opened and looked at, a run, a splat file or a composition."""
+"""Opened models: anything that can be opened and rendered, such as a run, a splat file or a composition."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from .settings import Settings, Source
 
 
 class Opened(ABC):
-    """Something to render, where it is, and cameras that see it: all that films, the viewer and exports ask for.
+    """An opened model with its path and cameras: the interface for films, the viewer and exports.
 
-    path:  where it lies
-    frame: of what it renders, and of its cameras
+    path:  of the file or folder
+    frame: of the method and of the cameras
     """
 
     path: Path
@@ -44,7 +44,7 @@ class Opened(ABC):
 
     @property
     def renders(self) -> Path:
-        """Folder of its films: not beside a file, whose folder may be read-only."""
+        """Folder of its films; for a file not beside it, since its folder may be read-only."""
         return Path("renders") / self.title
 
     @property
@@ -62,7 +62,7 @@ class Opened(ABC):
             return self.ready(device).given(**controls).render(camera)
 
     def ready(self, device: torch.device | str = "auto") -> Method:
-        """Method of the present version, loaded once."""
+        """Method of the current version, loaded once."""
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         version = (self.version, str(device), self.frame.scale)
@@ -81,7 +81,7 @@ class Opened(ABC):
 
     @property
     def version(self) -> str:
-        """Name of the state that rendering shows; another one after more training."""
+        """Identifier of the state that is rendered; it changes with further training."""
         return ""
 
     @abstractmethod
@@ -99,27 +99,29 @@ class Opened(ABC):
 
     @property
     def masked(self) -> bool:
-        """True if masks may leave pixels of its photographs out of learning."""
+        """True if its photographs may have masks that exclude pixels from training."""
         return self.photographed
 
     @property
     def open_scene(self) -> Callable[..., Scene] | None:
-        """Function that opens the photographs again, told where they are now if they have moved; None where there are
-        none."""
+        """Function that opens the photographs again, given their present path if they have moved; None without
+        photographs."""
         return None
 
     @property
     def conversion_fault(self) -> str | None:
-        """Reason why `convert` refuses it, and what to do instead; None for what can be converted."""
+        """Reason why `convert` refuses it, and a way out; None if it can be converted."""
         return None
 
     @property
     def model_bytes(self) -> int:
-        """Size of what rendering needs, as it is stored."""
+        """Size of the stored model, sufficient for rendering."""
         return size_of(self.path)
 
     def source_gaussians(self) -> Gaussians:
-        """Cloud in the source's frame, in the order of the method's. Raises LumigraphError for what is no cloud."""
+        """Cloud in the source's frame, in the order of the method's. Raises LumigraphError for a model without
+        Gaussians.
+        """
         return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix)
 
     def view_names(self) -> dict[str, list[str]]:
@@ -127,11 +129,11 @@ class Opened(ABC):
         return {}
 
     def survey(self, cameras: Camera) -> Camera:
-        """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
+        """Cameras for extracting meshes and points: its own, or a dome above its ring."""
         return cameras if self.photographed else dome(cameras)
 
     def set_scale(self, scale: float) -> None:
-        """Remember the scale of exports: see `Frame.scale`. Raises LumigraphError for what remembers none."""
+        """Set the scale of exports: see `Frame.scale`. Raises LumigraphError for a model that cannot store it."""
         raise LumigraphError(
             f"{self.path} remembers no scale, as a run does; export from the run, or scale the result in its program"
         )
@@ -142,10 +144,10 @@ class Opened(ABC):
 
 
 class Trained(Opened):
-    """A folder in which something was learnt; films, camera paths and what was measured of it lie there too.
+    """A training folder; its films, camera paths and measurements are stored there too.
 
-    folder:   where it lies
-    settings: what was trained on what
+    folder:   of the run or block run
+    settings: method, dataset and budget
     """
 
     folder: Path
@@ -159,7 +161,7 @@ class Trained(Opened):
     @property
     @abstractmethod
     def method_name(self) -> str:
-        """The method that learnt, as the user types it."""
+        """Name of the method, as the user types it."""
 
     @property
     @abstractmethod
@@ -168,7 +170,7 @@ class Trained(Opened):
 
     @abstractmethod
     def dataset(self, source: str | None = None) -> Dataset:
-        """Open its dataset again. source: its present path, if it has moved."""
+        """Open the training dataset again. source: its present path, if it has moved"""
 
     @property
     def title(self) -> str:

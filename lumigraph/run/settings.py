@@ -1,4 +1,4 @@
-"""Settings of a run in config.json, read and written here alone; and the memory that a Config needs."""
+"""Settings of a run, in config.json; and the memory that a Config needs."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ class Settings:
     """Settings of a run: method, dataset and budget.
 
     method:    as the user types it
-    config:    the method's numbers by name, as the run was written with; see `method_config`
+    config:    the method's numbers by name, as written with the run; see `method_config`
     splits:    number of photographs or shapes by purpose
     seed:      of all random choices
-    budget:    {"steps": n} or {"seconds": s}, and what else `Budget.to_json` says
-    device:    that it began on;  processor: what kind of machine that was
-    method_file: the Python file of a method from elsewhere, see `methods.load`; nothing runs it unasked
-    said:      the file as it was read. What a newer version has added to it is kept when it is written again
+    budget:    {"steps": n} or {"seconds": s}, and further fields of `Budget.to_json`
+    device:    of the start of training;  processor: its hardware name
+    method_file: the Python file of an external method, see `methods.load`; never executed without consent
+    said:      the file's contents as read. Fields of newer versions are preserved when it is written again
     """
 
     method: str
@@ -107,14 +107,14 @@ class Settings:
         return {"format": RUN_FORMAT} | self.said | own | parts
 
     def method_config(self, kind: type[Method], file: Path) -> Any:
-        """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
-        its range"""
+        """The numbers as the Config of a kind of method. file: named in faults for one that is unknown, of another
+        type, or out of range"""
         return typed(kind.Config, without_constants(self.config, kind.Config, file), file, closed=True)
 
 
 def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
-    """JSON of a Config without options of older versions that are constants now: they have the option's name in
-    capitals, in the module of the dataclass. Warns of one that had another value."""
+    """JSON of a Config without options of older versions that have become constants: in capitals, in the module of the
+    dataclass. Warns of one that had another value."""
     if not (isinstance(said, dict) and is_dataclass(kind)):
         return said
     known, module, kept = hints(kind), vars(sys.modules[kind.__module__]), {}  # type: ignore[arg-type]
@@ -128,7 +128,7 @@ def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
-    """Raise LumigraphError where a method would not fit into the memory that is free, naming what to make smaller."""
+    """Raise LumigraphError for a method that exceeds free memory, naming the numbers to reduce."""
 
     def needed(config: Any) -> int:
         return bytes_of(kind, frame, config, learning)
@@ -148,9 +148,9 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
 
 
 def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> int:
-    """Bytes of a method's parameters, with all that learning keeps of each, of its buffers, and `further_bytes`.
+    """Bytes of a method's parameters with gradients and optimizer state, its buffers, and `further_bytes`.
 
-    The method is built of tensors without memory. Where it looks at their values, and so cannot be built that way, only
+    The method is built on the meta device. Where its constructor reads values, which that does not allow, only
     `further_bytes` is known.
     """
     further = kind.further_bytes(frame, config, learning)
@@ -167,7 +167,7 @@ def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> i
 
 
 def halved(config: Any) -> list[tuple[str, Any]]:
-    """A Config with each of its whole numbers at half its value, or at the least that its range allows, by name."""
+    """Copies of a Config with one of its whole numbers halved, or at its range's minimum, by name."""
     found = []
     for name, kind in hints(config.__class__).items():
         if is_dataclass(inner := getattr(config, name)):
