@@ -49,7 +49,7 @@ def save_picture(
 
 
 def depth_range(depth: Float[Tensor, "*pixels"], opacity: Float[Tensor, "*pixels"]) -> Range:
-    """Near and far limits of the depth colour map: 0.5 % and 99.5 % quantiles of solid pixels."""
+    """Near and far limits of the depth colour map: 2 % and 98 % quantiles of solid pixels."""
     solid = depth[(opacity > 0.5) & depth.isfinite() & (depth > 0)].flatten()
     if not len(solid):
         return 1.0, 2.0

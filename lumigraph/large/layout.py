@@ -57,12 +57,13 @@ class Discs:
 
 
 def lay_out(places: Places, wish: str | Path = "auto", source: str = "the capture") -> list[Block]:
-    """Blocks of a capture, each with at least one training photograph.
+    """Blocks of a capture, each with at least two training photographs.
 
     wish:   "auto", a number, or a file with `Discs`
     source: named in faults
-    Empty blocks are left out and named in a LumigraphWarning, with the number of photographs outside all blocks. Raises
-    LumigraphError for a number that exceeds the places, an invalid file, and one whose blocks are all elsewhere.
+    Smaller blocks are left out and named in a LumigraphWarning, as is the number of training photographs outside all
+    blocks. Raises LumigraphError for a number that exceeds the places, an invalid file, and one whose blocks are all
+    elsewhere.
     """
     from_file = not (str(wish) == "auto" or str(wish).isdigit())
     if not from_file:
@@ -216,7 +217,9 @@ def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Floa
 
 
 def usual_step(ground: Float[np.ndarray, "photograph 2"]) -> float:
-    """Median distance from one place to the next along the way; 0 for a single place."""
+    """Typical distance between neighbouring photographs, a quantile of their spanning tree's edges; 0 for a single
+    place.
+    """
     if len(ground) < 3:
         return 0.0
     distance, index = cKDTree(ground).query(ground, min(GRAPH_NEIGHBOURS, len(ground)))

@@ -167,9 +167,10 @@ def distorted(
 
 
 def thing_loss(logits: Float[Tensor, "picture thing"], there: Bool[Tensor, "picture thing"]) -> Tensor:
-    """Cross entropy of each object in a picture against the objects that may be absent.
+    """Cross entropy of each object in a picture against absent objects.
 
-    Objects that would form a held-out pair with the others are excluded, since their absence says nothing.
+    Absent objects that would form a held-out pair with a present one are excluded, so that those are not learnt as
+    wrong.
     """
     never = torch.zeros(2 * [len(captions.THINGS)])
     for pair in captions.held_out():
