@@ -1,4 +1,4 @@
-"""COLMAP models, binary or text, in the places where programs leave them."""
+"""COLMAP models, binary or text, in the usual folders of programs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def recognises(folder: Path) -> bool:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """The first place that holds a whole model."""
+    """The first of the usual folders with a complete model."""
     for place in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
             if all((folder / place / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
@@ -44,8 +44,8 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder. Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and
-    absent image folders."""
+    """The capture in a folder. Raises LumigraphError for a damaged model, an unsupported camera model, and missing
+    image folders."""
     place = model_folder(folder)
     assert place is not None
     model = read_model(place)
@@ -71,7 +71,7 @@ def read(folder: Path) -> Capture:
 
 @reads("holds no readable COLMAP model", "make or copy it again")
 def read_model(place: Path) -> pycolmap.Reconstruction:
-    """Raises LumigraphError for what is no whole model."""
+    """Read a model with pycolmap. Raises LumigraphError for an incomplete or damaged one."""
     if (place / "images.bin").is_file():
         check_whole(place)
         read_points3d(place / "points3D.bin")
@@ -86,10 +86,10 @@ def read_model(place: Path) -> pycolmap.Reconstruction:
 
 
 def check_whole(place: Path) -> None:
-    """Walk through a binary model: to read a list that is longer than its file, pycolmap would allocate all memory or
-    run for hours.
+    """Walk through a binary model before reading it: with a list length beyond the file's end, pycolmap would allocate
+    all memory or run for hours.
 
-    Raises LumigraphError for a list that ends early, and for a rotation that is none.
+    Raises LumigraphError for a truncated list, and for an invalid rotation.
     """
     for name, walk in (("images.bin", walk_images), ("frames.bin", walk_frames), ("rigs.bin", walk_rigs)):
         path = place / name
@@ -102,8 +102,8 @@ def check_whole(place: Path) -> None:
 
 
 def walk_images(data: bytes, path: Path) -> int:
-    """Per image an id, a pose of seven numbers, a camera, a name that ends in zero, and a list of (x, y, point).
-    Returns where the list ends, as the other walks do."""
+    """Per image an id, a pose of seven numbers, a camera, a zero-terminated name, and a list of (x, y, point). Returns
+    the offset of the list's end, as the other walks do."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         quaternion = struct.unpack_from("<4d", data, offset + 4)
@@ -115,7 +115,7 @@ def walk_images(data: bytes, path: Path) -> int:
 
 
 def walk_frames(data: bytes, path: Path) -> int:
-    """Per frame its id and its rig's, a pose of seven numbers, and a list of (sensor's kind, sensor, image)."""
+    """Walk frames: an id and its rig's, a pose of seven numbers, and a list of (sensor's kind, sensor, image)."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         check_turn(struct.unpack_from("<4d", data, offset + 8), "a frame", path)
@@ -125,7 +125,7 @@ def walk_frames(data: bytes, path: Path) -> int:
 
 
 def walk_rigs(data: bytes, path: Path) -> int:
-    """Per rig an id and a number of sensors: the first, then others, each with a pose or without."""
+    """Walk rigs: an id and a number of sensors: the first, then others, each with a pose or without."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         (sensors,), offset = struct.unpack_from("<I", data, offset + 4), offset + 8
@@ -142,7 +142,7 @@ def check_turn(quaternion: Sequence[float], name: str, path: Path) -> None:
 
 
 def check_text(path: Path) -> None:
-    """Look at the rotations of images.txt: a line for each image, which another of its details follows."""
+    """Check the rotations of images.txt, in every second line."""
     lines = iter(read_text(path).splitlines())
     for line in lines:
         words = line.split()

@@ -1,4 +1,4 @@
-"""Numbers of files as they are stored: photographs of more than eight bits, depth, labels, arrays.
+"""Raw numbers of files: photographs of more than eight bits, depth, labels, arrays.
 
 Pillow keeps 16 bits of grey only, so colours of 16 bits and EXR go through FFmpeg (`av`), as films do.
 """
@@ -47,7 +47,7 @@ class Kind:
 
     @property
     def deep(self) -> bool:
-        """True if it holds more than eight bits, in 1, 3 or 4 channels."""
+        """True for more than eight bits, in 1, 3 or 4 channels."""
         return self.dtype.itemsize > 1 and self.channels in (1, 3, 4)
 
     @property
@@ -59,7 +59,7 @@ class Kind:
 
 
 def check_pixels(size: tuple[int, int], each: int = 4) -> None:
-    """Raise ValueError for a declared picture that nothing has, or that takes more memory to read than is free.
+    """Raise ValueError for an implausible picture size, or one that exceeds free memory.
 
     each: bytes of a pixel
     """
@@ -74,8 +74,8 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
 
 
 def load_array(path: Path) -> Any:
-    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine. Raises ValueError,
-    and what np.load raises."""
+    """Load a file by np.load without pickles, limited by the file's bytes and free memory. Raises ValueError, and the
+    errors of np.load."""
     if not zipfile.is_zipfile(path):
         return np.load(path, mmap_mode="r", allow_pickle=False)
     with zipfile.ZipFile(path) as packed:
@@ -115,7 +115,7 @@ def kind_of(path: Path, name: str = "") -> Kind:
 
 
 def tiff_tags(path: Path) -> Mapping[int, Any]:
-    """A TIFF file's tags, also where its pixels are of a kind that Pillow cannot open."""
+    """Tags of a TIFF file, also of one whose pixel format Pillow cannot open."""
     with open(path, "rb") as file:
         header = file.read(8)
         header += file.read(8) if header[2:4] in (b"\x2b\0", b"\0\x2b") else b""  # the large kind of TIFF
@@ -167,7 +167,7 @@ def read_numbers(path: Path, name: str = "") -> np.ndarray:
 
 
 def read_array(path: Path, name: str) -> np.ndarray:
-    """The array of a NumPy file; of several the one that is called so."""
+    """Array of a NumPy file; of several that of the given name."""
     found = load_array(path)
     if isinstance(found, np.ndarray):
         array = found
@@ -186,7 +186,7 @@ def read_array(path: Path, name: str) -> np.ndarray:
 
 
 def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
-    """Upright, as EXIF's orientation says."""
+    """Pixels rotated upright by EXIF's orientation."""
     if orientation in (5, 6, 7, 8):
         values = values.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -195,7 +195,7 @@ def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
 
 
 def as_bytes(values: np.ndarray, encoding: str) -> np.ndarray:
-    """RGB or RGBA of more than eight bits as sRGB-encoded bytes, colours not multiplied by alpha."""
+    """RGB or RGBA of more than eight bits as sRGB-encoded bytes, not premultiplied."""
     found = values.astype(np.float64)
     found = np.nan_to_num(found) if values.dtype.kind == "f" else found / np.iinfo(values.dtype).max
     if encoding == "linear premultiplied":

@@ -82,7 +82,7 @@ def is_polycam(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Raises LumigraphError for malformed files."""
+    """The capture in a folder. Raises LumigraphError for malformed files."""
     return read_polycam(folder) if is_polycam(folder) else read_record3d(folder)
 
 
@@ -91,7 +91,7 @@ def opencv(pose: np.ndarray) -> np.ndarray:
 
 
 def read_polycam(folder: Path) -> Capture:
-    """The corrected poses with their pictures, where Polycam has optimised them."""
+    """Polycam's optimised poses with their pictures, if there are any, else the original ones."""
     frames = folder / "keyframes"
     corrected = "corrected_" if (frames / "corrected_cameras").is_dir() else ""
     shots, missing = [], []
@@ -131,7 +131,7 @@ def read_record3d(folder: Path) -> Capture:
 
 
 def unpacked(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Depth of a file of Record3D. Raises LumigraphError without the library that unpacks it, or for another size."""
+    """Depth of a Record3D file. Raises LumigraphError without the LZFSE library, or for another size."""
     try:
         import liblzfse
     except ImportError as fault:

@@ -1,4 +1,4 @@
-"""Photographs as files: found, measured, turned upright, reduced, and read as bytes."""
+"""Image files of photographs: search, size, orientation, downscaling, reading as bytes."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `c
 
 
 def find_file(path: Path) -> Path:
-    """The file itself, or where it was named without a suffix, the image of that name. The file may not exist."""
+    """The file itself, or for a name without suffix the image of that name. The file may not exist."""
     if is_file(path) or not path.name:
         return path
     return next((p for s in IMAGE_SUFFIXES if is_file(p := path.with_name(path.name + s))), path)
 
 
 def list_images(folder: Path) -> list[str]:
-    """Names of the images below a folder, with / between folders, in the order in which programs pair them with poses:
-    by their letters, 10 before 2."""
+    """Names of the images below a folder, with / between folders, sorted as strings (10 before 2), the order in which
+    programs pair them with poses."""
     if not folder.is_dir():
         return []
     files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in IMAGE_SUFFIXES} and p.is_file())
@@ -65,7 +65,7 @@ def list_images(folder: Path) -> list[str]:
 
 
 def reductions(folder: Path) -> dict[int, Path]:
-    """Folders of the same photographs, reduced: images, images_2, images_4..., by how many times."""
+    """Folders of the same photographs at reduced size: images, images_2, images_4..., by factor."""
     found = {1: folder} if folder.is_dir() else {}
     for beside in folder.parent.glob(f"{folder.name}_*"):
         times = beside.name.removeprefix(f"{folder.name}_")
@@ -75,10 +75,10 @@ def reductions(folder: Path) -> dict[int, Path]:
 
 
 def versions(folders: dict[int, Path], names: list[str]) -> list[dict[int, Path]]:
-    """For each named photograph its files in folders of photographs reduced so many times.
+    """Files of each named photograph by reduction factor.
 
-    A file may have another suffix than the name says. In a reduced folder where no name fits but the number of files
-    does, the order of names decides.
+    A file may have another suffix than the name says. A reduced folder with the same number of files but no matching
+    name is matched in order of names.
     """
     found: list[dict[int, Path]] = [{} for _ in names]
     for times, place in folders.items():
@@ -103,10 +103,10 @@ def stem(name: str) -> str:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A photograph as it will be used: its pixels, the size its lens was calibrated for, and the size wanted.
+    """A photograph's file at its final size: its pixels, the size of its lens calibration, and the target size.
 
     plane: all its bits, where they are more than eight
-    digest: of its file, see `digest_of`; empty where there is none
+    digest: of its file, see `digest_of`; empty without a file
     """
 
     picture: ImageSource
@@ -117,9 +117,9 @@ class Chosen:
 
 
 def choose(shot: Shot, downscale: int | None) -> Chosen:
-    """File of a shot to read, and its reduction: `downscale` times the size that the lens was calibrated for.
+    """Choose a shot's file to read, and its reduction: `downscale` times the size that the lens was calibrated for.
 
-    Raises LumigraphError for a file that is no image or whose shape contradicts the lens.
+    Raises LumigraphError for a file that is no image or whose aspect ratio contradicts the lens.
     """
     if isinstance(shot.image, dict):
         return choose_file(shot, shot.image, downscale)
@@ -193,7 +193,7 @@ def reduced(size: Size, downscale: int | None) -> Size:
 
 
 def smaller(own: Size, wanted: Size) -> Size:
-    """The size to read at: the wanted one, unless that is larger, or smaller only by another program's rounding."""
+    """The size to read at: the target size, unless the file is smaller, or equal up to another program's rounding."""
     return own if max(own) <= max(wanted) + 1 else wanted
 
 
@@ -209,7 +209,7 @@ def stat(path: Path) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """Size of a file and a hash of samples of its content, by which a changed photograph is noticed."""
+    """Size of a file and a hash of samples of its content, to detect changed photographs."""
     with readable(path), open(path, "rb") as file:
         size, crc = path.stat().st_size, 0
         for number in range(DIGEST_SAMPLES + 1):
@@ -220,8 +220,8 @@ def digest_of(path: Path) -> str:
 
 @cache
 def reads_heic() -> bool:
-    """Let Pillow read HEIC, turned upright by the decoder and without an orientation left in EXIF. False where the
-    package for it is missing."""
+    """Register HEIC support in Pillow, with orientation applied by the decoder. False if the package for it is
+    missing."""
     try:
         import pi_heif
     except ImportError:
@@ -231,7 +231,7 @@ def reads_heic() -> bool:
 
 
 def measure(path: Path) -> tuple[Size, int | None]:
-    """Width and height as stored, and how EXIF says to turn it."""
+    """Width and height as stored, and EXIF's orientation."""
     with readable(path):
         if path.suffix.lower() == ".exr":
             return kind_of(path).size, None
@@ -243,7 +243,7 @@ def measure(path: Path) -> tuple[Size, int | None]:
 
 
 def upright_size(files: dict[int, Path]) -> Size:
-    """Full size of a photograph in files that are reduced so many times, upright as EXIF says."""
+    """Full size of a photograph from files by reduction factor, after EXIF rotation."""
     (width, height), orientation = measure(files[min(files)])
     width, height = width * min(files), height * min(files)
     return (height, width) if orientation in EXIF_SIDEWAYS else (width, height)
@@ -276,7 +276,7 @@ def read_deep(path: Path, turn: bool) -> np.ndarray:
 
 
 def deep_plane(path: Path, turn: bool, identity: str) -> PixelPlane | None:
-    """All bits of a photograph as values of a layer; None where eight hold it."""
+    """All bits of a photograph as values of a layer; None for eight bits."""
     kind = deep(path)
     if kind is None:
         return None
@@ -304,7 +304,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
 def masked(
     make: Callable[[], np.ndarray], shot: Shot, size: Size, turn: bool
 ) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    """Reader of a shot's pixels, whose alpha is multiplied by the silhouette, and of its mask."""
+    """Reader of a shot's pixels, with alpha multiplied by the silhouette, and of its mask."""
 
     def read() -> tuple[np.ndarray, np.ndarray | None]:
         pixels = make()
@@ -339,7 +339,7 @@ def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Context in which any fault that an image library raises for a file becomes one sentence."""
+    """Context that turns any error of an image library for a file into a LumigraphError of one sentence."""
     if path.suffix.lower() in HEIC_SUFFIXES and not reads_heic():
         raise LumigraphError(f"{path} {NO_HEIC}")
     with reading(path, "cannot be read as an image", "restore it, or delete it so that it is skipped"):

@@ -1,4 +1,4 @@
-"""Sparse points that lie beside photographs: PLY files, COLMAP's points3D.bin, and models in another frame."""
+"""Sparse points in files beside photographs: PLY, COLMAP's points3D.bin, and models in another frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera po
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Positions, colours, and how many photographs saw each; fields of `Capture`."""
+    """Positions, colours, and numbers of sightings; fields of `Capture`."""
 
     points: Float[np.ndarray, "point 3"]
     point_colours: UInt8[np.ndarray, "point 3"]
@@ -29,7 +29,7 @@ class SparsePoints:
 
 
 def read_ply(path: Path) -> SparsePoints:
-    """Vertices with x, y, z and, where they have them, red, green, blue, and sightings (in how many photographs)."""
+    """Vertices with x, y, z and, if present, red, green, blue, and sightings (number of photographs)."""
     vertex = read_vertices(path)["vertex"]
     positions, colours = np.array(columns(vertex, "xyz", np.float64)), colours_of(vertex)
     if colours is None:
@@ -40,7 +40,7 @@ def read_ply(path: Path) -> SparsePoints:
 
 
 def read_vertices(path: Path, *further: str) -> dict[str, np.ndarray]:
-    """Vertices of a PLY file, and further elements where it has them. Raises LumigraphError without x, y and z."""
+    """Vertices of a PLY file, and further elements if any. Raises LumigraphError without x, y and z."""
     header = read_header(path)
     if not {*"xyz"} <= {*header.properties.get("vertex", [])}:
         raise LumigraphError(f"{path} has no vertices with x, y and z; name another file")
@@ -59,7 +59,7 @@ def colours_of(rows: np.ndarray) -> UInt8[np.ndarray, "row 3"] | None:
 
 @reads("is truncated", "restore or remove it")
 def read_points3d(path: Path) -> SparsePoints:
-    """COLMAP's points3D.bin by itself: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
+    """COLMAP's points3D.bin: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
     data = read_bytes(path, free_memory())
     (count,), offset = struct.unpack_from("<Q", data), 8
     positions, colours, sightings = [], [], []
@@ -77,8 +77,8 @@ def read_points3d(path: Path) -> SparsePoints:
 
 
 def similarity(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> np.ndarray | None:
-    """The 4x4 similarity that takes source points onto target points, least squares (Umeyama 1991). None where they do
-    not agree to 2% of their spread, or are too few to tell."""
+    """The 4x4 least-squares similarity from source to target points (Umeyama 1991). None for a residual above 2% of
+    their spread, or too few points."""
     if len(source) < 4:
         return None
     a, b = source - source.mean(0), target - target.mean(0)

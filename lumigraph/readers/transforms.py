@@ -50,7 +50,7 @@ Angle = Annotated[float, between(1e-6, 3.14159)]  # radians
 
 @dataclass(frozen=True)
 class Whole:
-    """Contents of a file beside lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
+    """Fields of a file besides lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
 
     frames: list[Json]
     aabb_scale: Positive | None = None
@@ -64,7 +64,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class GpsRecord:
-    """Field `gps` of capture.json: whether the axes point east, north and up, in metres, and of what origin."""
+    """Field `gps` of capture.json: whether the axes point east, north and up, in metres, and their origin."""
 
     used: bool = False
     origin: tuple[float, float, float] | None = None
@@ -72,8 +72,8 @@ class GpsRecord:
 
 @dataclass(frozen=True)
 class Made:
-    """Fields of capture.json: the source of a scene, the name of its making, the messages about it, photographs
-    without a pose with the reason, and its position on Earth."""
+    """Fields of capture.json: source of a scene, method of its creation, warnings, photographs without a pose with the
+    reason, and its position on Earth."""
 
     sources: list[str] = field(default_factory=list)
     key: str = ""
@@ -91,7 +91,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Posed:
-    """A frame, with what the file says of all frames."""
+    """A frame, with the file's fields for all frames as defaults."""
 
     file_path: Name
     transform_matrix: list[Row]
@@ -154,15 +154,15 @@ def read(folder: Path) -> Capture:
 
 
 def read_frames_file(path: Path) -> tuple[Whole, Json]:
-    """Contents of a file: typed for what concerns all of it, and unchanged."""
+    """Contents of a file: parsed fields of the whole file, and raw JSON."""
     plain = read_json(path)
     return typed(Whole, plain, path), plain
 
 
 def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[Shot], list[str]]:
-    """The photographs that a file lists and that exist, and the names of those that do not.
+    """Photographs of a file that exist, and the names of missing ones.
 
-    whole: the file as it stands. What it says of a lens holds for every frame that says nothing else.
+    whole: raw JSON of the file. Its lens fields are defaults for every frame
     """
     folder, shots, missing = path.parent, [], []
     shared = {name: value for name, value in whole.items() if name != "frames"}
@@ -194,12 +194,12 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
 
 
 def called(frame: Json, number: int = 0) -> str:
-    """A frame's name for people."""
+    """A frame's display name."""
     return f"frame {frame.get('file_path', number)}"
 
 
 def fact(value: Any, name: str, where: str) -> np.ndarray:
-    """Fact of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
+    """Value of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
     with reading(where, f'has "{name}", which is no number and no array of them', "correct it"):
         numbers = np.asarray(value, np.float64)
     if numbers.size > MAX_FACT_NUMBERS:
@@ -208,7 +208,7 @@ def fact(value: Any, name: str, where: str) -> np.ndarray:
 
 
 def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> dict[str, PixelPlane]:
-    """Depth, labels and normals whose files a frame names; what it names and is not there joins `missing`."""
+    """Depth, labels and normals of the files that a frame names; missing ones are added to `missing`."""
     found = {}
     for kind, keys in PLANES.items():
         key = next((key for key in keys if getattr(about, key) is not None), None)
@@ -226,7 +226,7 @@ def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> d
 
 
 def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> PixelPlane:
-    """Depth as nerfstudio stores it, thousandths of a unit unless the file says otherwise, or as instant-ngp does."""
+    """Depth as nerfstudio stores it, thousandths of a unit by default, or as instant-ngp does."""
     stated = about.integer_depth_scale if key == "depth_path" else about.depth_unit_scale_factor
     scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
     along_ray = isinstance(lens, Equirectangular) or bool(about.is_euclidean_depth)
@@ -236,7 +236,7 @@ def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> PixelPlane:
 
 
 def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
-    """Each photograph's own file, and reduced ones where it lies in `images` and there are images_2, images_4..."""
+    """Files of each photograph: its own, and reduced ones if it is in `images` and there are images_2, images_4..."""
     files = [find_file(folder / name) for name in names]
     found = [{1: path} if is_file(path) else {} for path in files]
     inside = [i for i, path in enumerate(files) if path.parent == folder / "images"]
@@ -296,7 +296,9 @@ def published_splits(whole: Whole) -> dict[str, str]:
 
 
 def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str]) -> SparsePoints | None:
-    """The points a file names, else those of a COLMAP model of the same photographs, turned into this file's frame."""
+    """The points a file names, else those of a COLMAP model of the same photographs, transformed into this file's
+    frame.
+    """
     if (name := whole.ply_file_path) is not None:
         if is_file(folder / name):
             return read_ply(folder / name)
