@@ -1,4 +1,4 @@
-"""Structure from motion: where bare photographs were taken from."""
+"""Structure from motion: camera poses of photographs without any."""
 
 from .reconstruction import MotionOptions, reconstruct
 from .rig import capture_rig, is_rig

@@ -1,4 +1,4 @@
-"""Rigs: a folder of videos, one for each camera that stands still, filmed at once, becomes a scene with times."""
+"""Rigs: a folder of synchronised videos of static cameras becomes a scene with times."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SAME_RATE, SAME_LENGTH = 0.01, 0.05  # relative, and seconds: differences that a
 
 @dataclass(frozen=True)
 class RigVideo:
-    """A video of a rig. begin: seconds at which it begins, on the clock of all;  rate: frames per second"""
+    """A video of a rig. begin: its start in seconds, on the common clock;  rate: frames per second"""
 
     path: Path
     begin: float
@@ -37,13 +37,13 @@ class RigVideo:
         return self.begin + self.seconds
 
     def numbers(self, moments: Sequence[float]) -> list[int]:
-        """The frame nearest to each moment."""
+        """Number of the nearest frame at each time."""
         last = max(round(self.seconds * self.rate) - 1, 0)
         return [min(max(round((moment - self.begin) * self.rate), 0), last) for moment in moments]
 
 
 def is_rig(path: Path) -> bool:
-    """True for a folder that has several videos."""
+    """True for a folder with several videos."""
     return path.is_dir() and len(list_videos(path)) > 1
 
 
@@ -52,7 +52,7 @@ def list_videos(folder: Path) -> list[Path]:
 
 
 def films_of(folder: Path) -> list[RigVideo]:
-    """The videos of a folder, with their clocks. Raises LumigraphError for clocks that name none of them."""
+    """The videos of a folder, with their clocks. Raises LumigraphError for clocks without matching names."""
     clocks: dict[str, float] = {}
     if is_file(folder / CLOCKS_FILE):
         clocks = read_json(folder / CLOCKS_FILE, dict[str, float])
@@ -67,9 +67,9 @@ def films_of(folder: Path) -> list[RigVideo]:
 
 
 def common_moments(films: Sequence[RigVideo], count: int | None) -> tuple[list[float], list[str]]:
-    """Moments that all videos show, evenly spread, and what was done about lengths and rates that differ.
+    """Times common to all videos, evenly spaced, and remarks on lengths and rates that differ.
 
-    Raises LumigraphError where there are none.
+    Raises LumigraphError if there are none.
     """
     begin, end = max(film.begin for film in films), min(film.end for film in films)
     if end <= begin:
@@ -103,9 +103,9 @@ def capture_rig(
     source: Path, folder: Path, options: MotionOptions, track: Track = untracked
 ) -> tuple[dict[str, Any], list[str]]:
     """Write a scene of a rig's videos: images/CAMERA/0000.jpg and transforms.json with times. Returns numbers of
-    cameras and moments, and remarks.
+    cameras and times, and remarks.
 
-    Poses are those of a transforms.json beside the videos, whose frames name them, or found by the first moment.
+    Poses are those of a transforms.json beside the videos, whose frames name them, or reconstructed at the first time.
     """
     films = films_of(source)
     moments, said = common_moments(films, options.frames)
@@ -137,7 +137,7 @@ def step_of(moments: Sequence[float]) -> str:
 
 
 def take(film: RigVideo, moments: Sequence[float], folder: Path) -> None:
-    """Write the frame of each moment. Raises LumigraphError where the video ends before its last one."""
+    """Write the frame at each time. Raises LumigraphError where the video ends before the last one."""
     folder.mkdir(parents=True)
     numbers = film.numbers(moments)
     pictures = {number: upright(frame) for number, frame, _ in picked(film.path, sorted(set(numbers)))}
@@ -148,8 +148,8 @@ def take(film: RigVideo, moments: Sequence[float], folder: Path) -> None:
 
 
 def given_poses(source: Path, films: Sequence[RigVideo]) -> dict[str, dict[str, Any]] | None:
-    """Frames of the transforms.json beside videos, by the videos' names without endings, each with the lens that the
-    file gives for all; None without one. Raises LumigraphError where a video has no pose."""
+    """Frames of the transforms.json beside videos, by the videos' names without suffixes, each with the file's common
+    lens; None without one. Raises LumigraphError for a video without a pose."""
     path = source / "transforms.json"
     if not is_file(path):
         return None
@@ -164,7 +164,7 @@ def given_poses(source: Path, films: Sequence[RigVideo]) -> dict[str, dict[str, 
 def found_poses(
     films: Sequence[RigVideo], folder: Path, options: MotionOptions, track: Track
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Poses by the pictures of the first moment, and the lens that all share."""
+    """Poses reconstructed from the pictures at the first time, and the common lens."""
     if len(films) < MIN_VIEWS:
         raise LumigraphError(
             f"{films[0].path.parent} has {len(films)} videos, and poses of fewer than {MIN_VIEWS} cameras cannot be "

@@ -1,4 +1,4 @@
-"""Bare photographs and videos, whose poses are not known yet."""
+"""Photographs and videos without poses."""
 
 from .gather import gather, is_bare
 from .photo import Intake, Photo

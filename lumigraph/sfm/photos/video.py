@@ -1,10 +1,10 @@
-"""Selection of frames from a video: sharp, evenly spread over what the camera saw, no two the same.
+"""Selection of frames from a video: sharp, evenly spread over the camera's movement, without duplicates.
 
-The film is read twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
-and how far the picture has moved since the beginning. The film is then cut into as many stretches as frames are wanted,
+The film is read twice. First every frame, or every second or fourth of a fast film, is judged at small size: its
+sharpness, and the accumulated movement of the picture. The film is then cut into as many segments as frames are wanted,
 each with equal movement, so that a resting camera gives few frames and a quick turn many; a share of TIME goes by the
-clock, for movement that is not measured. The sharpest frame of each stretch, rather in its middle, is written the
-second time, unless it shows what a frame before it shows.
+clock, for movement that is not measured. The sharpest frame of each segment, with a preference for its middle, is
+written in the second pass, unless it repeats an earlier one.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ WINDOW_MEAN_SQUARE = (3 / 8) ** 2  # mean square of the window that fades out a 
 
 @dataclass(frozen=True)
 class Index:
-    """frames.json: which film the frames beside it are of, how many were asked for, and when each was seen."""
+    """frames.json: source film of the frames beside it, their requested number, and their times."""
 
     video: str = ""
     modified: int = 0
@@ -65,12 +65,12 @@ def is_video(path: Path) -> bool:
 
 
 def extract(path: Path, folder: Path, frames: int | None = None, track: Track = untracked) -> list[tuple[Path, float]]:
-    """Frames of a video as upright JPEGs in `folder`, in order, and when each was seen, in seconds from the first on.
+    """Frames of a video as upright JPEGs in `folder`, in order, with times in seconds from the first on.
 
-    frames: how many; None: FRAMES_PER_SECOND, from MIN_FRAMES to MAX_FRAMES. There are fewer where the film is shorter
-            or shows the same again
-    The folder is used as it is if it was made of the same file and with the same options; else it is replaced.
-    Raises LumigraphError where the film cannot be read or has no frames.
+    frames: their number; None: FRAMES_PER_SECOND, from MIN_FRAMES to MAX_FRAMES. There are fewer where the film is
+            shorter or repeats itself
+    An existing folder of the same file and options is reused; any other is replaced.
+    Raises LumigraphError if the film cannot be read or has no frames.
     """
     if frames is not None and frames < 2:
         raise LumigraphError(f"{frames} frames of {path} are too few to find cameras for; ask for 2 at least")
@@ -88,7 +88,7 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
 
 
 def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row, Row, Row]:
-    """Numbers of the judged frames, their seconds from the first on, sharpness, and how far the picture had moved."""
+    """Numbers of the judged frames, their seconds from the first on, sharpness, and accumulated movement."""
     rows: list[tuple[int, float, float, float]] = []
     odometer, end = Odometer(), 0.0
     with opened(path) as film:
@@ -110,7 +110,7 @@ def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row,
 
 
 def choose(numbers: Sequence[int], seconds: Row, sharp: Row, travelled: Row, frames: int | None = None) -> list[int]:
-    """The numbers of the sharpest frames of equal stretches, ascending. Other arguments are as `judge` gives them."""
+    """Numbers of the sharpest frames of segments of equal movement, ascending. Other arguments are those of `judge`."""
     length = float(seconds[-1])
     count = frames or min(max(round(FRAMES_PER_SECOND * length), MIN_FRAMES), MAX_FRAMES)
     clock = seconds / max(length, 1e-9)
@@ -122,7 +122,7 @@ def choose(numbers: Sequence[int], seconds: Row, sharp: Row, travelled: Row, fra
 
 
 def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict[str, float]:
-    """Write the chosen frames but those that repeat an earlier one; names and seconds from the first frame on."""
+    """Write the chosen frames except repetitions of earlier ones. Returns names and seconds from the first frame on."""
     written: dict[str, float] = {}
     signatures: list[np.ndarray] = []
     for number, frame, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
@@ -149,7 +149,7 @@ def picked(path: Path, chosen: Sequence[int]) -> Iterator[tuple[int, VideoFrame,
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[InputContainer]:
-    """A film with pictures. Raises LumigraphError where there are none."""
+    """Open a film. Raises LumigraphError for one without pictures."""
     try:
         container = av.open(str(path))
     except (av.FFmpegError, ValueError) as fault:
@@ -164,8 +164,8 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, and when each is shown, in seconds. What comes after damage is left out. Raises LumigraphError
-    where no frame can be decoded."""
+    """Frames in order, with their times in seconds, up to the first damaged one. Raises LumigraphError if no frame can
+    be decoded."""
     rate, count = speed(film), 0
     try:
         for frame in film.decode(video=0):
@@ -185,7 +185,7 @@ def speed(film: InputContainer) -> float:
 
 
 def duration(film: InputContainer) -> float:
-    """Seconds, as the file says; 0 where it does not."""
+    """Duration in seconds; 0 if the file does not state it."""
     stream = film.streams.video[0]
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
@@ -193,14 +193,14 @@ def duration(film: InputContainer) -> float:
 
 
 def grey(frame: VideoFrame, longest: int) -> Float[np.ndarray, "height width"]:
-    """Luminance from 0 to 255, reduced so that the longer side is at most `longest` pixels. Not turned upright."""
+    """Luminance from 0 to 255, reduced so that the longer side is at most `longest` pixels. Not rotated upright."""
     times = max(frame.width / longest, frame.height / longest, 1.0)
     width, height = (max(round(side / times), 1) for side in (frame.width, frame.height))
     return frame.reformat(width, height, format="gray", interpolation="AREA").to_ndarray().astype(np.float32)
 
 
 def upright(frame: VideoFrame) -> Image.Image:
-    """A frame as it is meant to be seen, in sRGB bytes."""
+    """A frame rotated upright, in sRGB bytes."""
     return frame.to_image().rotate(frame.rotation, expand=True)
 
 
@@ -209,10 +209,10 @@ def why(fault: Exception) -> str:
 
 
 class Odometer:
-    """Sum of the movement of a picture, in pixels of small grey pictures that are given one by one.
+    """Accumulated movement of a picture, in pixels of small grey pictures passed one by one.
 
-    Each is compared with a reference, which is exchanged only once the picture has moved by REFERENCE_STRIDE, so that
-    noise does not add up while the camera rests.
+    Each is compared with a reference, which is replaced only after movement by REFERENCE_STRIDE, so that noise does not
+    accumulate while the camera rests.
     """
 
     def __init__(self) -> None:
@@ -220,7 +220,7 @@ class Odometer:
         self._reference: np.ndarray | None = None
 
     def show(self, picture: Float[np.ndarray, "height width"]) -> float:
-        """The distance so far."""
+        """Add a picture. Returns the accumulated movement."""
         tiles = cut(picture)
         if self._reference is None:
             self._reference = tiles
@@ -231,7 +231,7 @@ class Odometer:
 
 
 def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile row column"]:
-    """Square tiles, faded out towards their borders; what does not fill a tile is left out."""
+    """Square tiles with a window function; incomplete tiles are left out."""
     rows, columns = max(picture.shape[0] // TILE_SIDE, 1), max(picture.shape[1] // TILE_SIDE, 1)
     whole = np.zeros((rows * TILE_SIDE, columns * TILE_SIDE), np.float32)
     part = picture[: rows * TILE_SIDE, : columns * TILE_SIDE]
@@ -242,8 +242,8 @@ def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile r
 
 
 def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
-    """Mean length of the tiles' displacements, each where its cross-correlation peaks; 0 where nothing has texture.
-    Tiles are followed one by one, so that walking forward or turning about the line of sight counts as well."""
+    """Mean length of the tiles' displacements by phase correlation; 0 without texture. Tiles are tracked one by one, so
+    that walking forward or rolling the camera counts as well."""
     textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > MIN_VARIANCE * WINDOW_MEAN_SQUARE
     if not textured.any():
         return 0.0
