@@ -75,9 +75,7 @@ class Config:
     tracking: TrackingNumbers = TrackingNumbers()
     descent: SplatPoseNumbers = SplatPoseNumbers()
     mapping: SplatMappingNumbers = SplatMappingNumbers()
-    rates: RateNumbers = RateNumbers(
-        means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, opacities_lr=0.05, scales_lr=1e-3
-    )
+    rates: RateNumbers = RateNumbers(means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, scales_lr=1e-3)
     frame_side: Annotated[int, between(0, 10_000)] = 0  # pixels of the longer side of frames, about; 0 as photographs
     max_gaussians: CloudSize = 4_000_000  # Gaussians at most; what is seen after that is not mapped
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
