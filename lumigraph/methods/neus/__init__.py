@@ -35,6 +35,8 @@ ROOM_RADIUS = 0.9  # the same of a hollow sphere, seen from inside
 CLEAR_RADIUS = 0.5  # largest radius of it, of the distance from its middle to the nearest camera
 TAPS = 5  # evaluations of the hash table for each section: in its middle, and around it for the gradient
 MIN_OPACITY = 1e-3  # opacities of the mask term stay so far from 0 and 1, where its slope has no end
+EIKONAL_WEIGHT = 0.1  # lambda, weight of the eikonal term, eq. 17; higher keeps f closer to a distance
+MASK_WEIGHT = 0.1  # beta, weight of the mask term, eq. 18, where photographs have alpha
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,6 @@ class Config:
     samples_per_step: Annotated[int, between(0, 1 << 24)] = 0  # sections of a step, which sets its rays; 0: fixed rays
     outside_samples: RaySamples = 32  # samples of a ray behind the box of an open capture; more are sharper, slower
     weight_threshold: Share = 0.0  # weight of a section below which it is left out; higher is faster, less exact
-    eikonal_weight: NonNegative = 0.1  # lambda, weight of the eikonal term, eq. 17; higher keeps f closer to a distance
-    mask_weight: NonNegative = 0.1  # beta, weight of the mask term, eq. 18, where photographs have alpha
     curvature_weight: NonNegative = 0.0  # weight of the Laplacian's magnitude, with --field hash; higher smooths
     cosine_annealing: Share = 1 / 6  # share of the budget in which slopes are annealed, where nothing has alpha
     coarse_to_fine: Share = 0.0  # share of the budget in which levels of the hash table are added; 0: at once
@@ -167,12 +167,12 @@ class NeuS(FieldMethod):
         anywhere, filled = self.network.shape.surface(points), self.sampler.empty.may_hold(points)
         if filled is not None:  # nothing else is learnt where the mask says that nothing is
             terms["empty"] = ((-anywhere.distance).clamp_min(0) * ~filled).mean()
-        terms["eikonal"] = c.eikonal_weight * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
+        terms["eikonal"] = EIKONAL_WEIGHT * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
         if c.curvature_weight and laplacian:
             bent = laplacian[0][inside].abs()
             terms["curvature"] = c.curvature_weight * bent.sum() / max(len(bent), 1)
-        if batch.alpha is not None and c.mask_weight:
-            terms["mask"] = c.mask_weight * mask_error(rendering.opacity, batch.alpha)
+        if batch.alpha is not None and MASK_WEIGHT:
+            terms["mask"] = MASK_WEIGHT * mask_error(rendering.opacity, batch.alpha)
         return terms
 
     def _anywhere(self, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:

@@ -27,6 +27,8 @@ from ...method.controls import Control
 from .loops import trace
 from .octree import CodeOctree
 
+MAX_STEPS = 64  # steps of sphere tracing at most
+
 
 @dataclass(frozen=True)
 class Config:
@@ -41,7 +43,6 @@ class Config:
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first
     final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
     hit_distance: NonNegative = 3e-4  # scene units from the surface at which a ray meets it; smaller costs steps
-    max_steps: Annotated[int, between(1, 1024)] = 64  # steps of sphere tracing at most
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
@@ -161,7 +162,7 @@ class NGLOD(SurfaceMethod):
         given = [x.contiguous().numpy() for x in (0.5 * rays.origins + 0.5, rays.directions, tree.cells, tree.rows)]
         near, hit = np.float32(0.5 * self.frame.near), np.float32(0.5 * self.config.hit_distance)
         found = [x.numpy() for x in (t, normals)]
-        trace(*given, tree.depth, near, *(x.detach().numpy() for x in tables), hit, self.config.max_steps, *found)
+        trace(*given, tree.depth, near, *(x.detach().numpy() for x in tables), hit, MAX_STEPS, *found)
         return 2 * t, normals
 
     def _traced(self, rays: Rays) -> Float[Tensor, " ray"]:
@@ -174,7 +175,7 @@ class NGLOD(SurfaceMethod):
         row = (found.ray_starts.diff() > 0).nonzero()[:, 0]
         place = 2 * found.t_start[found.ray_starts[row]]
         before, ahead = place, torch.zeros_like(place)  # 0: no value in front of it
-        for _ in range(c.max_steps):
+        for _ in range(MAX_STEPS):
             if not len(row):
                 break
             value = self.distance(rays[row].at(place))

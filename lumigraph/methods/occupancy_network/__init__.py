@@ -32,6 +32,7 @@ Input = Literal["points", "voxels", "picture"]
 
 FIT_LEARNING_RATE = 0.02  # Adam's learning rate of a new code, in deviations of the learnt codes
 CLOUD_NOISE = 0.01  # deviation of noise of a cloud's points in training, scene units
+VIEWS = 24  # pictures of each shape to learn from, around it, section 4.2
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,6 @@ class Config:
     bend: Annotated[float, between(0, 0.6)] = 0.0  # largest bend of axes in training, of points alone; more vary shapes
     stretch: Annotated[float, between(0, 2)] = 0.0  # largest |log| of factors of axes in training, likewise
     picture_size: Annotated[int, between(16, 512)] = 224  # pixels a side of a picture as input
-    views: Annotated[int, between(1, 256)] = 24  # pictures of each shape to learn from, around it, section 4.2
     code: Width = 512  # numbers of a code, appendix A; more hold more shapes
     encoder_width: Width = 512  # channels of the encoder, appendix A; wider costs time
     hidden_width: Width = 256  # channels of the decoder, appendix A; wider costs time
@@ -193,7 +193,7 @@ class OccupancyNetwork(CodedSurface):
         return known if c.input == "voxels" else known[int(torch.randint(len(known), (), generator=generator))]
 
     def _pictures(self, shape: Shape, member: int) -> Float[Tensor, "view height width"]:
-        cameras = ring(shape.frame.bounds, size=self.config.picture_size, count=self.config.views)
+        cameras = ring(shape.frame.bounds, size=self.config.picture_size, count=VIEWS)
         shots = [picture_of(shape, cameras[i], self.random(1000 + member)) for i in range(len(cameras))]
         return torch.stack([grey(shot) for shot in shots])
 

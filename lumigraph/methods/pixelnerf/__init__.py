@@ -29,7 +29,6 @@ from ...files.ranges import (
     Layers,
     LearningRate,
     NonNegative,
-    Octaves,
     Positive,
     RaySamples,
     Seed,
@@ -45,6 +44,8 @@ from ...volume import composite, weights_of
 from .networks import STRIDE, PictureEncoder, ResidualNetwork, look_up
 
 Views = Annotated[int, between(1, 64)]
+POSITION_FREQUENCIES = 6  # octaves of positions, appendix B.1; the lowest turns by 1.5 radians a unit
+DEPTH_DEVIATION = 0.01  # standard deviation of these, as a share of the ray's length in the scene
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,10 @@ class Config:
     encoder_blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)  # blocks of the encoder's three stages; more cost time
     encoder_pool: bool = True  # halve the resolution after the encoder's stem; off: finer features, slower
     encoder_weights: str = ""  # file of torchvision's resnet34 weights to begin with; without, begin at random
-    position_frequencies: Octaves = 6  # octaves of positions, appendix B.1; the lowest turns by 1.5 radians a unit
     centred: bool = True  # positions relative to an object's centre, as published; off: to each camera
     coarse_samples: RaySamples = 64  # coarse samples of a ray, appendix B.2; more find thinner things, slower
     fine_samples: RaySamples = 16  # fine samples of a ray, by the coarse weights, appendix B.2; more are sharper
     depth_samples: Annotated[int, between(0, 4096)] = 16  # samples around the coarse depth, appendix B.2; 0: none
-    depth_deviation: Positive = 0.01  # standard deviation of these, as a share of the ray's length in the scene
     networks: Annotated[int, between(1, 2)] = 2  # networks: one for each pass, or 1 for both, which is faster
     coarse_loss_weight: NonNegative = 1.0  # weight of the coarse pass's colours; 0: it only guides the fine one
     density: Literal["relu", "softplus"] = "relu"  # activation of density; softplus has a gradient below zero too
@@ -133,7 +132,7 @@ class PixelNeRF(RayMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        self.encode = FrequencyEncoding(3, c.position_frequencies, base=1.5)
+        self.encode = FrequencyEncoding(3, POSITION_FREQUENCIES, base=1.5)
         self.encoder = PictureEncoder(c.encoder_widths, c.encoder_blocks, c.encoder_pool, bool(c.encoder_weights))
         shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, c.blocks, c.view_blocks, not c.bfloat16)
         self.networks = torch.nn.ModuleList(ResidualNetwork(*shape) for _ in range(c.networks))
@@ -332,7 +331,7 @@ class PixelNeRF(RayMethod):
             total = weights.sum(-1, keepdim=True)
             depth = torch.where(total > 0, (weights * shares).sum(-1, keepdim=True) / total.clamp_min(1e-9), 0.5)
             spread = 2 * stratified(count, c.depth_samples, generator, device) - 1
-            places.append((depth + c.depth_deviation * 2**0.5 * torch.erfinv(spread.clamp(-0.999, 0.999))).clamp(0, 1))
+            places.append((depth + DEPTH_DEVIATION * 2**0.5 * torch.erfinv(spread.clamp(-0.999, 0.999))).clamp(0, 1))
         return torch.cat(places, -1)
 
     def _ask(

@@ -24,7 +24,7 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Seed, Share, Steps, Width, between
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod, seeded
@@ -39,6 +39,7 @@ Components = Annotated[int, between(1, 1024)]  # of each factor
 
 TV_DENSITY_WEIGHT = 0.02  # weight of density's total variation, in the open
 TV_APPEARANCE_WEIGHT = 0.02  # weight of appearance's total variation, in the open
+DENSITY_SCALE = 25.0  # factor behind the softplus, the code's; higher learns density faster
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,6 @@ class Config:
     feature_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the features' encoding, the code's
     direction_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the directions' encoding, the code's
     density_shift: Annotated[float, between(-30, 30)] = -7.0  # shift ahead of the softplus; higher begins denser
-    density_scale: Positive = 25.0  # factor behind the softplus, the code's; higher learns density faster
     step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # sample distance over node distance; larger is faster
     rays_per_step: BatchSize = 4096  # rays in a step at most, section 5; more reduce noise, and cost time
     open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 17  # the same where there is no bound
@@ -141,7 +141,7 @@ class TensorField(Field):
         c, places = self.config, self.places(points)
         inside = ((places > 0) & (places < 1)).all(-1)  # points before the plane of a forward capture are on it
         total = self.density_grid(places, summed=True)[:, 0]
-        density = c.density_scale * nn.functional.softplus(total + c.density_shift) * inside
+        density = DENSITY_SCALE * nn.functional.softplus(total + c.density_shift) * inside
         return density * self.space.stretch(points) if self.space.is_open else density, places
 
     def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
