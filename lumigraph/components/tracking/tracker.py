@@ -28,9 +28,7 @@ class TrackingNumbers:
     """A Config's numbers of tracking that methods share."""
 
     track: bool = False  # find the poses of frames in order, as `lumigraph track` does; else they are those given
-    first_estimate: Literal["velocity", "surface"] = (
-        "velocity"  # first pose: constant velocity, or aligned with the map
-    )
+    first_estimate: Literal["velocity", "surface"] = "velocity"  # first pose: by velocity, or aligned with the map
     lost_share: Share = 0.3  # share of explained pixels below which a frame is lost
     close_loops: bool = False  # recognise places by features and correct the path by a pose graph; slower
 

@@ -68,9 +68,7 @@ class Config:
     final_rendering_size: Side = 128  # pixels across of the volume rendering in the end, section 5
     super_resolution: Literal[2, 4] = 4  # factor from the features to the picture, section 4.3
     super_widths: tuple[Width, Width] = (256, 128)  # channels of the super-resolution's two blocks
-    field: Literal["planes", "film"] = (
-        "planes"  # planes, or pi-GAN's sines, which are rendered without super-resolution
-    )
+    field: Literal["planes", "film"] = "planes"  # planes, or pi-GAN's sines without super-resolution
     plane_size: Side = 256  # nodes across a plane, a power of two; more hold finer detail
     plane_channels: Annotated[int, between(1, 256)] = 32  # channels of a plane
     features: Annotated[int, between(4, 256)] = 32  # features of a pixel of the volume rendering, colours included
@@ -83,9 +81,7 @@ class Config:
     density_shift: Annotated[float, between(-20, 20)] = -1.0  # added ahead of the softplus; lower begins emptier
     code: Width = 512  # numbers of a random code
     style: Width = 512  # numbers of a style
-    channel_base: Annotated[int, between(8, 1 << 20)] = (
-        32_768  # channels at a size are this by the size; more cost time
-    )
+    channel_base: Annotated[int, between(8, 1 << 20)] = 32_768  # channels at a size, times the size; more cost time
     channel_most: Width = 512  # channels at most
     pictures_per_step: Annotated[int, between(1, 1024)] = 32  # photographs, and made pictures, of a step
     learning_rate: LearningRate = 0.0025  # Adam's learning rate of the generator

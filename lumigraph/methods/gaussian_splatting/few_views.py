@@ -45,9 +45,7 @@ SURFACE_WEIGHT = 0.2  # weight of swept surfaces at unobserved views
 class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
-    few_views: Literal["auto", "yes", "no"] = (
-        "no"  # regularisation for few photographs; auto: if plane sweeps agree little
-    )
+    few_views: Literal["auto", "yes", "no"] = "no"  # few photographs; auto: where plane sweeps agree little
 
 
 class FewViews(Addition):
