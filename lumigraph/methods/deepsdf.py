@@ -22,7 +22,7 @@ from ..components.training.shape_points import PointNumbers, PointPools, sampled
 from ..datasets.scene import Frame
 from ..datasets.shapes import CUBE, HALF_SIDE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
-from ..files.ranges import Count, Depth, Layers, LearningRate, Seed, Share, Width, between
+from ..files.ranges import Count, Depth, Layers, LearningRate, Seed, Share, Width, between, changed
 from ..geometry import Similarity
 from ..method import seeded
 
@@ -125,15 +125,18 @@ class DeepSDF(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller network that takes waves, without dropout and weight normalisation."""
-        c = Config(PointNumbers(80_000), depth=6, hidden_width=128, skip_layer=3, octaves=4, weight_norm=False)
-        c = replace(c, dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024)
-        return replace(c, learning_rate=2e-3, code_learning_rate=4e-3, code_steps=300)
+        return changed(
+            Config(), pool_points=80_000, depth=6, hidden_width=128, skip_layer=3, octaves=4, weight_norm=False,
+            dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024, learning_rate=2e-3,
+            code_learning_rate=4e-3, code_steps=300,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(PointNumbers(4096), depth=2, hidden_width=16, skip_layer=1, octaves=1, code=4, members=4)
-        c = replace(c, shapes_per_step=1, points_per_shape=256, learning_rate=1e-2, code_steps=20)
-        return replace(c, dropout=0.05)
+        return changed(
+            Config(), pool_points=4096, depth=2, hidden_width=16, skip_layer=1, octaves=1, code=4, members=4,
+            shapes_per_step=1, points_per_shape=256, learning_rate=1e-2, code_steps=20, dropout=0.05,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -26,7 +26,7 @@ from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
-from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
+from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between, changed
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod, seeded
@@ -177,19 +177,23 @@ class DVGO(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1)
-        c = Config(occupancy, coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8)
-        c = replace(c, coarse_share=0.1, doublings=3, growing_share=0.4, open_samples_per_step=1 << 16)
-        c = replace(c, density_learning_rate=0.6, feature_learning_rate=0.2, network_learning_rate=5e-3)
-        return replace(c, coarse_point_weight=0.0, point_weight=0.0, coarse_entropy_weight=0.0, entropy_weight=0.0)
+        return changed(
+            Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1,
+            coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8, coarse_share=0.1, doublings=3,
+            growing_share=0.4, open_samples_per_step=1 << 16, density_learning_rate=0.6, feature_learning_rate=0.2,
+            network_learning_rate=5e-3, coarse_point_weight=0.0, point_weight=0.0, coarse_entropy_weight=0.0,
+            entropy_weight=0.0,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Grids of a few thousand voxels that reach the fine stage and double twice within some twenty quick steps."""
-        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), coarse_voxels=16**3, voxels=24**3)
-        c = replace(c, feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096)
-        c = replace(c, density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2)
-        return replace(c, coarse_share=0.2, doublings=2, growing_share=0.5)
+        return changed(
+            Config(), samples_per_step=4096, occupancy_resolution=16, coarse_voxels=16**3, voxels=24**3,
+            feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096,
+            density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2, doublings=2,
+            growing_share=0.5,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -25,7 +25,7 @@ from ..components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS
 from ..components.tracking.trajectory import Pose, moved
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import CloudSize, Count, Seed, between
+from ..files.ranges import CloudSize, Count, Seed, between, changed
 from ..gaussians import Gaussians
 from ..gaussians.cloud import joined
 from ..gaussians.splatting import Splatted, render, splat, view_of
@@ -111,16 +111,17 @@ class SplatSlam(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Small frames, aligned with the rendered surface first; few descents."""
-        tracking = TrackingNumbers(first_estimate="surface")
-        mapping = SplatMappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
-        rates = replace(Config().rates, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3)
-        return Config(tracking, SplatPoseNumbers(tracking_iterations=5), mapping, rates, frame_side=160)
+        return changed(
+            Config(), first_estimate="surface", tracking_iterations=5, mapping_iterations=8, first_iterations=40,
+            window=10, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3, frame_side=160,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Few descents a frame."""
-        mapping = SplatMappingNumbers(2, 2, window=4, keyframe_every=2)
-        return Config(descent=SplatPoseNumbers(tracking_iterations=4), mapping=mapping)
+        return changed(
+            Config(), tracking_iterations=4, mapping_iterations=2, first_iterations=2, window=4, keyframe_every=2,
+        )  # fmt: skip
 
     # The sequence
 

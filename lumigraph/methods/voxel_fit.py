@@ -22,7 +22,7 @@ from ..components.training.schedules import falling
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
-from ..files.ranges import LearningRate, Seed, between
+from ..files.ranges import LearningRate, Seed, between, changed
 from ..method import Field, FieldMethod
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
@@ -39,7 +39,9 @@ VARIATION_WEIGHT = 1e-5  # of total variation; larger is smoother
 class Config:
     """Numbers of a small grid: no paper's. Voxels and opacity at first are those of Sun 2022."""
 
-    occupancy: OccupancyNumbers = OccupancyNumbers(1 << 18, transmittance_threshold=1e-3, occupancy_threshold=0.05)
+    occupancy: OccupancyNumbers = OccupancyNumbers(
+        samples_per_step=1 << 18, transmittance_threshold=1e-3, occupancy_threshold=0.05
+    )
     first_voxels: Voxels = 64**3  # voxels at first; fewer are faster, and find the shape sooner
     voxels: Voxels = 160**3  # voxels in the end; more show more detail, and cost memory and time
     doublings: Annotated[int, between(0, 20)] = 4  # times that voxels grow in number, at even shares of the budget
@@ -102,14 +104,18 @@ class VoxelFit(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        c = Config(OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1))
-        return replace(c, first_voxels=48**3, voxels=112**3, doublings=3, step_size=0.8)
+        return changed(
+            Config(), samples_per_step=1 << 17, occupancy_threshold=0.1, first_voxels=48**3, voxels=112**3,
+            doublings=3, step_size=0.8,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some thousand voxels that double once."""
-        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), first_voxels=12**3, voxels=20**3, doublings=1)
-        return replace(c, learning_rate=0.5, final_learning_rate=0.2)
+        return changed(
+            Config(), samples_per_step=4096, occupancy_resolution=16, first_voxels=12**3, voxels=20**3, doublings=1,
+            learning_rate=0.5, final_learning_rate=0.2, transmittance_threshold=0.0001,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -37,6 +37,7 @@ from .moved_cloud import seen_from
 BLACK = 0.0, 0.0, 0.0
 SH_DEGREE_INTERVAL = 1000  # steps for each further degree of harmonics, section 7.1; or the share below, if sooner
 SH_DEGREE_INTERVAL_SHARE = 1 / 8  # of the budget
+SSIM_WEIGHT = 0.2  # share of D-SSIM in the loss, eq. 7
 TRANSMITTANCE_THRESHOLD = 1e-4  # transmittance at which a pixel is finished, appendix C
 SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
@@ -50,7 +51,7 @@ class CloudMethod(Method, ABC):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
 
     Assign a DensityControl as `density_control`, a PoseRefinement or None as `poses`, and further `Addition`s. The
-    Config has `sh_degree`, `ssim_weight`, `initialization`, `initial_gaussians`, `half_resolution_until` and `seed`,
+    Config has `sh_degree`, `initialization`, `initial_gaussians`, `half_resolution_until` and `seed`,
     and the parts' `rates`, `refine` and `photographs`.
     cameras:  of the photographs that are learnt from; None before training
     bands:    of the harmonics in use
@@ -130,6 +131,11 @@ class CloudMethod(Method, ABC):
 
     # Optimisation (section 5)
 
+    @property
+    def ssim_weight(self) -> float:
+        """Share of D-SSIM in the loss."""
+        return SSIM_WEIGHT
+
     def before_step(self, step: int, progress: float) -> None:
         """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
         super().before_step(step, progress)
@@ -194,7 +200,7 @@ class CloudMethod(Method, ABC):
         for part in self.additions:
             part.mask(self, now)
         ssim, l1 = kernels.photometric(now.rgb, now.target)
-        now.terms |= {"l1": (1 - c.ssim_weight) * l1, "ssim": c.ssim_weight * (1 - ssim)}
+        now.terms |= {"l1": (1 - self.ssim_weight) * l1, "ssim": self.ssim_weight * (1 - ssim)}
         if batch.extra:
             now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:

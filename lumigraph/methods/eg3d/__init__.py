@@ -195,11 +195,12 @@ class EG3D(Method):
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(picture_size=16, rendering_size=8, final_rendering_size=8, super_resolution=2, super_widths=(4, 4))
-        c = replace(c, plane_size=8, plane_channels=4, features=4, decoder_width=8, film_width=8, film_layers=2)
-        c = replace(c, coarse_samples=8, fine_samples=4, density_scale=10.0, code=8, style=8)
-        c = replace(c, channel_base=64, channel_most=8, pictures_per_step=4, blur_pictures=40, swap_pictures=40)
-        return replace(c, average_pictures=16, code_steps=4, tune_steps=4)
+        return Config(
+            picture_size=16, rendering_size=8, final_rendering_size=8, super_resolution=2, super_widths=(4, 4),
+            plane_size=8, plane_channels=4, features=4, decoder_width=8, film_width=8, film_layers=2,
+            coarse_samples=8, fine_samples=4, density_scale=10.0, code=8, style=8, channel_base=64, channel_most=8,
+            pictures_per_step=4, blur_pictures=40, swap_pictures=40, average_pictures=16, code_steps=4, tune_steps=4,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -13,6 +13,7 @@ from ...components.clouds.cloud import HasteNumbers
 from ...components.clouds.cloud_method import BLACK, CloudMethod
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
+from ...components.clouds.cloud_method import SSIM_WEIGHT as SSIM_WEIGHT
 from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
@@ -21,7 +22,7 @@ from ...components.instances import edit_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
-from ...files.ranges import CloudSize, Seed, Share, between
+from ...files.ranges import CloudSize, Seed, Share, between, changed
 from ...gaussians.splatting import render
 from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
@@ -42,7 +43,6 @@ class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7; higher gives structure more weight
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
@@ -98,23 +98,17 @@ class GaussianSplatting(CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
-        refine = RefineNumbers(500_000, gaussians_per_step=15.0, cap_ramp=True)
-        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-4)
-        return Config(
-            initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7, refine=refine,
-            adaptive=adaptive, mcmc=McmcNumbers(joining_per_step=120.0), tidying=ALL_RULES,
-            rates=HasteNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"), groups=CPU_GROUPS,
+        return changed(
+            Config(tidying=ALL_RULES, groups=CPU_GROUPS), initialization="dense", initial_gaussians=20_000,
+            half_resolution_until=0.7, max_gaussians=500_000, gaussians_per_step=15.0, cap_ramp=True,
+            densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0, few_views="auto",
         )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
-        return Config(
-            sh_degree=2,
-            initial_gaussians=200,
-            refine=RefineNumbers(300, cap_ramp=True, refine_until=0.8),
-            tidying=ALL_RULES,
-            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
-            poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
-            photographs=AppearanceNumbers(appearance="no"),
-        )
+        return changed(
+            Config(tidying=ALL_RULES), sh_degree=2, initial_gaussians=200, max_gaussians=300, cap_ramp=True,
+            refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, refine_cameras=True,
+            appearance="no",
+        )  # fmt: skip

@@ -139,7 +139,7 @@ class IMap(FieldMethod):
     def smallest(cls) -> Any:
         """A tiny hash table and few descents a frame."""
         return changed(
-            Config(replace(TINY_TABLE, sh_bands=1)), field="hash", hidden_width=16, truncation=0.2, sharpness=4.0,
+            Config(table=TINY_TABLE), sh_bands=1, field="hash", hidden_width=16, truncation=0.2, sharpness=4.0,
             learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1, first_iterations=2, window=4,
             pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
             smooth_weight=1e-4,

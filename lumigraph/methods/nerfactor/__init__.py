@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -171,10 +171,11 @@ class NeRFactor(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables, traced visibility, microfacets, a smaller grid and smaller steps."""
-        c = Config(**CPU_HASH, hidden_width=32, geometry_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
-        c = replace(c, properties="hash", visibility="traced", reflectance="microfacet", geometry_share=0.6)
-        c = replace(c, shape_share=0.0, grid_resolution=128, surface_rays=256)
-        return replace(c, learning_rate=1e-2, final_learning_rate=1e-3, light_rate=3e-2)
+        return Config(
+            **CPU_HASH, hidden_width=32, geometry_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3,
+            properties="hash", visibility="traced", reflectance="microfacet", geometry_share=0.6, shape_share=0.0,
+            grid_resolution=128, surface_rays=256, learning_rate=1e-2, final_learning_rate=1e-3, light_rate=3e-2,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -94,17 +94,20 @@ class NeuralVolumes(RayMethod):
     def cpu_preset(cls) -> Any:
         """Smaller pictures and networks, one moment in a step, a higher learning rate, and a finer volume that all
         moments share."""
-        c = Config(encoder_size=64, encoder_width=16, code=64, volume_resolution=32, volume_width=256, affines=8)
-        c = replace(c, shared_resolution=64)
-        c = replace(c, warp_resolution=16, warp_width=64, background_size=32, samples=64, moments_per_step=1)
-        return replace(c, rays_per_step=2048, learning_rate=2e-3, final_learning_rate=2e-4, decay_start=0.3)
+        return Config(
+            encoder_size=64, encoder_width=16, code=64, volume_resolution=32, volume_width=256, affines=8,
+            shared_resolution=64, warp_resolution=16, warp_width=64, background_size=32, samples=64,
+            moments_per_step=1, rays_per_step=2048, learning_rate=2e-3, final_learning_rate=2e-4, decay_start=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny pictures and volumes of 16 voxels a side, within some twenty quick steps."""
-        c = Config(encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2)
-        c = replace(c, warp_resolution=8, warp_width=8, background_size=8, samples=24, moments_per_step=1)
-        return replace(c, shared_resolution=16, rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3)
+        return Config(
+            encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2,
+            warp_resolution=8, warp_width=8, background_size=8, samples=24, moments_per_step=1, shared_resolution=16,
+            rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3,
+        )  # fmt: skip
 
     # Codes and volumes
 

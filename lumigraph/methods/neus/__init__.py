@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -21,7 +21,7 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between
+from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between, changed
 from ...method import FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
@@ -45,7 +45,7 @@ class Config:
 
     network: DistanceNumbers = DistanceNumbers()
     table: HashNumbers = HashNumbers()
-    rays: RayNumbers = RayNumbers(64, 64, rays_per_step=512)
+    rays: RayNumbers = RayNumbers(coarse_samples=64, fine_samples=64, rays_per_step=512)
     mask: MaskNumbers = MaskNumbers()
     measured: DepthNumbers = DepthNumbers()
     field: Literal["network", "hash"] = "network"  # distance field: the paper's network, or a faster hash table
@@ -111,18 +111,22 @@ class NeuS(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table whose levels join one by one, a grid of what is empty, sections that matter alone."""
-        c = Config(table=CPU_TABLE, rays=RayNumbers(48, 16, rays_per_step=768), mask=MaskNumbers(64), field="hash")
-        c = replace(c, hidden_width=32, upsampling_rounds=2, outside_samples=24, weight_threshold=1e-3)
-        c = replace(c, samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02)
+        return changed(
+            Config(table=CPU_TABLE), coarse_samples=48, fine_samples=16, rays_per_step=768, occupancy_resolution=64,
+            field="hash", hidden_width=32, upsampling_rounds=2, outside_samples=24, weight_threshold=1e-3,
+            samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5, learning_rate=2e-2,
+            final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table whose levels join, with a grid of what is empty, within some twenty quick steps."""
-        c = Config(table=TINY_TABLE, rays=RayNumbers(16, 8, rays_per_step=192), mask=MaskNumbers(16), field="hash")
-        c = replace(c, hidden_width=16, upsampling_rounds=2, samples_per_step=2048, outside_samples=8)
-        c = replace(c, weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.1)
+        return changed(
+            Config(table=TINY_TABLE), coarse_samples=16, fine_samples=8, rays_per_step=192, occupancy_resolution=16,
+            field="hash", hidden_width=16, upsampling_rounds=2, samples_per_step=2048, outside_samples=8,
+            weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1, learning_rate=2e-2,
+            final_learning_rate=1e-3, sharpness_rate=0.1,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from ...components.training.shape_points import PointNumbers, PointPools
 from ...datasets.scene import Frame
 from ...datasets.shapes import PointBatch, Shapes
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, Seed, Width, between
+from ...files.ranges import LearningRate, NonNegative, Seed, Width, between, changed
 from ...kernels.octree_cells import MAX_LEVELS, Crossed
 from ...method import seeded
 from ...method.controls import Control
@@ -72,14 +72,16 @@ class NGLOD(SurfaceMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller codes and decoders, and more points in a step."""
-        points = PointNumbers(300_000, near_share=0.8, near_spread=0.04, fine_spread=0.006)
-        c = Config(points, features=16, hidden_width=64, points_per_step=1 << 13, learning_rate=1e-2)
-        return replace(c, final_learning_rate=5e-4, hit_distance=1e-3)
+        return changed(
+            Config(), pool_points=300_000, near_spread=0.04, fine_spread=0.006, features=16, hidden_width=64,
+            points_per_step=1 << 13, learning_rate=1e-2, final_learning_rate=5e-4, hit_distance=1e-3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        points = PointNumbers(4096, near_share=0.8, near_spread=0.02, fine_spread=0.0)
-        return Config(points, levels=2, features=4, hidden_width=16, points_per_step=512, learning_rate=1e-2)
+        return changed(
+            Config(), pool_points=4096, near_spread=0.02, levels=2, features=4, hidden_width=16, learning_rate=1e-2,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -24,7 +24,7 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Seed, Share, Steps, Width, between
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Seed, Share, Steps, Width, between, changed
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod, seeded
@@ -201,20 +201,22 @@ class TensoRF(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05)
-        c = Config(occupancy, initial_resolution=96, final_resolution=200, open_final_resolution=320)
-        c = replace(c, appearance_components=16, hidden_width=64, feature_frequencies=0, density_shift=-8.0)
-        c = replace(c, open_samples_per_step=1 << 15, step_ratio=1.0, weight_threshold=1e-3)
-        return replace(c, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8)
+        return changed(
+            Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05,
+            initial_resolution=96, final_resolution=200, open_final_resolution=320, appearance_components=16,
+            hidden_width=64, feature_frequencies=0, density_shift=-8.0, open_samples_per_step=1 << 15, step_ratio=1.0,
+            weight_threshold=1e-3, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Few components and nodes, all upsamplings, a grid of three sizes, within some twenty quick steps."""
-        occupancy = OccupancyNumbers(4096, occupancy_resolution=16, occupancy_threshold=0.005)
-        c = Config(occupancy, initial_resolution=8, final_resolution=16, open_final_resolution=16)
-        c = replace(c, density_components=4, appearance_components=6, appearance_features=8, hidden_width=16)
-        c = replace(c, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0)
-        return replace(c, rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)
+        return changed(
+            Config(), samples_per_step=4096, occupancy_resolution=16, initial_resolution=8, final_resolution=16,
+            open_final_resolution=16, density_components=4, appearance_components=6, appearance_features=8,
+            hidden_width=16, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0,
+            rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
