@@ -49,7 +49,7 @@ class Config:
     code: Width = 512  # numbers of a code, appendix A; more hold more shapes
     encoder_width: Width = 512  # channels of the encoder, appendix A; wider costs time
     hidden_width: Width = 256  # channels of the decoder, appendix A; wider costs time
-    blocks: Annotated[int, between(1, 32)] = 5  # residual blocks of the decoder, appendix A; more cost time
+    blocks: Layers = 5  # residual blocks of the decoder, appendix A; more cost time
     octaves: Annotated[int, between(0, 16)] = 0  # octaves of waves that encode points; more give finer detail, noise
     threshold: Annotated[float, between(0.001, 0.999)] = 0.2  # probability at the surface, section 3.3; higher: thinner
     members: Count = 4096  # shapes of a collection at most; the code of each is kept
