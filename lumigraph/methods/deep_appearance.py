@@ -53,10 +53,10 @@ class Config:
     mesh_width: Width = 256  # of the layer before the mesh
     divergence_weight: NonNegative = 0.01  # lambda_Z
     mesh_rows: Annotated[int, between(5, 512)] = 73  # of the mesh's grid; 7306 vertices are the paper's
-    mesh_columns: Annotated[int, between(5, 512)] = 101
-    textures_per_step: Count = 16
-    learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
+    mesh_columns: Annotated[int, between(5, 512)] = 101  # of the mesh's grid
+    textures_per_step: Count = 16  # textures of a step; more are steadier, and cost time
+    learning_rate: LearningRate = 1e-3  # Adam's learning rate
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class Config:
     blended_views: Count = 4  # k: photographs blended at each pixel; more: smoother, more ghosts
     candidate_views: Count = 16  # photographs near a camera among which each pixel chooses
     surface_views: Count = 6  # photographs whose depth maps make the surface before a camera
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class Lumigraph(ImageBasedMethod):

@@ -39,7 +39,7 @@ class Config:
     geometry: Literal["stereo", "measured"] = "stereo"  # source of depth: multi-view stereo, or a layer `depth`
     depth_size: Pixels = 400  # longer side of the depth maps; larger: finer edges, slower
     warped_views: Annotated[int, between(1, 16)] = 2  # photographs warped into a picture; more: fewer holes, slower
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class ViewInterpolation(ImageBasedMethod):

@@ -80,13 +80,13 @@ class Config:
     adversary_width: Width = 128  # channels of the adversaries' first layer
     opacity_weight: NonNegative = 0.0  # of the light that passes through blocks; higher: blocks are opaque earlier
     kl_weight: NonNegative = 0.05  # of the style codes' divergence from the normal distribution
-    learning_rate: LearningRate = 1e-4
+    learning_rate: LearningRate = 1e-4  # Adam's learning rate of the field's networks
     corner_learning_rate: LearningRate = 1e-3  # of the features at corners
-    adversary_learning_rate: LearningRate = 4e-4
+    adversary_learning_rate: LearningRate = 4e-4  # of the adversary
     momentum: Annotated[float, between(0, 0.999)] = 0.0  # beta_1 of Adam
-    painter_learning_rate: LearningRate = 1e-4
-    painter_adversary_learning_rate: LearningRate = 4e-4
-    seed: Seed = 0
+    painter_learning_rate: LearningRate = 1e-4  # of the painter of pseudo truth
+    painter_adversary_learning_rate: LearningRate = 4e-4  # of the painter's adversary
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)
