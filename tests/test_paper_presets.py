@@ -23,7 +23,7 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.commands.main_options import groups_of
+from lumigraph.files.ranges import groups_of
 
 pytestmark = budget("house", 3)
 PAGES = Path(__file__).parent.parent / "docs" / "methods"

@@ -30,7 +30,7 @@ from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
 from ..files.options import option_name
-from ..files.ranges import coherent, domain, is_surprising, members, outside, shown
+from ..files.ranges import coherent, domain, groups_of, is_surprising, members, outside, shown
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
 from .app import AppCommand
@@ -52,7 +52,7 @@ from .gallery import Gallery
 from .infer import Infer
 from .info import Info
 from .jump import Jump
-from .main_options import HELP_ALL, groups_of, hidden_options
+from .main_options import HELP_ALL, hidden_options
 from .methods import Methods
 from .photo3d import Photo3DCommand
 from .render import Render

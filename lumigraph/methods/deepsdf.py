@@ -125,18 +125,14 @@ class DeepSDF(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller network that takes waves, without dropout and weight normalisation."""
-        return changed(
-            Config(), pool_points=80_000, depth=6, hidden_width=128, skip_layer=3, octaves=4, weight_norm=False,
-            dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024, learning_rate=2e-3,
-            code_learning_rate=4e-3, code_steps=300,
-        )  # fmt: skip
+        return changed(Config(), pool_points=80_000, depth=6, hidden_width=128, skip_layer=3, octaves=4,
+            weight_norm=False, dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024,
+            learning_rate=2e-3, code_learning_rate=4e-3, code_steps=300)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        return changed(
-            Config(), pool_points=4096, depth=2, hidden_width=16, skip_layer=1, octaves=1, code=4, members=4,
-            shapes_per_step=1, points_per_shape=256, learning_rate=1e-2, code_steps=20, dropout=0.05,
-        )  # fmt: skip
+        return changed(Config(), pool_points=4096, depth=2, hidden_width=16, skip_layer=1, octaves=1, code=4, members=4,
+            shapes_per_step=1, points_per_shape=256, learning_rate=1e-2, code_steps=20, dropout=0.05)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -68,11 +68,9 @@ class DreamFields(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Coarse tables and small views, larger in the picture, in which a small model recognises shapes."""
-        return changed(
-            Config(guidance=CPU_GUIDANCE), levels=4, features_per_level=4, log2_hashmap_size=15, base_resolution=8,
-            max_resolution=48, samples_per_step=1 << 17, occupancy_resolution=32, steps_per_diagonal=72,
-            hidden_width=32,
-        )  # fmt: skip
+        return changed(Config(guidance=CPU_GUIDANCE), levels=4, features_per_level=4, log2_hashmap_size=15,
+            base_resolution=8, max_resolution=48, samples_per_step=1 << 17, occupancy_resolution=32,
+            steps_per_diagonal=72, hidden_width=32)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -65,10 +65,8 @@ class DreamSplats(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Fewer Gaussians that move faster, and the small views of `dream-fields`."""
-        return changed(
-            Config(guidance=CPU_GUIDANCE), means_lr=5e-3, final_means_lr=5e-4, sh_lr=2e-2, scales_lr=1e-2,
-            initial_gaussians=1000,
-        )  # fmt: skip
+        return changed(Config(guidance=CPU_GUIDANCE), means_lr=5e-3, final_means_lr=5e-4, sh_lr=2e-2, scales_lr=1e-2,
+            initial_gaussians=1000)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -177,23 +177,19 @@ class DVGO(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        return changed(
-            Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1,
+        return changed(Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1,
             coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8, coarse_share=0.1, doublings=3,
             growing_share=0.4, open_samples_per_step=1 << 16, density_learning_rate=0.6, feature_learning_rate=0.2,
             network_learning_rate=5e-3, coarse_point_weight=0.0, point_weight=0.0, coarse_entropy_weight=0.0,
-            entropy_weight=0.0,
-        )  # fmt: skip
+            entropy_weight=0.0)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Grids of a few thousand voxels that reach the fine stage and double twice within some twenty quick steps."""
-        return changed(
-            Config(), samples_per_step=4096, occupancy_resolution=16, coarse_voxels=16**3, voxels=24**3,
+        return changed(Config(), samples_per_step=4096, occupancy_resolution=16, coarse_voxels=16**3, voxels=24**3,
             feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096,
             density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2, doublings=2,
-            growing_share=0.5,
-        )  # fmt: skip
+            growing_share=0.5)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

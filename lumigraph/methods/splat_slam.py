@@ -113,8 +113,7 @@ class SplatSlam(Method):
         """Small frames, aligned with the rendered surface first; few descents."""
         return changed(
             Config(), first_estimate="surface", tracking_iterations=5, mapping_iterations=8, first_iterations=40,
-            window=10, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3, frame_side=160,
-        )  # fmt: skip
+            window=10, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3, frame_side=160)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -104,18 +104,14 @@ class VoxelFit(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        return changed(
-            Config(), samples_per_step=1 << 17, occupancy_threshold=0.1, first_voxels=48**3, voxels=112**3,
-            doublings=3, step_size=0.8,
-        )  # fmt: skip
+        return changed(Config(), samples_per_step=1 << 17, occupancy_threshold=0.1, first_voxels=48**3, voxels=112**3,
+            doublings=3, step_size=0.8)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some thousand voxels that double once."""
-        return changed(
-            Config(), samples_per_step=4096, occupancy_resolution=16, first_voxels=12**3, voxels=20**3, doublings=1,
-            learning_rate=0.5, final_learning_rate=0.2, transmittance_threshold=0.0001,
-        )  # fmt: skip
+        return changed(Config(), samples_per_step=4096, occupancy_resolution=16, first_voxels=12**3, voxels=20**3,
+            doublings=1, learning_rate=0.5, final_learning_rate=0.2, transmittance_threshold=0.0001)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -142,12 +138,11 @@ class VoxelFit(FieldMethod):
         error = (seen.rgb - batch.before(background)).square().mean()
         self.figures["mse"] = float(error.detach())
         terms |= {"colour": error}
-        if batch.alpha is not None and MASK_WEIGHT:
+        if batch.alpha is not None:
             terms["mask"] = MASK_WEIGHT * (seen.opacity - batch.alpha).square().mean()
-        if ENTROPY_WEIGHT:
-            a = seen.opacity.clamp(1e-6, 1 - 1e-6)
-            terms["entropy"] = ENTROPY_WEIGHT * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
-        if VARIATION_WEIGHT and len(look.samples):
+        a = seen.opacity.clamp(1e-6, 1 - 1e-6)
+        terms["entropy"] = ENTROPY_WEIGHT * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
+        if len(look.samples):
             points, _ = look.samples.along(batch.rays)
             terms["variation"] = VARIATION_WEIGHT * self.network.grid.variation(points, MAX_SMOOTHED, generator)
         return terms

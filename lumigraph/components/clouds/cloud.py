@@ -30,12 +30,8 @@ FULL_SCHEDULE = 2400  # steps from which on the rates of scales and harmonics ar
 REST_BANDS_SCALE = 1 / 20  # of the harmonics' learning rate, beyond the first band
 
 
-# Learning rates of 3D Gaussian Splatting, graphdeco-inria/gaussian-splatting, arguments/__init__.py.
-MEANS_LR, FINAL_MEANS_LR = 1.6e-4, 1.6e-6  # of the means at first and at the end, times the extent of the cameras
-SH_LR = 2.5e-3  # of colours; a twentieth of it beyond the first band
-OPACITIES_LR = 0.05  # of opacity logits
-SCALES_LR = 5e-3  # of log scales
-QUATERNIONS_LR = 1e-3  # of rotations
+# Learning rates of 3D Gaussian Splatting, graphdeco-inria/gaussian-splatting, arguments/__init__.py; see `RateNumbers`.
+MEANS_LR, FINAL_MEANS_LR, SH_LR, OPACITIES_LR, SCALES_LR, QUATERNIONS_LR = 1.6e-4, 1.6e-6, 2.5e-3, 0.05, 5e-3, 1e-3
 MOST_HASTE = 1.0  # factor on rates in short runs, where it is no option
 
 

@@ -30,7 +30,7 @@ from .appearance import SplatAppearance
 from .cloud import Cloud, picture_share, thinned
 from .dense_points import Points, compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl
-from .initialization import Initialization, cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
+from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
 from .interval_schedule import intervals
 from .moved_cloud import seen_from
 
@@ -51,7 +51,7 @@ class CloudMethod(Method, ABC):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
 
     Assign a DensityControl as `density_control`, a PoseRefinement or None as `poses`, and further `Addition`s. The
-    Config has `sh_degree`, `initialization`, `initial_gaussians`, `half_resolution_until` and `seed`,
+    Config has `sh_degree`, `ssim_weight`, `initialization`, `initial_gaussians`, `half_resolution_until` and `seed`,
     and the parts' `rates`, `refine` and `photographs`.
     cameras:  of the photographs that are learnt from; None before training
     bands:    of the harmonics in use
@@ -88,14 +88,9 @@ class CloudMethod(Method, ABC):
 
     # Initialisation
 
-    @property
-    def initialization(self) -> Initialization:
-        """Kind of the first Gaussians."""
-        return self.config.initialization
-
     def compile_begin(self) -> None:
         super().compile_begin()
-        if may_sweep(self.initialization, self.frame):
+        if may_sweep(self.config.initialization, self.frame):
             compile_sweep()
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
@@ -109,7 +104,7 @@ class CloudMethod(Method, ABC):
         """The cloud to begin with, of the photographs. sweep: gives points that plane sweeps find"""
         c, cap = self.config, self.density_control.max_count(self.cloud)
         counts = min(c.initial_gaussians, cap), cap
-        return initial_cloud(data, self.initialization, *counts, c.sh_degree, self.random(1), sweep)
+        return initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
@@ -130,11 +125,6 @@ class CloudMethod(Method, ABC):
             part.begin_cloud(self)
 
     # Optimisation (section 5)
-
-    @property
-    def ssim_weight(self) -> float:
-        """Share of D-SSIM in the loss."""
-        return SSIM_WEIGHT
 
     def before_step(self, step: int, progress: float) -> None:
         """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
@@ -200,7 +190,7 @@ class CloudMethod(Method, ABC):
         for part in self.additions:
             part.mask(self, now)
         ssim, l1 = kernels.photometric(now.rgb, now.target)
-        now.terms |= {"l1": (1 - self.ssim_weight) * l1, "ssim": self.ssim_weight * (1 - ssim)}
+        now.terms |= {"l1": (1 - c.ssim_weight) * l1, "ssim": c.ssim_weight * (1 - ssim)}
         if batch.extra:
             now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:

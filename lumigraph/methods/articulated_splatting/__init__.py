@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Int
@@ -15,10 +15,9 @@ from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
 from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import SSIM_WEIGHT as SSIM_WEIGHT
 from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization, round_gaussians
@@ -47,6 +46,8 @@ class Config:
     """Numbers of MANUS from memory, and Kerbl's (2023) of the cloud; `cpu_preset` has those of a plain CPU."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
+    ssim_weight: ClassVar[float] = SSIM_WEIGHT
+    initialization: ClassVar[Initialization] = INITIALIZATION
     initial_gaussians: CloudSize = 10_000  # random Gaussians about the bones at first
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
@@ -63,7 +64,6 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     """A canonical cloud on bones, posed to the moment of a photograph before it is rasterized."""
 
     Config = Config
-    initialization = INITIALIZATION
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -78,19 +78,15 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud without view dependence, a coarser volume, and higher rates for few steps."""
-        return changed(
-            Config(), sh_degree=0, initial_gaussians=6000, max_gaussians=30_000, cap_ramp=True,
-            half_resolution_until=0.3, most_haste=4.0, weight_cells=24, pose_smoothing=True,
-        )  # fmt: skip
+        return changed(Config(), sh_degree=0, initial_gaussians=6000, max_gaussians=30_000, cap_ramp=True,
+            half_resolution_until=0.3, most_haste=4.0, weight_cells=24, pose_smoothing=True)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians on bones, refined within some twenty quick steps."""
-        return changed(
-            Config(), max_gaussians=300, cap_ramp=True, refine_until=0.8, sh_degree=1, initial_gaussians=200,
+        return changed(Config(), max_gaussians=300, cap_ramp=True, refine_until=0.8, sh_degree=1, initial_gaussians=200,
             densify_grad_threshold=1e-6, opacity_reset_interval=5, weight_cells=8, bone_radius=0.5, pose_lr=1e-3,
-            pose_from=0.0,
-        )  # fmt: skip
+            pose_from=0.0)  # fmt: skip
 
     def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
         """Round Gaussians about the bones at rest, in random colours."""

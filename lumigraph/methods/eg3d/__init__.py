@@ -185,13 +185,11 @@ class EG3D(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """The same design for pictures of 64 pixels."""
-        return Config(
-            picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2, super_widths=(32, 16),
-            plane_size=64, plane_channels=16, features=8, decoder_width=32, film_width=64, film_layers=4,
+        return Config(picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2, super_widths=(32,
+            16), plane_size=64, plane_channels=16, features=8, decoder_width=32, film_width=64, film_layers=4,
             coarse_samples=8, fine_samples=6, density_scale=10.0, density_shift=-3.0, code=64, style=128,
             channel_base=1024, channel_most=128, pictures_per_step=4, r1_weight=2.0, swap_pictures=10_000,
-            blur_deviation=1.0, blur_pictures=2000, average_pictures=1000, code_steps=150, tune_steps=150,
-        )  # fmt: skip
+            blur_deviation=1.0, blur_pictures=2000, average_pictures=1000, code_steps=150, tune_steps=150)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
@@ -258,7 +256,7 @@ class EG3D(Method):
 
         with frozen(self.discriminator):
             terms = {"generator": generator_loss(self.discriminator(fake, views))}
-        if step % DENSITY_INTERVAL == 0 and DENSITY_WEIGHT > 0:
+        if step % DENSITY_INTERVAL == 0:
             terms["density"] = DENSITY_INTERVAL * DENSITY_WEIGHT * self._roughness(made, random)
         descend(terms, [generators])
         self.figures |= {name: float(value.detach()) for name, value in terms.items()}

@@ -143,27 +143,21 @@ class GANcraft(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Networks of an eighth of the width, fewer samples, parts of 64 pixels; higher learning rates."""
-        return Config(
-            features=16, encoded=8, bands=3, hidden_width=32, output_features=12, style=32, style_layers=2, code=8,
-            samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5,
-            encoder_size=32, encoder_width=12,
-            painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
-            adversary_width=12, kl_weight=3e-4, opacity_weight=0.5, momentum=0.5,
-            learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
-            painter_learning_rate=5e-4, painter_adversary_learning_rate=5e-4,
-        )  # fmt: skip
+        return Config(features=16, encoded=8, bands=3, hidden_width=32, output_features=12, style=32, style_layers=2,
+            code=8, samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5, encoder_size=32,
+            encoder_width=12, painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
+            adversary_width=12, kl_weight=3e-4, opacity_weight=0.5, momentum=0.5, learning_rate=3e-3,
+            corner_learning_rate=1e-2, adversary_learning_rate=1e-3, painter_learning_rate=5e-4,
+            painter_adversary_learning_rate=5e-4)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """All networks of eight channels, parts of 16 pixels."""
-        return Config(
-            features=4, encoded=2, bands=1, hidden_width=8, output_features=4, style=8, style_layers=1, code=2,
-            samples_per_block=2, sample_depth=1.0, density_scale=1.0, crop=16, label_window=3,
-            encoder_size=8, encoder_width=4,
-            painter_code=2, painter_width=4, painter_levels=1, landscapes=4, landscapes_per_step=1,
-            painter_share=1.0, field_interval=1, opacity_weight=0.5,
-            adversary_width=4, learning_rate=1e-2, corner_learning_rate=2e-2, painter_learning_rate=1e-2,
-        )  # fmt: skip
+        return Config(features=4, encoded=2, bands=1, hidden_width=8, output_features=4, style=8, style_layers=1,
+            code=2, samples_per_block=2, sample_depth=1.0, density_scale=1.0, crop=16, label_window=3, encoder_size=8,
+            encoder_width=4, painter_code=2, painter_width=4, painter_levels=1, landscapes=4, landscapes_per_step=1,
+            painter_share=1.0, field_interval=1, opacity_weight=0.5, adversary_width=4, learning_rate=1e-2,
+            corner_learning_rate=2e-2, painter_learning_rate=1e-2)  # fmt: skip
 
     # The world
 
@@ -408,8 +402,7 @@ class BlockGrid:
         begin = begin.clamp_min(0)
         found = kernels.march(
             rays.origins / half - 1, rays.directions, begin / half, leave / half,
-            self.occupied, self.density, step / half, stop=math.exp(-depth / half),
-        )  # fmt: skip
+            self.occupied, self.density, step / half, stop=math.exp(-depth / half))  # fmt: skip
         return Samples(found.t_start * half, found.t_end * half, found.ray_starts)
 
     def label_at(self, places: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
 from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import SSIM_WEIGHT as SSIM_WEIGHT
 from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
@@ -43,6 +42,7 @@ class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
+    ssim_weight: ClassVar[float] = SSIM_WEIGHT
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
@@ -98,17 +98,13 @@ class GaussianSplatting(CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
-        return changed(
-            Config(tidying=ALL_RULES, groups=CPU_GROUPS), initialization="dense", initial_gaussians=20_000,
+        return changed(Config(tidying=ALL_RULES, groups=CPU_GROUPS), initialization="dense", initial_gaussians=20_000,
             half_resolution_until=0.7, max_gaussians=500_000, gaussians_per_step=15.0, cap_ramp=True,
-            densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0, few_views="auto",
-        )  # fmt: skip
+            densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0, few_views="auto")  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
-        return changed(
-            Config(tidying=ALL_RULES), sh_degree=2, initial_gaussians=200, max_gaussians=300, cap_ramp=True,
+        return changed(Config(tidying=ALL_RULES), sh_degree=2, initial_gaussians=200, max_gaussians=300, cap_ramp=True,
             refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, refine_cameras=True,
-            appearance="no",
-        )  # fmt: skip
+            appearance="no")  # fmt: skip

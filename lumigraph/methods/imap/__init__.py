@@ -127,23 +127,19 @@ class IMap(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
-        return changed(
-            Config(), field="hash", hidden_width=32, learning_rate=1e-2,
-            levels=8, features_per_level=2, log2_hashmap_size=16, max_resolution=512, colour_layers=1, sh_bands=1,
-            coarse_samples=16, fine_samples=10, first_estimate="surface", tracking_iterations=0, mapping_iterations=5,
-            window=8, pixels_per_frame=128, active_sampling=False, keyframe_pose_rate=2e-4,
-            depth_weight=0.1, distance_weight=10.0, free_weight=10.0, smooth_weight=1e-3,
-        )  # fmt: skip
+        return changed(Config(), field="hash", hidden_width=32, learning_rate=1e-2, levels=8, features_per_level=2,
+            log2_hashmap_size=16, max_resolution=512, colour_layers=1, sh_bands=1, coarse_samples=16, fine_samples=10,
+            first_estimate="surface", tracking_iterations=0, mapping_iterations=5, window=8, pixels_per_frame=128,
+            active_sampling=False, keyframe_pose_rate=2e-4, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
+            smooth_weight=1e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny hash table and few descents a frame."""
-        return changed(
-            Config(table=TINY_TABLE), sh_bands=1, field="hash", hidden_width=16, truncation=0.2, sharpness=4.0,
-            learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1, first_iterations=2, window=4,
-            pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
-            smooth_weight=1e-4,
-        )  # fmt: skip
+        return changed(Config(table=TINY_TABLE), sh_bands=1, field="hash", hidden_width=16, truncation=0.2,
+            sharpness=4.0, learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1,
+            first_iterations=2, window=4, pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1,
+            distance_weight=10.0, free_weight=10.0, smooth_weight=1e-4)  # fmt: skip
 
     # The sequence
 

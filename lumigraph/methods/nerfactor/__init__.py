@@ -180,11 +180,9 @@ class NeRFactor(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and a light of few pixels, in all stages within some twenty steps."""
-        return Config(
-            **TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced",
+        return Config(**TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced",
             reflectance="microfacet", geometry_share=0.6, shape_share=0.0, grid_resolution=16, huber_delta=1.0,
-            light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2,
-        )  # fmt: skip
+            light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -103,11 +103,9 @@ class NeuralVolumes(RayMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny pictures and volumes of 16 voxels a side, within some twenty quick steps."""
-        return Config(
-            encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2,
+        return Config(encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2,
             warp_resolution=8, warp_width=8, background_size=8, samples=24, moments_per_step=1, shared_resolution=16,
-            rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3,
-        )  # fmt: skip
+            rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3)  # fmt: skip
 
     # Codes and volumes
 

@@ -111,22 +111,18 @@ class NeuS(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table whose levels join one by one, a grid of what is empty, sections that matter alone."""
-        return changed(
-            Config(table=CPU_TABLE), coarse_samples=48, fine_samples=16, rays_per_step=768, occupancy_resolution=64,
-            field="hash", hidden_width=32, upsampling_rounds=2, outside_samples=24, weight_threshold=1e-3,
-            samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5, learning_rate=2e-2,
-            final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02,
-        )  # fmt: skip
+        return changed(Config(table=CPU_TABLE), coarse_samples=48, fine_samples=16, rays_per_step=768,
+            occupancy_resolution=64, field="hash", hidden_width=32, upsampling_rounds=2, outside_samples=24,
+            weight_threshold=1e-3, samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5,
+            learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table whose levels join, with a grid of what is empty, within some twenty quick steps."""
-        return changed(
-            Config(table=TINY_TABLE), coarse_samples=16, fine_samples=8, rays_per_step=192, occupancy_resolution=16,
-            field="hash", hidden_width=16, upsampling_rounds=2, samples_per_step=2048, outside_samples=8,
-            weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1, learning_rate=2e-2,
-            final_learning_rate=1e-3, sharpness_rate=0.1,
-        )  # fmt: skip
+        return changed(Config(table=TINY_TABLE), coarse_samples=16, fine_samples=8, rays_per_step=192,
+            occupancy_resolution=16, field="hash", hidden_width=16, upsampling_rounds=2, samples_per_step=2048,
+            outside_samples=8, weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1,
+            learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.1)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -175,7 +171,7 @@ class NeuS(FieldMethod):
         if c.curvature_weight and laplacian:
             bent = laplacian[0][inside].abs()
             terms["curvature"] = c.curvature_weight * bent.sum() / max(len(bent), 1)
-        if batch.alpha is not None and MASK_WEIGHT:
+        if batch.alpha is not None:
             terms["mask"] = MASK_WEIGHT * mask_error(rendering.opacity, batch.alpha)
         return terms
 

@@ -72,10 +72,8 @@ class NGLOD(SurfaceMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller codes and decoders, and more points in a step."""
-        return changed(
-            Config(), pool_points=300_000, near_spread=0.04, fine_spread=0.006, features=16, hidden_width=64,
-            points_per_step=1 << 13, learning_rate=1e-2, final_learning_rate=5e-4, hit_distance=1e-3,
-        )  # fmt: skip
+        return changed(Config(), pool_points=300_000, near_spread=0.04, fine_spread=0.006, features=16, hidden_width=64,
+            points_per_step=1 << 13, learning_rate=1e-2, final_learning_rate=5e-4, hit_distance=1e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

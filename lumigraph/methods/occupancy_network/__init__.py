@@ -23,7 +23,7 @@ from ...datasets.scene import Frame, Photograph
 from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
-from ...files.ranges import Count, LearningRate, Seed, Width, between, changed
+from ...files.ranges import Count, Layers, LearningRate, Seed, Width, between, changed
 from ...method import seeded
 from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
@@ -133,19 +133,15 @@ class OccupancyNetwork(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller networks, points close to the surface too, waves, and warped members."""
-        return changed(
-            Config(), pool_points=80_000, near_share=0.6, picture_size=64, code=128, encoder_width=64,
+        return changed(Config(), pool_points=80_000, near_share=0.6, picture_size=64, code=128, encoder_width=64,
             hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=16, points_per_shape=256,
-            learning_rate=2e-3, bend=0.4, stretch=0.3, code_steps=30,
-        )  # fmt: skip
+            learning_rate=2e-3, bend=0.4, stretch=0.3, code_steps=30)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        return changed(
-            Config(), pool_points=4096, near_share=0.5, cloud_points=32, code=4, encoder_width=8, hidden_width=8,
-            blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512,
-            learning_rate=2e-2,
-        )  # fmt: skip
+        return changed(Config(), pool_points=4096, near_share=0.5, cloud_points=32, code=4, encoder_width=8,
+            hidden_width=8, blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512,
+            learning_rate=2e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

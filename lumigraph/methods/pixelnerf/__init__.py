@@ -143,21 +143,17 @@ class PixelNeRF(RayMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller encoder and network of the same design."""
-        return Config(
-            hidden_width=64, encoder_widths=(32, 32, 64, 128), encoder_blocks=(2, 2, 2), encoder_pool=False,
+        return Config(hidden_width=64, encoder_widths=(32, 32, 64, 128), encoder_blocks=(2, 2, 2), encoder_pool=False,
             coarse_samples=20, fine_samples=12, depth_samples=0, networks=1, empty_threshold=1e-2, density="softplus",
             density_scale=10.0, members_per_step=3, boxed=0.5, coarse_loss_weight=0.1, learning_rate=1e-3,
-            warmup=0.02,
-        )  # fmt: skip
+            warmup=0.02)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16, blocks=2,
-            view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2, coarse_samples=12,
-            fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96, learning_rate=1e-2,
-            final_learning_rate=3e-3,
-        )  # fmt: skip
+        return Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16,
+            blocks=2, view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2,
+            coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96,
+            learning_rate=1e-2, final_learning_rate=3e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -7,7 +7,7 @@ Each Gaussian is flattened into a disc, whose plane gives unbiased depth and a n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 
@@ -19,8 +19,7 @@ from ...components.clouds.appearance import AppearanceNumbers
 from ...components.clouds.cloud import HasteNumbers
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import SSIM_WEIGHT as SSIM_WEIGHT
-from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD, CloudMethod
+from ...components.clouds.cloud_method import SSIM_WEIGHT, TRANSMITTANCE_THRESHOLD, CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
@@ -66,6 +65,7 @@ class Config:
     """The paper's numbers, those of 3D Gaussian Splatting where it gives none."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
+    ssim_weight: ClassVar[float] = SSIM_WEIGHT
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
@@ -145,21 +145,17 @@ class PlanarSplatting(CloudMethod):
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more. Patches
         are fewer, and smaller because photographs are."""
-        return changed(
-            Config(tidying=ALL_RULES), initialization="dense", initial_gaussians=20_000, half_resolution_until=0.3,
-            depth="median", normal_weight=0.05, photometric_weight=0.6, geometric_weight=0.1, consistency_from=0.05,
-            patches=2048, patch_side=5, both_views=False, discs=True, max_gaussians=60_000, cap_ramp=True,
-            most_haste=4.0,
-        )  # fmt: skip
+        return changed(Config(tidying=ALL_RULES), initialization="dense", initial_gaussians=20_000,
+            half_resolution_until=0.3, depth="median", normal_weight=0.05, photometric_weight=0.6, geometric_weight=0.1,
+            consistency_from=0.05, patches=2048, patch_side=5, both_views=False, discs=True, max_gaussians=60_000,
+            cap_ramp=True, most_haste=4.0)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and made consistent within some twenty quick steps."""
-        return changed(
-            Config(tidying=ALL_RULES), sh_degree=1, initial_gaussians=200, depth="median", consistency_from=0.1,
-            patches=64, patch_side=3, view_angle=180.0, max_gaussians=300, cap_ramp=True, refine_until=0.8,
-            densify_grad_threshold=1e-6, opacity_reset_interval=5, appearance="no",
-        )  # fmt: skip
+        return changed(Config(tidying=ALL_RULES), sh_degree=1, initial_gaussians=200, depth="median",
+            consistency_from=0.1, patches=64, patch_side=3, view_angle=180.0, max_gaussians=300, cap_ramp=True,
+            refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, appearance="no")  # fmt: skip
 
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
         """The next photograph, and one of those that were taken beside it."""

@@ -104,16 +104,13 @@ class SRN(RayMethod):
         """Smaller networks; rays start where they enter the scene's box."""
         return Config(
             code=64, hidden_width=64, start="box", members=1024, members_per_step=4, rays_per_member=256, targets=4,
-            learning_rate=2e-3, final_learning_rate=1e-4, warmup=0.02, code_steps=200, fit_rays=512,
-        )  # fmt: skip
+            learning_rate=2e-3, final_learning_rate=1e-4, warmup=0.02, code_steps=200, fit_rays=512)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            code=4, hidden_width=16, depth=2, pixel_layers=1, march_steps=4, start="box", members=8,
+        return Config(code=4, hidden_width=16, depth=2, pixel_layers=1, march_steps=4, start="box", members=8,
             members_per_step=1, rays_per_member=128, learning_rate=1e-2, final_learning_rate=3e-3, code_steps=5,
-            fit_rays=64,
-        )  # fmt: skip
+            fit_rays=64)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

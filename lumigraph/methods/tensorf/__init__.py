@@ -201,12 +201,10 @@ class TensoRF(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        return changed(
-            Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05,
+        return changed(Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05,
             initial_resolution=96, final_resolution=200, open_final_resolution=320, appearance_components=16,
             hidden_width=64, feature_frequencies=0, density_shift=-8.0, open_samples_per_step=1 << 15, step_ratio=1.0,
-            weight_threshold=1e-3, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8,
-        )  # fmt: skip
+            weight_threshold=1e-3, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
@@ -215,8 +213,7 @@ class TensoRF(FieldMethod):
             Config(), samples_per_step=4096, occupancy_resolution=16, initial_resolution=8, final_resolution=16,
             open_final_resolution=16, density_components=4, appearance_components=6, appearance_features=8,
             hidden_width=16, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0,
-            rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3,
-        )  # fmt: skip
+            rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
