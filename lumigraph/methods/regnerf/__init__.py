@@ -67,7 +67,7 @@ class Config:
     annealing: Share = 512 / 69_768  # share of the budget in which samples spread along rays, eq. 10
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
     forward_annealing_start: PositiveShare = 1e-4  # the same of forward-facing captures, from the far plane on
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
     # Of the network.
     hidden_width: Width = 256  # channels of a layer
     density_noise: NonNegative = 1.0  # deviation of noise on raw density in training; 0: none
