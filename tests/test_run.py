@@ -23,6 +23,7 @@ from lumigraph.files import replacing, write_json
 from lumigraph.files.plain import alike, flatten, unflatten
 from lumigraph.files.ranges import typed
 from lumigraph.run import Run, State
+from lumigraph.run.settings import of_this_version
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 8)
@@ -72,6 +73,43 @@ def test_an_option_that_became_a_constant_opens(run):
     kind = methods.find("deepsdf")
     older = replace(settings, config=asdict(kind.smallest()) | {"fit_weight": 1e-4})
     assert older.method_config(kind, run.folder) == kind.smallest()
+
+
+@dataclass(frozen=True)
+class Layer:
+    width: int = 1
+    rate: float = 2.0
+
+
+@dataclass(frozen=True)
+class Stack:
+    inner: Layer = Layer()
+    steps: int = 3
+
+
+@dataclass(frozen=True)
+class Numbers:
+    outer: Stack = Stack()
+    other: Layer = Layer()
+    size: int = 4
+
+
+def test_an_option_that_moved_opens():
+    """Down into a part or up out of one, alone or with its whole part; not where two parts have its name."""
+    for said, found in (
+        ({"steps": 5, "outer": {"inner": {"width": 6}}}, {"outer": {"steps": 5, "inner": {"width": 6}}}),
+        ({"inner": {"width": 6}}, {"outer": {"inner": {"width": 6}}}),
+        ({"inner": {"size": 7, "steps": 8}}, {"size": 7, "outer": {"steps": 8}}),
+        ({"width": 6}, {"width": 6}),
+        ({"inner": {"inner": {"inner": 1}}}, {"outer": {"inner": {"inner": 1}}}),
+    ):
+        assert of_this_version(said, Numbers, "a run") == found
+    kind = methods.find("nerf-w")
+    said = asdict(kind.smallest())
+    said |= said.pop("backbone")
+    said["table"]["density_layers"] = 1
+    older = of_this_version(said, kind.Config, "a run")
+    assert typed(kind.Config, older, "a run", closed=True) == kind.smallest()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

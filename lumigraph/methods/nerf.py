@@ -96,5 +96,4 @@ class NeRF(FieldMethod):
             network.coarse.network.load_state_dict(network.network.state_dict())
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        own = torch.optim.Adam(self.network.parameters(), self.config.learning_rate, eps=1e-7)
-        return [own, *super().optimizers()]
+        return [*self.network.optimizers_at(self.config.learning_rate), *super().optimizers()]

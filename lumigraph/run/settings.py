@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -109,22 +110,61 @@ class Settings:
     def method_config(self, kind: type[Method], file: Path) -> Any:
         """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
         its range"""
-        return typed(kind.Config, without_constants(self.config, kind.Config, file), file, closed=True)
+        return typed(kind.Config, of_this_version(self.config, kind.Config, file), file, closed=True)
 
 
-def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
-    """JSON of a Config without options of older versions that are constants now: they have the option's name in
-    capitals, in the module of the dataclass. Warns of one that had another value."""
-    if not (isinstance(said, dict) and is_dataclass(kind)):
-        return said
-    known, module, kept = hints(kind), vars(sys.modules[kind.__module__]), {}  # type: ignore[arg-type]
-    for name, value in said.items():
-        if name in known or name.upper() not in module:
-            kept[name] = without_constants(value, known.get(name), file)
-        elif msgspec.to_builtins(constant := module[name.upper()]) != value:
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
-            warnings.warn(text, LumigraphWarning, stacklevel=2)
-    return kept
+def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
+    """JSON of a Config in the layout of this version. An option of an older version that moved between the dataclasses
+    of the Config moves to its place. One that is a constant now, by its name in capitals in the module of its dataclass
+    or of the Config, is left out, with a warning if it had another value."""
+    made: dict[str, Any] = {}
+
+    def place(said: dict[str, Any], path: tuple[str, ...], part: Any) -> None:
+        for name, value in said.items():
+            known = name in hints(part)
+            to = (*path, name) if known else path_to(kind, name)
+            if to and (known or not path) and isinstance(value, dict) and is_dataclass(inner := kind_at(kind, to)):
+                place(value, to, inner)  # no deeper than the Config, whatever the file holds
+            elif to or not dropped(name, value, (kind, part), file):
+                put(made, to or (*path, name), value)
+
+    place(said, (), kind)
+    return made
+
+
+def path_to(kind: Any, name: str) -> tuple[str, ...] | None:
+    """Path of the one option or part of a name in a dataclass and in those that it holds; None if there is none."""
+    if name in (known := hints(kind)):
+        return (name,)
+    inner = ((held, path_to(each, name)) for held, each in known.items() if is_dataclass(each))
+    found = [(held, *path) for held, path in inner if path]
+    return found[0] if len(found) == 1 else None
+
+
+def kind_at(kind: Any, path: tuple[str, ...]) -> Any:
+    """Annotation at a path of a dataclass."""
+    for name in path:
+        kind = hints(kind)[name]
+    return kind
+
+
+def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    """Set a value at a path of nested JSON."""
+    *parts, name = path
+    for part in parts:
+        made = made.setdefault(part, {})
+    made[name] = value
+
+
+def dropped(name: str, value: Any, owners: Iterable[type], file: Path | str) -> bool:
+    """True for an option that is a constant now in the module of an owner. Warns of another value."""
+    for module in (vars(sys.modules[owner.__module__]) for owner in owners):
+        if name.upper() in module:
+            if msgspec.to_builtins(constant := module[name.upper()]) != value:
+                text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
+                warnings.warn(text, LumigraphWarning, stacklevel=2)
+            return True
+    return False
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:

@@ -17,7 +17,7 @@ from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.teacher import teacher_of
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ...components.sampling.occupancy_sampler import OCCUPANCY_INTERVAL, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
 from ...components.training.photometric import backdrop, huber, residuals
@@ -143,7 +143,7 @@ class SNeRG(FieldMethod):
         contracted = contraction_of(frame) if c.whole and frame.is_open else None
         self.voxel_space = contracted or Box(frame.bounds, frame.near)
         cells = c.visibility_resolution * (2 if contracted else 1)
-        self.visibility = VisibilityGrid(cells, c.occupancy.occupancy_interval)
+        self.visibility = VisibilityGrid(cells, OCCUPANCY_INTERVAL)
         self.voxels, self.tuned = BakedVoxels(c.block_size - 2, contracted), VoxelParameters()
         self.register_buffer("stage", torch.tensor(FIELD))
         self.register_buffer("began", torch.tensor(-1.0))
