@@ -90,20 +90,21 @@ class Stack:
 @dataclass(frozen=True)
 class Numbers:
     outer: Stack = Stack()
-    other: Layer = Layer()
     size: int = 4
 
 
 def test_an_option_that_moved_opens():
-    """Down into a part or up out of one, alone or with its whole part; not where two parts have its name."""
+    """Down into a part or up out of one, alone or with its whole part; what is unknown is refused."""
     for said, found in (
         ({"steps": 5, "outer": {"inner": {"width": 6}}}, {"outer": {"steps": 5, "inner": {"width": 6}}}),
-        ({"inner": {"width": 6}}, {"outer": {"inner": {"width": 6}}}),
-        ({"inner": {"size": 7, "steps": 8}}, {"size": 7, "outer": {"steps": 8}}),
-        ({"width": 6}, {"width": 6}),
-        ({"inner": {"inner": {"inner": 1}}}, {"outer": {"inner": {"inner": 1}}}),
+        ({"inner": {"width": 6, "size": 7}}, {"outer": {"inner": {"width": 6}}, "size": 7}),
+        ({"outer": {"inner": 1}, "width": 2}, None),
+        ({"width": {"width": {"width": "wide"}}}, None),
+        ({"late": {"other": 3}}, None),
     ):
-        assert of_this_version(said, Numbers, "a run") == found
+        with contextlib.nullcontext() if found else pytest.raises(LumigraphError):
+            numbers = typed(Numbers, of_this_version(said, Numbers, "a run"), "a run", closed=True)
+            assert alike(asdict(numbers), asdict(typed(Numbers, found, "a run")))
     kind = methods.find("nerf-w")
     said = asdict(kind.smallest())
     said |= said.pop("backbone")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -114,57 +114,47 @@ class Settings:
 
 
 def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
-    """JSON of a Config in the layout of this version. An option of an older version that moved between the dataclasses
-    of the Config moves to its place. One that is a constant now, by its name in capitals in the module of its dataclass
-    or of the Config, is left out, with a warning if it had another value."""
-    made: dict[str, Any] = {}
-
-    def place(said: dict[str, Any], path: tuple[str, ...], part: Any) -> None:
-        for name, value in said.items():
-            known = name in hints(part)
-            to = (*path, name) if known else path_to(kind, name)
-            if to and (known or not path) and isinstance(value, dict) and is_dataclass(inner := kind_at(kind, to)):
-                place(value, to, inner)  # no deeper than the Config, whatever the file holds
-            elif to or not dropped(name, value, (kind, part), file):
-                put(made, to or (*path, name), value)
-
-    place(said, (), kind)
+    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. Options
+    that are constants now, by their names in capitals beside the Config or a part of it, are left out, with a warning
+    of another value."""
+    parts, made = [*parts_of(kind)], dict[str, Any]()
+    places = {name: (*path, name) for path, part in parts for name in hints(part)}
+    modules = [vars(sys.modules[part.__module__]) for _, part in parts]
+    for path, value in leaves(said):
+        name = path[-1]
+        constants = [module[name.upper()] for module in modules if name.upper() in module]
+        if name in places or not constants:
+            put(made, places.get(name, path), value)
+        elif value not in map(msgspec.to_builtins, constants):
+            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constants[0])} now"
+            warnings.warn(text, LumigraphWarning, stacklevel=2)
     return made
 
 
-def path_to(kind: Any, name: str) -> tuple[str, ...] | None:
-    """Path of the one option or part of a name in a dataclass and in those that it holds; None if there is none."""
-    if name in (known := hints(kind)):
-        return (name,)
-    inner = ((held, path_to(each, name)) for held, each in known.items() if is_dataclass(each))
-    found = [(held, *path) for held, path in inner if path]
-    return found[0] if len(found) == 1 else None
+def parts_of(kind: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """A dataclass and those that it holds, each after its path."""
+    yield path, kind
+    for name, part in hints(kind).items():
+        if is_dataclass(part):
+            yield from parts_of(part, (*path, name))
 
 
-def kind_at(kind: Any, path: tuple[str, ...]) -> Any:
-    """Annotation at a path of a dataclass."""
-    for name in path:
-        kind = hints(kind)[name]
-    return kind
+def leaves(said: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Values of nested JSON that are no dictionaries, each after its path."""
+    for name, value in said.items():
+        if isinstance(value, dict):
+            yield from leaves(value, (*path, name))
+        else:
+            yield (*path, name), value
 
 
 def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
-    """Set a value at a path of nested JSON."""
-    *parts, name = path
-    for part in parts:
-        made = made.setdefault(part, {})
-    made[name] = value
-
-
-def dropped(name: str, value: Any, owners: Iterable[type], file: Path | str) -> bool:
-    """True for an option that is a constant now in the module of an owner. Warns of another value."""
-    for module in (vars(sys.modules[owner.__module__]) for owner in owners):
-        if name.upper() in module:
-            if msgspec.to_builtins(constant := module[name.upper()]) != value:
-                text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
-                warnings.warn(text, LumigraphWarning, stacklevel=2)
-            return True
-    return False
+    """Set a value at a path of nested JSON, unless something else than a dictionary is on the way."""
+    for name in path[:-1]:
+        made = made.setdefault(name, {})
+        if not isinstance(made, dict):
+            return
+    made[path[-1]] = value
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:

@@ -19,6 +19,7 @@ from .occupancy import MaskNumbers, OccupancyMask
 from .sampling import inverse_transform, midpoints, stratified
 from .spaces import Space
 
+RESAMPLE_PADDING = 0.01  # alpha, least weight of a frustum of a cone (Barron 2021, eq. 17)
 RAYS_WITH_FEATURES = 1024  # rays that are rendered at once where the features of all their samples are kept
 
 

@@ -56,15 +56,14 @@ class Config:
     visibility_width: Width = 128  # channels of the visibility network; wider costs time
     residual_masks: bool = False  # exclude parts of photographs with large errors, in addition to given masks
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
-    own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
     head_layers: Layers = 3  # of the network: hidden colour layers, appendix; more cost time
     head_width: Width = 128  # of the network: channels of a hidden colour layer, appendix; wider costs time
     warmup_steps: Steps = 1024  # steps in which the learning rate rises, appendix; more begin more carefully
-    resample_padding: NonNegative = 0.01  # of the network: least weight of a frustum; higher samples more evenly
     coarse_loss_weight: NonNegative = 0.1  # of the network: weight of the coarse colours; 0: it only guides
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
+OWN_SKIES = True  # a sky for each photograph behind open captures, by hash table
 FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 
 
@@ -92,10 +91,12 @@ class BlockNeRF(FieldMethod):
         with seeded(c.seed):
             self.network = b.build(frame, space, network=network, code=code, joining=joining)
             if b.hashed:
-                self.sky = sky_for(frame, c.own_skies, b.table.sh_bands, code, b.hidden_width)
+                self.sky = sky_for(frame, OWN_SKIES, b.table.sh_bands, code, b.hidden_width)
                 self.sampler = b.sampler(frame, space)
             else:
-                self.sampler = ConeSampler(space, c.rays, rays_per_chunk=RAYS_WITH_FEATURES)
+                self.sampler = ConeSampler(
+                    space, c.rays, learns_coarse=c.coarse_loss_weight > 0, rays_per_chunk=RAYS_WITH_FEATURES
+                )
             shape = c.visibility_frequencies, c.visibility_layers, c.visibility_width
             self.sight = Visibility(space, *shape) if c.visibility else None
 

@@ -43,6 +43,8 @@ from .warp import MomentCodes, Motion, MotionField, SliceField
 
 Code = Annotated[int, between(0, 1024)]  # numbers of a code; 0 for none
 FIRST_MOMENTS = 0.1  # share of the capture that is learnt from at first, where moments join
+ELASTIC_SCALE = 0.03  # c of the elastic term's robust loss, section 3.3
+BACKGROUND_WEIGHT = 1.0  # weight of background points that must not move, section 3.4
 BACKGROUND_SCALE = 0.001  # c of the background's robust loss, in scene units (the authors' release)
 
 
@@ -60,9 +62,7 @@ class DeformationNumbers:
     annealing: Share = 0.32  # share of the budget in which octaves join, 80k of 250k steps, section 3.5; 0: at once
     elastic_weight: NonNegative = 1e-3  # lambda, weight of the elastic loss at first, section 4; higher: more rigid
     elastic_until: Share = 0.2  # share of the budget before that weight falls, 50k of 250k steps
-    elastic_scale: PositiveShare = 0.03  # c of the robust loss, section 3.3; higher: large stretches count for more
     elastic_samples: Annotated[int, between(1, 1 << 20)] = 8192  # samples of a step where it is measured
-    background_weight: NonNegative = 1.0  # weight of background points that must not move, section 3.4
     background_points: Annotated[int, between(1, 1 << 20)] = 16384  # of them in a step
     growth: Share = 0.0  # share of the budget in which later moments join the first (Pumarola 2021); 0: at once
     slice_dimensions: Annotated[int, between(0, 16)] = 0  # ambient dimensions of HyperNeRF's slice; 0: none
@@ -208,8 +208,8 @@ class Nerfies(FieldMethod):
         motion = self.network.motion
         if motion is not None and (weight := self.elastic_weight()):
             terms["elastic"] = weight * self.stretching(motion, batch.rays, passes[-1], code, generator)
-        if motion is not None and len(self.background_points) and self.config.deformation.background_weight:
-            terms["background"] = self.config.deformation.background_weight * self.restlessness(motion, generator)
+        if motion is not None and len(self.background_points):
+            terms["background"] = BACKGROUND_WEIGHT * self.restlessness(motion, generator)
         return terms
 
     def stretching(
@@ -225,7 +225,7 @@ class Nerfies(FieldMethod):
         ray = seen.samples.ray_index[drawn]
         points = rays.origins[ray] + seen.samples.t[drawn, None] * rays.directions[ray]
         jacobian = motion.jacobian(points, code[ray, self.network.appearance :])
-        return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
+        return total / len(rays) * elastic_loss(jacobian, ELASTIC_SCALE).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
         """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""

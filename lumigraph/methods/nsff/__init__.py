@@ -33,6 +33,10 @@ from .fields import BlendedField, NetworkField, StaticHash, TimeHash
 from .priors import DepthSource, MotionPriors, seen
 from .sampler import EvenNumbers, EvenSampler
 
+OCCLUSION_WEIGHT = 0.1  # beta_w, of disocclusion weights that differ from 1, eq. 6
+CYCLE_WEIGHT = 1.0  # weight of flow forward and back that do not cancel, eq. 7
+SMOOTH_WEIGHT = 0.1  # weight of flow that differs between samples of a ray, or between moments
+MIN_WEIGHT = 0.01  # weight of flow itself
 ROWS = 288  # of the pictures in whose pixels the release measures errors of flow
 PRIOR_FALL = 10.0  # factor by which the weights of flow and depth fall each time (the authors' release)
 LAST_SCALE = 0.005  # of those weights, below which they are 0
@@ -47,10 +51,6 @@ class FlowNumbers:
     neighbours: Annotated[int, between(0, 2)] = 2  # moments to either side that are warped; 0: time is a mere input
     both_ways: bool = True  # warp forward and back in each step; off: one of them at random, in half the time
     max_flow: PositiveShare = 1.0  # largest flow to the next moment along an axis, in coordinates of the space
-    occlusion_weight: NonNegative = 0.1  # beta_w, of disocclusion weights that differ from 1, eq. 6
-    cycle_weight: NonNegative = 1.0  # of flow forward and back that do not cancel, eq. 7
-    smooth_weight: NonNegative = 0.1  # of flow that differs between samples of a ray, or between moments
-    min_weight: NonNegative = 0.01  # of flow itself
     flow_weight: NonNegative = 0.02  # of optical flow at first, per pixel of 288 rows; 0: without OpenCV
     depth_weight: NonNegative = 0.04  # of depth at first; 0: none
     depth_source: DepthSource = "sweeps"  # depth of what stands still by plane sweeps, or files of depth
@@ -213,8 +213,8 @@ class NSFF(FieldMethod):
         between = packed.ray_index.diff() == 0
         near = torch.exp(-NEIGHBOURS * points.diff(dim=0).norm(dim=-1))
         unlike = near * (forward.diff(dim=0).abs() + back.diff(dim=0).abs()).sum(-1)
-        terms["smooth"] = c.smooth_weight * (seen(between, unlike) + (forward + back).square().sum(-1).mean() / 2)
-        terms["least"] = c.min_weight * (forward.abs().mean() + back.abs().mean())
+        terms["smooth"] = SMOOTH_WEIGHT * (seen(between, unlike) + (forward + back).square().sum(-1).mean() / 2)
+        terms["least"] = MIN_WEIGHT * (forward.abs().mean() + back.abs().mean())
         if len(self.priors.depth.rows) and self.prior_scale > LAST_SCALE:
             terms["depth"] = c.depth_weight * self.prior_scale * self.depth_error(batch, packed, density, moving)
         return terms
@@ -268,8 +268,8 @@ class NSFF(FieldMethod):
             flow, (back, _) = self.toward(at.motion, way[ray])[0], self.toward(there.motion, 1 - way[ray])
             values = {
                 "photometric": seen(known, certain * (picture.rgb - target).square().mean(-1)),
-                "occlusion": c.occlusion_weight * seen(known[ray], 1 - weight[:, 0]),
-                "cycle": c.cycle_weight * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
+                "occlusion": OCCLUSION_WEIGHT * seen(known[ray], 1 - weight[:, 0]),
+                "cycle": CYCLE_WEIGHT * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
             }
             if not hop and len(self.priors.flow.rows) and self.prior_scale > LAST_SCALE:
                 own = composite(packed, at.density, at.rgb, None, place=there.places)
