@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -107,24 +108,53 @@ class Settings:
         return {"format": RUN_FORMAT} | self.said | own | parts
 
     def method_config(self, kind: type[Method], file: Path) -> Any:
-        """The numbers as the Config of a kind of method. file: named in faults for one that is unknown, of another
-        type, or out of range"""
-        return typed(kind.Config, without_constants(self.config, kind.Config, file), file, closed=True)
+        """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
+        its range"""
+        return typed(kind.Config, of_this_version(self.config, kind.Config, file), file, closed=True)
 
 
-def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
-    """JSON of a Config without options of older versions that have become constants: in capitals, in the module of the
-    dataclass. Warns of one that had another value."""
-    if not (isinstance(said, dict) and is_dataclass(kind)):
-        return said
-    known, module, kept = hints(kind), vars(sys.modules[kind.__module__]), {}  # type: ignore[arg-type]
-    for name, value in said.items():
-        if name in known or name.upper() not in module:
-            kept[name] = without_constants(value, known.get(name), file)
-        elif msgspec.to_builtins(constant := module[name.upper()]) != value:
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
+def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
+    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. Options
+    that are constants now, by their names in capitals beside the Config or a part of it, are left out, with a warning
+    of another value."""
+    parts, made = [*parts_of(kind)], dict[str, Any]()
+    places = {name: (*path, name) for path, part in parts for name in hints(part)}
+    modules = [vars(sys.modules[part.__module__]) for _, part in parts]
+    for path, value in leaves(said):
+        name = path[-1]
+        constants = [module[name.upper()] for module in modules if name.upper() in module]
+        if name in places or not constants:
+            put(made, places.get(name, path), value)
+        elif value not in map(msgspec.to_builtins, constants):
+            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constants[0])} now"
             warnings.warn(text, LumigraphWarning, stacklevel=2)
-    return kept
+    return made
+
+
+def parts_of(kind: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """A dataclass and those that it holds, each after its path."""
+    yield path, kind
+    for name, part in hints(kind).items():
+        if is_dataclass(part):
+            yield from parts_of(part, (*path, name))
+
+
+def leaves(said: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Values of nested JSON that are no dictionaries, each after its path."""
+    for name, value in said.items():
+        if isinstance(value, dict):
+            yield from leaves(value, (*path, name))
+        else:
+            yield (*path, name), value
+
+
+def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    """Set a value at a path of nested JSON, unless something else than a dictionary is on the way."""
+    for name in path[:-1]:
+        made = made.setdefault(name, {})
+        if not isinstance(made, dict):
+            return
+    made[path[-1]] = value
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
