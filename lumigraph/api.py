@@ -29,7 +29,7 @@ from .commands.results import Evaluation, Exported, Film, Reports
 from .datasets.dataset import Dataset
 from .datasets.scene import Scene
 from .errors import LumigraphError
-from .large import held_open, open_any
+from .large import open_any
 from .method import Method
 from .opening import open_scene
 from .run import Opened
@@ -123,16 +123,12 @@ class Model:
 
     def _made(self, name: str, *arguments: object, **options: Any) -> Any:
         """Result of a command on what is opened."""
-        made: Reports = command(name, self.opened.path, *arguments, **options)
-        with held_open(self.opened):
-            return quietly(made.made)[0]
+        asked: Reports = command(name, self.opened.path, *arguments, **options)
+        return quietly(lambda: asked.of(self.opened))[0]
 
     def _derived(self, name: str, output: Path | str, *arguments: object, **options: Any) -> Model:
         """Run or file that a command makes of what is opened."""
-        made = command(name, self.opened.path, *arguments, output=output, **options)
-        with held_open(self.opened):
-            finished(quietly(made.run)[0])
-        return open(output)
+        return open(self._made(name, *arguments, output=output, **options).path)
 
 
 def open(path: str | Path) -> Model:

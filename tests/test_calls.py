@@ -19,7 +19,6 @@ import lumigraph
 from lumigraph.commands.calls import command
 from lumigraph.commands.cli import COMMANDS, parse
 from lumigraph.errors import LumigraphError
-from lumigraph.large import held_open, open_any, open_run
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
 
@@ -142,13 +141,6 @@ def test_weights_are_loaded_once_for_all_calls(own_run, tmp_path, monkeypatch):
     assert mesh.counts["triangles"] > 10 and mesh.bytes == Path(mesh).stat().st_size
     assert found.psnr == found["psnr"] == lumigraph.open(own_run.path).evaluation()["psnr"] and len(found.views) == 2
     assert len(opens) == 1 and found.path.name == "eval.json"
-
-
-def test_a_held_run_is_that_of_its_own_path_alone(own_run, ball_run):
-    with held_open(own_run.opened):
-        assert open_any(own_run.path) is own_run.opened is open_run(str(own_run.path))
-        assert open_any(ball_run.path) is not own_run.opened
-    assert open_any(own_run.path) is not own_run.opened
 
 
 def test_a_model_has_all_that_was_opened(own_run, tmp_path):

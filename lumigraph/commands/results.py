@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .common import show
+from .common import choose_device, show
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,25 @@ class Evaluation(Result, Mapping[str, Any]):
 
 
 class Reports(ABC):
-    """A command with a result: `made` works and returns it, `run` prints its rows."""
+    """A command on something that opens: `of` works on it and returns a result, `made` opens its `source`, `run` prints
+    the rows."""
 
     @abstractmethod
-    def made(self) -> Result:
-        """Do the work, and return the result."""
+    def of(self, opened: Any) -> Any:
+        """Do the work on what was opened, and return a Result."""
+
+    def made(self) -> Any:
+        """Open the source, do the work, and return a Result."""
+        from ..large import open_any
+
+        return self.of(open_any(self.source))  # type: ignore[attr-defined]
+
+    def loaded(self, opened: Any) -> Any:
+        """What was opened with its method, as the options of the command have it."""
+        from ..export.loaded import Loaded
+
+        options = {name: getattr(self, name) for name in ("settings", "part", "scaling") if hasattr(self, name)}
+        return Loaded.of(opened, choose_device(getattr(self, "device", "cpu")), **options)
 
     def run(self) -> int:
         """Do the work, and print the result. Returns the exit code."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from ..budget import Budget, Quality
+from ..budget import Budget, Quality, given_budget
 from ..errors import LumigraphError
 from ..files.ranges import Port, Seconds, Steps
-from .common import choose_device, exit_code, given_budget, quality_budget, typed
+from .common import choose_device, exit_code, quality_budget, typed
 from .options import RunOption, ViewerToken, option
 
 

@@ -11,22 +11,21 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, arg
 
 from .. import methods
-from ..budget import Budget, Quality
+from ..budget import Budget, Quality, about_quality, given_budget
 from ..errors import LumigraphError
 from ..files.names import counted
 from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Steps
 from .capture import posed
 from .common import (
-    about_quality,
     choose_device,
     default_config,
     exit_code,
-    given_budget,
     method_config,
     next_free,
     option_group,
     preset_device,
     quality_budget,
+    quality_of,
     say,
     scene_name,
     show,
@@ -321,7 +320,7 @@ def with_options_of(
     if in_blocks and (learner := field.replace("_", "-")) in methods.available():
         name = learner
     kind = methods.find(name)
-    asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
+    asked = option("draft|good|best", "as long as --seconds", quality_of(kind))
     extra: dict[str, tuple[Any, Any]] = {}
     if "quality" in {x.name for x in dataclasses.fields(command)}:
         extra["quality"] = Annotated[Quality | None, asked], None

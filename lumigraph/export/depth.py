@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,47 @@ from PIL import Image
 from ..camera import Camera
 from ..datasets.scene import Scene
 from ..depth_maps import DepthMap
+from ..depth_maps.multi_view import multi_view_depth, pair_depth
 from ..depth_maps.stereo import Disparity, RectifiedPair
 from ..errors import LumigraphError
 from ..figures import Row, colour_depth, contact_sheet, depth_range, save_picture, to_image
 from ..files import replacing_folder, write_json
 from ..readers.transforms import OPENCV_FROM_OPENGL
+from .options import DepthOptions
 
 MAX_LEVEL = 65534  # of 16 bits; 0 and 65535 stand for unknown depth
 SHEET = "depth.png"
+
+
+@dataclass(frozen=True)
+class ComparedPair:
+    """Two photographs that were compared: the left one's name, baseline in units of the capture, disparities in pixels,
+    and the share of trusted pixels whose depth is sure."""
+
+    left: str
+    baseline: float
+    disparities: tuple[int, int]
+    sure: float
+
+
+def export_depth(scene: Scene, folder: Path, options: DepthOptions = DepthOptions()) -> list[DepthMap]:
+    """Write depth maps of the photographs by multi-view stereo, and return them."""
+    maps = multi_view_depth(scene, options.size, views=options.views or len(scene))
+    write_depth(folder, scene, maps)
+    return maps
+
+
+def export_pair(scene: Scene, folder: Path, names: tuple[str, str], options: DepthOptions) -> ComparedPair:
+    """Write the depth of the left one of two photographs, by name or number, by rectification and matching."""
+    first, second = (scene.find(name) for name in names)
+    pair, found = pair_depth(scene, first, second, options.size)
+    left = first if bool((pair.left.pose[:, 3] == scene.cameras.position[first]).all()) else second
+    seen = pair.depth_map(found, left)
+    sure = float(seen.solid[pair.left.trust > 0.5].float().mean())
+    write_depth(folder, scene, [seen], pair_sheet(scene.source, names, pair, found))
+    begin, count = pair.disparities
+    baseline = pair.baseline * scene.frame.to_source.scale
+    return ComparedPair(scene.names[left], baseline, (begin, begin + count - 1), sure)
 
 
 def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap], sheet: Image.Image | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -19,12 +20,14 @@ from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Scene
 from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, measurements, render_depth_maps
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasDensity, HasDistance, HasMesh, can, needs
+from ..run import Opened
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .loaded import Loaded
 from .options import TEXTURED_FACES, MeshOptions
 from .surface import (
     BLOCK,
@@ -56,6 +59,30 @@ ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surfac
 POINTS_PER_CHUNK = 1 << 18  # points
 
 Way = Literal["distance", "density", "own", "depth"]
+
+
+def export_mesh(loaded: Loaded, options: MeshOptions = MeshOptions()) -> tuple[Mesh, str]:
+    """The mesh of what is loaded, in the frame of exports, and the source of its surface as text."""
+    loaded = loaded.still
+    why = best_way(loaded.method)[1] if options.way == "auto" else f"{options.way}, as --from says"
+    photographs = photographs_of(loaded.opened, options)
+    mesh = extract_mesh(loaded.without_floaters(), loaded.surveyors, options, loaded.crop, photographs)
+    return mesh.in_source(loaded.frame), why
+
+
+def photographs_of(opened: Opened, options: MeshOptions) -> Scene | None:
+    """The photographs, if their colours or masks are used; None, with a warning, where they are gone.
+    Raises LumigraphError if they are not where the options say."""
+    if opened.open_scene is None or not (options.texture or opened.masked):
+        return None
+    try:
+        return opened.open_scene(options.scene)
+    except LumigraphError as error:
+        if options.scene is not None:
+            raise
+        if options.texture:
+            warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
+        return None
 
 
 @torch.no_grad()

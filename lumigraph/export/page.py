@@ -42,6 +42,7 @@ from ..paths import Surroundings, camera_path, film_size
 from ..paths.opening import Backdrop, Opening
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .options import PageOptions
 
 BACKDROP_VIEWS, BACKDROP_SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
 MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
@@ -179,17 +180,17 @@ def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
 
 
 @at_work()
-def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
+def views_page(
+    path: Path, method: Method, cameras: Camera, opening: Opening, options: PageOptions = PageOptions()
+) -> None:
     """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
 
     cameras: of the photographs
-    count:   pictures
-    longest: side of a picture in pixels
     """
     method.eval()
     around = Surroundings(cameras, method.frame)
     closed = around.arc[1] == math.pi
-    seen_from = views(around, count, film_size(cameras, longest))
+    seen_from = views(around, options.views, film_size(cameras, options.size))
     pictures, ends = [], [0]
     for i in track(range(len(seen_from)), f"Rendering {path.name}", len(seen_from)):
         pictures.append(webp(method.render(seen_from[i]).rgb))

@@ -222,6 +222,13 @@ class BlockRun(Trained):
     def learnt_from(self) -> Source:
         return self.plan.scene
 
+    def method_and_data(
+        self, device: torch.device | str, source: str | None = None, split: str = "test"
+    ) -> tuple[Method, Scene]:
+        """The method by the exposures of the photographs that it will be given, and these."""
+        data = self.dataset(source, split)
+        return self.method(device, data.about.get("exposure")), data
+
     @property
     def method_name(self) -> str:
         return self.plan.method

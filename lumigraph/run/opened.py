@@ -126,6 +126,19 @@ class Opened(ABC):
         """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         return {}
 
+    def find_view(self, split: str, view: str) -> int:
+        """Number of a photograph in a split, by its name or number. Raises LumigraphError if there is none."""
+        names = self.view_names().get(split, [])
+        if not names:
+            raise LumigraphError(f"{self.path} has no views in the split {split!r}; choose another --split")
+        number = names.index(view) if view in names else int(view) if view.isdecimal() else len(names)
+        if number >= len(names):
+            raise LumigraphError(
+                f"There is no view {view!r} in the split {split!r} of {self.path}; give --view a number from 0 to "
+                f"{len(names) - 1}, or a name such as {names[0]}"
+            )
+        return number
+
     def survey(self, cameras: Camera) -> Camera:
         """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
         return cameras if self.photographed else dome(cameras)
@@ -169,6 +182,12 @@ class Trained(Opened):
     @abstractmethod
     def dataset(self, source: str | None = None) -> Dataset:
         """Open its dataset again. source: its present path, if it has moved."""
+
+    def method_and_data(
+        self, device: torch.device | str, source: str | None = None, split: str = "test"
+    ) -> tuple[Method, Any]:
+        """The method, and the dataset with a split to compare it with. source: as for `dataset`"""
+        return self.ready(device), self.dataset(source)
 
     @property
     def title(self) -> str:
