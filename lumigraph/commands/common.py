@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from pathlib import Path
 from typing import Any
 
 from .. import methods
 from ..budget import Budget, Quality, about_quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
+from ..files.names import next_free as next_free
 from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
 
@@ -139,8 +138,3 @@ def finding_rows(found: Sequence[Any], more: str) -> dict[str, str]:
 def typed(*words: object) -> str:
     """A command to type next, quoted for a shell."""
     return shlex.join(["lumigraph", *map(str, words)])
-
-
-def next_free(prefix: str) -> Path:
-    """The first of prefix-1, prefix-2, ... that does not exist yet."""
-    return next(path for n in itertools.count(1) if not (path := Path(f"{prefix}-{n}")).exists())

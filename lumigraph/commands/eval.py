@@ -12,15 +12,8 @@ from .options import DeviceOption, Overwrite, RunOption, Set, option
 from .results import Evaluation, Reports
 
 
-@dataclass(frozen=True)
-class EvaluatedRun:
-    """Run that is evaluated."""
-
-    run_folder: RunOption
-
-
-@dataclass(frozen=True)
-class Eval(Reports, EvaluationOptions, EvaluatedRun):
+@dataclass(frozen=True, kw_only=True)
+class Eval(Reports, EvaluationOptions):
     """Compare a run with held-out photographs, or its surface with the training shapes.
 
     Writes RUN/eval.json (per view and mean PSNR, SSIM and fine detail, also by resolution where there are several, the
@@ -30,6 +23,7 @@ class Eval(Reports, EvaluationOptions, EvaluatedRun):
     out, cameras, moments or both, and where a mask of what moves is known, by that alone as well.
     """
 
+    run_folder: RunOption
     overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
     """Path of the training data, if it was moved since training."""

@@ -227,7 +227,7 @@ class ExplainRay:
         sight = sight.beside(self._photograph(run, name))
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
         write_bytes(output, standalone(ray_figure(sight, title)), "figure")
-        about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
+        about: dict[str, Any] = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
         about |= {"controls": method.settings} if method.settings else {}
         write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})

@@ -268,7 +268,7 @@ class SphereExport(Reports, SphereOptions, Files):
     device: DeviceOption = "auto"
 
     def claimed(self, opened: Any) -> Any:
-        """What is loaded, after a check of the output."""
+        """Loaded source, after a check of the output."""
         from ..export.panorama import picture_format, sphere_size
 
         picture_format(self.output)

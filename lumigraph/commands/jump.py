@@ -14,24 +14,18 @@ from .common import show
 from .options import Overwrite, needed
 
 
-@dataclass(frozen=True)
-class JumpFiles:
-    """Source and output of a stereo panorama."""
-
-    scene: Annotated[Positional[str], needed("RIG")]
-    """Folder of photographs with poses, or procedural:ring,views=12."""
-    output: Annotated[Positional[Path], needed("FILE.jpg|.png")]
-    """The pair, a square picture for headsets."""
-
-
-@dataclass(frozen=True)
-class Jump(JumpOptions, JumpFiles):
+@dataclass(frozen=True, kw_only=True)
+class Jump(JumpOptions):
     """Stitch the photographs of a ring of cameras to an omnidirectional stereo pair, the left eye on top.
 
     The cameras look outward from one level circle, six or more, and their poses are known (transforms.json, or
     procedural:ring). The nearest distance that is reliable follows from the rig, and is printed.
     """
 
+    scene: Annotated[Positional[str], needed("RIG")]
+    """Folder of photographs with poses, or procedural:ring,views=12."""
+    output: Annotated[Positional[Path], needed("FILE.jpg|.png")]
+    """The pair, a square picture for headsets."""
     overwrite: Overwrite = False
 
     def run(self) -> int:

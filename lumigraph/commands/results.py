@@ -112,7 +112,7 @@ class Reports(ABC):
         return self.of(open_any(self.source))  # type: ignore[attr-defined]
 
     def loaded(self, opened: Any) -> Any:
-        """What was opened with its method, as the options of the command have it."""
+        """Opened source with its method, as the options of the command have it."""
         from ..export.loaded import Loaded
 
         options = {name: getattr(self, name) for name in ("settings", "part", "scaling") if hasattr(self, name)}

@@ -165,6 +165,7 @@ def write_field(
 ) -> None:
     """Write the result of a field: a composition of it inside and outside a mask of voxels."""
     points, grid = selection.points, selection.points.grid
+    assert grid is not None  # of a field
     part, seen = (selection.spread_out(x).view(grid.size).numpy() > 0 for x in (chosen, points.is_seen))
     mask_of(part, seen, grid.lower, grid.edge).write(mask_file(output))
     said = relative(opened.path, output), relative(mask_file(output), output)

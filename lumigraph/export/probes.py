@@ -82,7 +82,7 @@ def export_probes(loaded: Loaded, path: Path, options: ProbesOptions = ProbesOpt
     box = loaded.frame.bounds if crop is None else crop.bounds
     grid = bake_probes(method, loaded.photographers, box, options)
     origin = loaded.frame.origin if options.origin else None
-    write_probes(path, grid, origin and origin.to_json())
+    write_probes(path, grid, None if origin is None else origin.to_json())
     if options.page is not None:
         probes_page(options.page, method, loaded.camera(options.view), grid, loaded.opened.title, options.mesh)
     return grid

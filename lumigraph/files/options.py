@@ -31,6 +31,8 @@ def option_name(field: str, kind: Any) -> str:
     return next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), field).replace("-", "_")
 
 
+DEVICE = "Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."
+DeviceOption = Annotated[str, option("NAME", about=DEVICE)]
 BEFORE_READING = "Reduce the photographs by this whole number before reading."
 DownscaleOption = Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320", BEFORE_READING)]
 PHOTOGRAPHS = "Path of the photographs, if they were moved since training."
