@@ -13,29 +13,24 @@ from ..errors import LumigraphError
 from ..sfm.options import MotionOptions
 from .common import finding_rows, lines, say, scene_name, show, typed
 from .options import needed, option
+from .results import Output
 
 MAX_NAMED_GAPS = 2  # gaps around the subject that are named
 GENERIC_FOLDERS = "images", "photos", "photographs", "pictures", "input", "frames"  # named after their contents
 
 
-@dataclass(frozen=True)
-class CaptureFiles:
-    """Source and output of a capture."""
-
-    what: Annotated[Positional[tuple[Path, ...]], needed("PHOTOS_OR_VIDEO")]
-    """A folder of photographs, several image files, or one video."""
-    output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
-    """Folder for the scene."""
-
-
-@dataclass(frozen=True)
-class CaptureCommand(MotionOptions, CaptureFiles):
+@dataclass(frozen=True, kw_only=True)
+class CaptureCommand(MotionOptions, Output):
     """Find the camera poses of photographs: a folder, a list of files, or a video.
 
     The result is a folder that this and other programs open: images, sparse/0 (COLMAP), transforms.json, and two
     pictures of the result. Ctrl-C stops; the same command continues.
     """
 
+    what: Annotated[Positional[tuple[Path, ...]], needed("PHOTOS_OR_VIDEO")]
+    """A folder of photographs, several image files, or one video."""
+    output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
+    """Folder for the scene."""
     mask_object: bool = False
     """Mask one object in front of a backdrop, so that training learns it alone. Writes object_masks/ and object.png
     into the scene; check that picture before you train."""

@@ -41,7 +41,7 @@ class Clean(Reports, CleanOptions, CleanFiles):
         from ..derive.cleaning import clean
 
         made = clean(opened, self.output, self, self.overwrite, choose_device(self.device))
-        rows = {"Gaussians": f"{made.after:,} of {made.before:,} stay"}
+        rows = {"Gaussians": f"{made.before - sum(made.removed.values()):,} of {made.before:,} stay"}
         rows |= {reason: f"{count:,} went" for reason, count in made.removed.items()}
         rows |= {"saved": str(self.output), "picture": str(made.picture), "next": f"lumigraph view {self.output}"}
         return Result(self.output, rows=rows)

@@ -11,23 +11,13 @@ from tyro.conf import Positional
 from ..derive.options import CompressOptions
 from .common import choose_device, say, show_table, typed
 from .options import DeviceOption, needed
-from .results import Reports, Result
+from .results import Output, Reports, Result
 
 INVISIBLE_LOSS, VISIBLE_LOSS = 0.3, 1.0  # dB
 
 
-@dataclass(frozen=True)
-class CompressFiles:
-    """Source and output of a compression."""
-
-    run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run, which does not change."""
-    output: Annotated[Path, needed("NEW")]
-    """New folder for the smaller run."""
-
-
-@dataclass(frozen=True)
-class Compress(Reports, CompressOptions, CompressFiles):
+@dataclass(frozen=True, kw_only=True)
+class Compress(Reports, CompressOptions, Output):
     """Compress a trained run to a size, or to a loss of PSNR.
 
     Unimportant rows are pruned, features become rows of a codebook, numbers get 8 or 16 bits; the rest is tuned on the
@@ -35,6 +25,10 @@ class Compress(Reports, CompressOptions, CompressFiles):
     held-out views before and after. Without its photographs a run is compared with its own renderings.
     """
 
+    run_folder: Annotated[Positional[Path], needed("RUN")]
+    """Folder of the run, which does not change."""
+    output: Annotated[Path, needed("NEW")]
+    """New folder for the smaller run."""
     device: DeviceOption = "auto"
 
     def made(self) -> Result:

@@ -4,35 +4,31 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from tyro.conf import Positional
 
 from ..export.options import DepthOptions
 from .common import lines, show, typed
 from .options import needed
+from .results import Output
 
 LOW_SURE_SHARE = 0.3
 LOW_SHARE = " (little: walls without texture, or too little in common; trust only the sure pixels)"
 
 
-@dataclass(frozen=True)
-class DepthFiles:
-    """Source and output of depth maps."""
-
-    scene: Annotated[Positional[str], needed("SCENE")]
-    """Folder of photographs with poses, or procedural:NAME."""
-    output: Annotated[Path, needed("FOLDER")]
-    """Folder for the depth maps."""
-
-
-@dataclass(frozen=True)
-class Depth(DepthOptions, DepthFiles):
+@dataclass(frozen=True, kw_only=True)
+class Depth(DepthOptions, Output):
     """Find the depth of every photograph by comparing it with its neighbours (multi-view stereo, PatchMatch).
 
     The result is a folder that opens as a scene: undistorted pictures, 16-bit depth of the pixels on which neighbours
     agree, transforms.json, and a contact sheet, depth.png.
     """
+
+    scene: Annotated[Positional[str], needed("SCENE")]
+    """Folder of photographs with poses, or procedural:NAME."""
+    output: Annotated[Path, needed("FOLDER")]
+    """Folder for the depth maps."""
 
     def run(self) -> int:
         from ..export.depth import SHEET, export_depth, export_pair
@@ -41,15 +37,11 @@ class Depth(DepthOptions, DepthFiles):
 
         claim_folder(self.output, "depth maps")
         scene = open_scene(self.scene, self.downscale, self.reader, whole=True)
-        rows: dict[str, Any]
         if self.pair:
-            found = export_pair(scene, self.output, self.pair, self)
-            rows = {
-                "left": found.left,
-                "baseline": f"{found.baseline:.4g} units of the capture",
-                "disparities": "{} to {} pixels".format(*found.disparities),
-                "sure pixels": f"{100 * found.sure:.0f} %" + LOW_SHARE * (found.sure < LOW_SURE_SHARE),
-            }
+            left, baseline, (low, high), sure = export_pair(scene, self.output, self.pair, self)
+            rows = {"left": left, "baseline": f"{baseline:.4g} units of the capture"}
+            rows |= {"disparities": f"{low} to {high} pixels"}
+            rows |= {"sure pixels": f"{100 * sure:.0f} %" + LOW_SHARE * (sure < LOW_SURE_SHARE)}
         else:
             maps = export_depth(scene, self.output, self)
             names = [scene.names[int(seen.camera.image_index)] for seen in maps]  # type: ignore[arg-type]

@@ -249,11 +249,12 @@ class ExportLightField(Reports, LightFieldOptions, Files):
 
         if not (flat := self.output.suffix.lower() == ".png"):
             claim_folder(self.output, "light field")
-        made = export_light_field(self.loaded(opened), self.output, self, self.overwrite)
-        count = {"views": str(made.views)} if flat else {"pictures": f"{self.grid} x {self.grid}"}
-        rows = {"quilt" if flat else "light field": str(made.path), **count}
-        rows |= {"focal plane": f"{made.focus:.4g} away", "span": f"{made.span:.4g}"}
-        return Exported(made.path, {"views": made.views}, rows=rows)
+        path, focus, span = export_light_field(self.loaded(opened), self.output, self, self.overwrite)
+        views = self.quilt[0] * self.quilt[1] if flat else self.grid**2
+        count = {"views": str(views)} if flat else {"pictures": f"{self.grid} x {self.grid}"}
+        rows = {"quilt" if flat else "light field": str(path), **count}
+        rows |= {"focal plane": f"{focus:.4g} away", "span": f"{span:.4g}"}
+        return Exported(path, {"views": views}, rows=rows)
 
 
 @dataclass(frozen=True)
@@ -430,9 +431,9 @@ class ExportWeb(Reports, PageOptions, Files):
 
         claim(self.output, "page", self.overwrite, [self.source])
         loaded, rows = self.loaded(opened), dict[str, str]()
-        page = export_page(loaded, self.output, self, self.octree(loaded, rows))
-        rows |= {"page": str(self.output), "holds": page.holds, "size": size_text(self.output)}
-        return Exported(self.output, page.counts, rows=rows)
+        holds, counts = export_page(loaded, self.output, self, self.octree(loaded, rows))
+        rows |= {"page": str(self.output), "holds": holds, "size": size_text(self.output)}
+        return Exported(self.output, counts, rows=rows)
 
     def octree(self, loaded: Any, rows: dict[str, str]) -> Callable[[], Any] | None:
         """Function that converts what is loaded to an octree and adds a row; None where it cannot become one."""

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 from ..export.options import AUTO, FilmOptions
 from .compress import size as file_size
 from .options import Animate, DeviceOption, Overwrite, Set, needed, option
-from .results import Film, Reports
+from .results import Film, Output, Reports
 
 CHOSEN = {
     "orbit": "orbit, for the photographs go round",
@@ -19,18 +19,8 @@ CHOSEN = {
 }
 
 
-@dataclass(frozen=True)
-class FilmFiles:
-    """Source and output of a film."""
-
-    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
-    output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
-    """The film: .mp4, .gif or .webp. FILE.json, its cameras, is beside it."""
-
-
-@dataclass(frozen=True)
-class Render(Reports, FilmOptions, FilmFiles):
+@dataclass(frozen=True, kw_only=True)
+class Render(Reports, FilmOptions, Output):
     """Render a film of a run, a splat file or a composition.
 
     Paths stay near the positions of the photographs. orbit goes round (or to and fro). sweep is an oval among cameras
@@ -40,6 +30,10 @@ class Render(Reports, FilmOptions, FilmFiles):
     film of the same capture.
     """
 
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
+    output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
+    """The film: .mp4, .gif or .webp. FILE.json, its cameras, is beside it."""
     overwrite: Overwrite = False
     settings: Set = ()
     animated: Animate = ()
@@ -49,19 +43,18 @@ class Render(Reports, FilmOptions, FilmFiles):
         from ..export.film import depth_beside, read_path, render_film
 
         read_path(self)  # before the method is loaded
-        made = render_film(self.loaded(opened), self.output, self, self.animated, self.overwrite)
-        output, (width, height) = made.file, made.about["size"]
-        frames, seconds = made.about["frames"], made.about["seconds_per_frame"]
+        output, path, about = render_film(self.loaded(opened), self.output, self, self.animated, self.overwrite)
+        frames, (width, height), seconds = about["frames"], about["size"], about["seconds_per_frame"]
         depth, pictures = depth_beside(output) if self.depth else None, output.with_suffix("")
         rows = {"film": f"{output}, {file_size(output.stat().st_size)}"}
-        rows |= {"path": CHOSEN[made.path]} if self.path == AUTO else {}
+        rows |= {"path": CHOSEN[path]} if self.path == AUTO else {}
         rows |= {"depth": str(depth)} if depth else {}
         rows |= {"pictures": f"{pictures}/0000.{self.pictures} …"} if self.pictures else {}
         rows |= {"frames": f"{frames} of {width}x{height}, {seconds:.3f} s each"}
         return Film(
             output,
             frames,
-            made.fps,
+            about["fps"],
             (width, height),
             seconds * frames,
             cameras=output.with_suffix(".json"),

@@ -97,6 +97,13 @@ class Evaluation(Result, Mapping[str, Any]):
         return "\n".join(f"{name}  {value}" for name, value in self.rows.items())
 
 
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """Output of a command, ahead of its options; the command says what it is."""
+
+    output: Any
+
+
 class Reports(ABC):
     """A command on something that opens: `of` works on it and returns a result, `made` opens its `source`, `run` prints
     the rows."""

@@ -13,8 +13,7 @@ from .. import methods
 from ..budget import Quality, given_budget
 from ..errors import LumigraphError
 from ..files.names import counted
-from ..large.options import BlockOptions
-from ..training.options import TrainOptions
+from ..training.options import BlockOptions, TrainOptions
 from .capture import posed
 from .common import (
     choose_device,
@@ -29,6 +28,7 @@ from .common import (
     typed,
 )
 from .options import ViewerOptions, needed, option
+from .results import Output
 
 
 def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | None:
@@ -53,9 +53,9 @@ def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | No
     else:  # of the cluster's machines
         device = torch.device("cuda" if train.device == "gpu" else train.device)
     config = method_config(train, methods.check(blocks.field or train.method))
-    begun = begin_blocks(source, places, train.method, config, device, train, blocks, train.output)
-    show_plan(begun.folder, begun.plan, given_budget(train.steps, train.seconds, train.quality))
-    return begun.folder, train_all(begun.folder, begun.plan, begun.workers)
+    run, plan, workers = begin_blocks(source, places, train.method, config, device, train, blocks, train.output)
+    show_plan(run, plan, given_budget(train.steps, train.seconds, train.quality))
+    return run, train_all(run, plan, workers)
 
 
 def train_all(output: Path, plan: Any, workers: Any) -> int:
@@ -109,21 +109,8 @@ def onward(run: Path, source: str | None = None) -> dict[str, str]:
     return {NEXT["eval"]: typed("eval", run, *again), NEXT["view"]: typed("view", run)}
 
 
-@dataclass(frozen=True)
-class TrainFiles:
-    """Method, data and output of training."""
-
-    method: Annotated[Positional[str], needed("METHOD")]
-    """Method to train, for example instant-ngp, or `surface` for the default method for meshes: neus for objects and
-    bounded scenes, planar-splatting in the open."""
-    scene: Annotated[Positional[str], needed("SCENE")]
-    """Photographs, a video, or other data to train on."""
-    output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
-    """New folder for the run."""
-
-
-@dataclass(frozen=True)
-class Train(ViewerOptions, TrainOptions, TrainFiles):
+@dataclass(frozen=True, kw_only=True)
+class Train(ViewerOptions, TrainOptions, Output):
     """Train a method on the photographs of a scene.
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
@@ -132,6 +119,14 @@ class Train(ViewerOptions, TrainOptions, TrainFiles):
     photographs have no poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's
     own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` continues.
     """
+
+    method: Annotated[Positional[str], needed("METHOD")]
+    """Method to train, for example instant-ngp, or `surface` for the default method for meshes: neus for objects and
+    bounded scenes, planar-splatting in the open."""
+    scene: Annotated[Positional[str], needed("SCENE")]
+    """Photographs, a video, or other data to train on."""
+    output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
+    """New folder for the run."""
 
     def run(self) -> int:
         return self.learn()[1]
@@ -143,6 +138,7 @@ class Train(ViewerOptions, TrainOptions, TrainFiles):
         """
         from ..opening import open_dataset
         from ..run import check_new
+        from ..training import fit
         from ..training.beginning import begin_run, check_source
         from .outcome import show_outcome
         from .view import end_training, keep_showing, watching
@@ -156,12 +152,14 @@ class Train(ViewerOptions, TrainOptions, TrainFiles):
         check_source(self.scene, self.method)
         data: Any = open_dataset(posed(self.scene), methods.find(self.method).learns_from, **self.of_dataset)
         name = self.chosen(data)
-        begun = begin_run(name, data, method_config(self, name), device, self, self.output)
-        with watching(self, begun.method, data, begun.run) as viewer:
-            outcome = begun.fit(self.pause_at, viewer or watch)
-            show_outcome(begun.run, outcome, begun.method, data, end_training(viewer, begun.method))
+        run, method, budget = begin_run(name, data, method_config(self, name), device, self, self.output)
+        with watching(self, method, data, run) as viewer:
+            with run.kept_if_learnt():
+                seed, looking = run.settings.seed, viewer or watch
+                outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
+            show_outcome(run, outcome, method, data, end_training(viewer, method))
             keep_showing(viewer if self.stay else None, outcome.signal)
-        return begun.run.folder, exit_code(outcome.signal)
+        return run.folder, exit_code(outcome.signal)
 
     def chosen(self, data: Any) -> str:
         """Name of the method. The word `surface`, without options of the method, depends on the scene."""

@@ -38,11 +38,6 @@ class Cleaned:
     removed: dict[str, int]
     picture: Path
 
-    @property
-    def after(self) -> int:
-        """Gaussians that stay."""
-        return self.before - sum(self.removed.values())
-
 
 def clean(
     opened: Opened,

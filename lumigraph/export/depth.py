@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +25,6 @@ MAX_LEVEL = 65534  # of 16 bits; 0 and 65535 stand for unknown depth
 SHEET = "depth.png"
 
 
-@dataclass(frozen=True)
-class ComparedPair:
-    """Two photographs that were compared: the left one's name, baseline in units of the capture, disparities in pixels,
-    and the share of trusted pixels whose depth is sure."""
-
-    left: str
-    baseline: float
-    disparities: tuple[int, int]
-    sure: float
-
-
 def export_depth(scene: Scene, folder: Path, options: DepthOptions = DepthOptions()) -> list[DepthMap]:
     """Write depth maps of the photographs by multi-view stereo, and return them."""
     maps = multi_view_depth(scene, options.size, views=options.views or len(scene))
@@ -44,8 +32,13 @@ def export_depth(scene: Scene, folder: Path, options: DepthOptions = DepthOption
     return maps
 
 
-def export_pair(scene: Scene, folder: Path, names: tuple[str, str], options: DepthOptions) -> ComparedPair:
-    """Write the depth of the left one of two photographs, by name or number, by rectification and matching."""
+def export_pair(
+    scene: Scene, folder: Path, names: tuple[str, str], options: DepthOptions
+) -> tuple[str, float, tuple[int, int], float]:
+    """Write the depth of the left one of two photographs, by name or number, by rectification and matching.
+
+    Returns the left one's name, the baseline in units of the capture, the disparities and the share of sure pixels.
+    """
     first, second = (scene.find(name) for name in names)
     pair, found = pair_depth(scene, first, second, options.size)
     left = first if bool((pair.left.pose[:, 3] == scene.cameras.position[first]).all()) else second
@@ -53,8 +46,7 @@ def export_pair(scene: Scene, folder: Path, names: tuple[str, str], options: Dep
     sure = float(seen.solid[pair.left.trust > 0.5].float().mean())
     write_depth(folder, scene, [seen], pair_sheet(scene.source, names, pair, found))
     begin, count = pair.disparities
-    baseline = pair.baseline * scene.frame.to_source.scale
-    return ComparedPair(scene.names[left], baseline, (begin, begin + count - 1), sure)
+    return scene.names[left], pair.baseline * scene.frame.to_source.scale, (begin, begin + count - 1), sure
 
 
 def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap], sheet: Image.Image | None = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -41,24 +41,14 @@ DEFAULT_FPS = 30.0  # frames per second
 PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, for the range of depth
 
 
-@dataclass(frozen=True)
-class Rendered:
-    """A film that was rendered: its file, the name of its path, frames a second, and the contents of its JSON file."""
-
-    file: Path
-    path: str
-    fps: float
-    about: dict[str, Any]
-
-
 def render_film(
     loaded: Loaded,
     file: Path | None = None,
     options: FilmOptions = FilmOptions(),
     animations: Iterable[str] = (),
     overwrite: bool | None = None,
-) -> Rendered:
-    """Render a film of what is loaded.
+) -> tuple[Path, str, dict[str, Any]]:
+    """Render a film of what is loaded. Returns its file, the name of its path, and the contents of its JSON file.
 
     file: None for one that is called after the path, in the opened run's folder of films
     animations: controls that change over the film, NAME=A:B
@@ -75,7 +65,7 @@ def render_film(
     cameras = film_cameras(loaded.cameras, loaded.frame, flight or path, options.frames, size)
     stations = stations_of(opened, loaded.method, animations)
     shown = animated(loaded.method, stations, len(cameras)) if stations else loaded.method
-    return Rendered(file, path, fps, film(shown, cameras, file, replace(options, fps=fps)))
+    return file, path, film(shown, cameras, file, replace(options, fps=fps))
 
 
 def read_path(options: FilmOptions) -> CameraPath | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -24,21 +23,13 @@ SPAN = 0.1  # width of the grid, in distances of the focal plane, where none is 
 ABOUT = "lightfield.json"
 
 
-@dataclass(frozen=True)
-class WrittenLightField:
-    """A light field that was written: its file or folder, number of views, and in the unit of exports the distance of
-    the focal plane and the width of the grid."""
-
-    path: Path
-    views: int
-    focus: float
-    span: float
-
-
 def export_light_field(
     loaded: Loaded, path: Path, options: LightFieldOptions = LightFieldOptions(), overwrite: bool | None = None
-) -> WrittenLightField:
-    """Write a folder of pictures; or a quilt for a path that ends in .png, to whose name its layout is added."""
+) -> tuple[Path, float, float]:
+    """Write a folder of pictures; or a quilt for a path that ends in .png, to whose name its layout is added.
+
+    Returns what was written, and in the unit of exports the distance of the focal plane and the width of the grid.
+    """
     method, unit = loaded.method, loaded.frame.to_export.scale
     camera = loaded.camera(options.view)
     camera = camera.resized(options.size / int(camera.size.max())).to(method.device)
@@ -46,13 +37,13 @@ def export_light_field(
     span = options.span / unit if options.span else SPAN * focus
     if path.suffix.lower() != ".png":
         write_light_field(path, method, camera, options.grid, span / (options.grid - 1), focus, loaded.frame)
-        return WrittenLightField(path, options.grid**2, focus * unit, span * unit)
+        return path, focus * unit, span * unit
     columns, rows = options.quilt
     width, height = camera.size[0].tolist()
     path = path.with_name(f"{path.stem}_qs{columns}x{rows}a{width / height:.2f}.png")
     claim(path, "quilt", overwrite, [loaded.opened.path])
     save_picture(path, quilt(method, camera, columns, rows, span / (columns * rows - 1), focus), "quilt")
-    return WrittenLightField(path, columns * rows, focus * unit, span * unit)
+    return path, focus * unit, span * unit
 
 
 def focal_distance(method: Method, camera: Camera) -> float:

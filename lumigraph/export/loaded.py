@@ -83,11 +83,6 @@ class Loaded:
         return self.cameras["train"] if self.opened.photographed else None
 
     @property
-    def surveyors(self) -> Camera:
-        """Cameras that surfaces are looked at with; see `Opened.survey`."""
-        return self.opened.survey(self.cameras["train"])
-
-    @property
     def crop(self) -> Crop | None:
         """The crop in the scene's frame; None where there is none."""
         return self.part.crop(self.frame)

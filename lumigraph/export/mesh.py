@@ -65,8 +65,8 @@ def export_mesh(loaded: Loaded, options: MeshOptions = MeshOptions()) -> tuple[M
     """The mesh of what is loaded, in the frame of exports, and the source of its surface as text."""
     loaded = loaded.still
     why = best_way(loaded.method)[1] if options.way == "auto" else f"{options.way}, as --from says"
-    photographs = photographs_of(loaded.opened, options)
-    mesh = extract_mesh(loaded.without_floaters(), loaded.surveyors, options, loaded.crop, photographs)
+    cameras, photographs = loaded.opened.survey(loaded.cameras["train"]), photographs_of(loaded.opened, options)
+    mesh = extract_mesh(loaded.without_floaters(), cameras, options, loaded.crop, photographs)
     return mesh.in_source(loaded.frame), why
 
 

@@ -49,8 +49,8 @@ class PointCloud:
 
 def export_points(loaded: Loaded, options: PointsOptions = PointsOptions()) -> PointCloud:
     """Points of what is loaded, in the frame of exports."""
-    still = loaded.still
-    points = extract_points(still.without_floaters(), still.surveyors, options, still.crop)
+    still, surveyors = loaded.still, loaded.opened.survey(loaded.cameras["train"])
+    points = extract_points(still.without_floaters(), surveyors, options, still.crop)
     return points.in_source(loaded.frame)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from ..camera import Camera
@@ -23,12 +23,7 @@ from .page import backdrop, mesh_page, moving_page, splats_page, views_page, vol
 MAX_FACES = 300_000  # triangles of a mesh in a page, about 4 MB
 
 
-@dataclass(frozen=True)
-class Page:
-    """Contents of a page that was written, in words and in numbers."""
-
-    holds: str
-    counts: dict[str, int]
+Page = tuple[str, dict[str, int]]  # contents in words and in numbers
 
 
 def export_page(
@@ -58,7 +53,7 @@ def page_of_splats(loaded: Loaded, path: Path, options: PageOptions, opening: Op
         moving_page(path, moving, opening)
         still = len(moving) - moving.moving
         held = f"{still:,} Gaussians that stand still, {moving.moving:,} spans of those that move"
-        return Page(held, {"still": still, "moving": moving.moving})
+        return held, {"still": still, "moving": moving.moving}
     gaussians = loaded.gaussians()
     splats_page(path, gaussians, opening)
     return Page(f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}", {"gaussians": len(gaussians)})
@@ -71,13 +66,13 @@ def page_of_still(
     if kind == "volume":
         volume, held = browsable(loaded.method, options.degree)
         volume_page(path, volume, opening)
-        return Page(held, {name: volume.settings[name] for name in ("leaves", "blocks") if name in volume.settings})
+        return held, {name: volume.settings[name] for name in ("leaves", "blocks") if name in volume.settings}
     if kind == "views":
         views_page(path, loaded.kept_method(), cameras, opening, options)
-        return Page(f"{options.views} views", {"views": options.views})
+        return f"{options.views} views", {"views": options.views}
     mesh = extract_mesh(loaded.without_floaters(), cameras, MeshOptions(faces=MAX_FACES), loaded.crop)
     mesh_page(path, mesh, opening)
-    return Page(f"{len(mesh.faces):,} triangles", {"triangles": len(mesh.faces)})
+    return f"{len(mesh.faces):,} triangles", {"triangles": len(mesh.faces)}
 
 
 def kind_of(loaded: Loaded, options: PageOptions, octree: object) -> str:

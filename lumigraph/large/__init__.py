@@ -10,28 +10,11 @@ opening              open runs, in blocks or not, and all that opens like a run
 alignment            one appearance and one exposure for all blocks
 """
 
-from typing import TYPE_CHECKING
-
-from ..system.lazy import lazily
-
-if TYPE_CHECKING:
-    from .alignment import align_appearance as align_appearance
-    from .block_cache import Nearby as Nearby
-    from .block_run import BlockRun as BlockRun
-    from .compositing import InBlocks as InBlocks
-    from .compositing import merged as merged
-    from .opening import open_any as open_any
-    from .opening import open_run as open_run
-    from .weights import Mixing as Mixing
-
-HOMES = {
-    "align_appearance": "alignment",
-    "Nearby": "block_cache",
-    "BlockRun": "block_run",
-    "InBlocks": "compositing",
-    "merged": "compositing",
-    "open_any": "opening",
-    "open_run": "opening",
-    "Mixing": "weights",
-}
-__getattr__ = lazily(__name__, HOMES)
+from .alignment import align_appearance as align_appearance
+from .block_cache import Nearby as Nearby
+from .block_run import BlockRun as BlockRun
+from .compositing import InBlocks as InBlocks
+from .compositing import merged as merged
+from .opening import open_any as open_any
+from .opening import open_run as open_run
+from .weights import Mixing as Mixing

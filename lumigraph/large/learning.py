@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +17,14 @@ from ..files.names import next_free
 from ..opening import kind_of
 from ..readers import Places
 from ..system.memory import free_memory
-from ..training.options import TrainOptions
+from ..training.options import BlockOptions, TrainOptions
 from .layout import MIN_LARGE_VIEWS
-from .options import BlockOptions
 from .plan import DONE_FILE, PLAN_FILE, Plan
-from .planning import BlockRecipe, begin, difference, make_plan, place_of, survey
+from .planning import SCENE_OPTIONS, begin, difference, make_plan, place_of, survey
 from .training import Workers, update
 from .worker import Ended
 
 MEMORY_BYTES = 2 << 30  # bytes reserved for a block
-OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 
 
 def places_in_blocks(source: str, train: TrainOptions, blocks: BlockOptions) -> Places | None:
@@ -44,15 +41,6 @@ def places_in_blocks(source: str, train: TrainOptions, blocks: BlockOptions) -> 
     return places
 
 
-@dataclass(frozen=True)
-class BegunBlocks:
-    """A run in blocks that has begun: its folder, its plan, and who trains its blocks."""
-
-    folder: Path
-    plan: Plan
-    workers: Workers
-
-
 def begin_blocks(
     source: str,
     places: Places,
@@ -62,32 +50,27 @@ def begin_blocks(
     train: TrainOptions,
     blocks: BlockOptions,
     output: Path | None = None,
-) -> BegunBlocks:
-    """Begin a run in blocks, or go on with the latest one of the same plan.
+) -> tuple[Path, Plan, Workers]:
+    """Begin a run in blocks, or go on with the latest one of the same plan. Returns its folder, plan and workers.
 
-    method, config: of the user's method; the blocks' own is that of the options
+    config: of the method of the blocks, which is the user's unless the options name another
     """
     learner, here = methods.check(blocks.field or method), blocks.address is None
-    seed, budget = getattr(config, "seed", train.seed), given_budget(train.steps, train.seconds, train.quality)
-    options = {name: getattr(train, name) for name in OPTIONS}
-    recipe = BlockRecipe(learner, config, options, budget, train.quality, seed, str(device), here)
-    plan = make_plan(source, places, blocks.blocks or "auto", recipe)
+    plan = make_plan(source, places, learner, config, train, blocks, str(device))
     folder = output or unfinished(f"runs/{scene_name(source)}-{methods.check(method)}", plan)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = blocks.workers
     cpus = max(1, cores // count) if count else 1
     plan = begin(folder, plan, places, None if here and count is None else cpus)
     memory = min(MEMORY_BYTES, free_memory() // (2 * count)) if here and count else MEMORY_BYTES
-    return BegunBlocks(
-        folder, plan, Workers(count, blocks.address, cpus, 1.0 if device.type == "cuda" else 0.0, memory)
-    )
+    return folder, plan, Workers(count, blocks.address, cpus, 1.0 if device.type == "cuda" else 0.0, memory)
 
 
 def learn_again(run: Path, source: str, train: TrainOptions, blocks: BlockOptions) -> Ended:
     """Learn a block of a run again, from the photographs of a source; see `update`."""
     if blocks.blocks is None or not blocks.blocks.isdigit():
         raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
-    options = {name: getattr(train, name) for name in OPTIONS}
+    options = {name: getattr(train, name) for name in SCENE_OPTIONS}
     budget = given_budget(train.steps, train.seconds, train.quality)
     return update(run, blocks.blocks, source, survey(source, train.reader), options, budget)
 

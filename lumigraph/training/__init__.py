@@ -1,8 +1,7 @@
 """Training: the loop, its display, and the verdict on its outcome."""
 
-from typing import TYPE_CHECKING
-
-from ..system.lazy import lazily
+import importlib
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .loop import Clock as Clock
@@ -13,5 +12,7 @@ if TYPE_CHECKING:
     from .loop import rehearse as rehearse
     from .loop import set_learning_rate as set_learning_rate
 
-NAMES = "Clock", "Descent", "advance", "finite", "fit", "rehearse", "set_learning_rate"
-__getattr__ = lazily(__name__, dict.fromkeys(NAMES, "loop"))
+
+def __getattr__(name: str) -> Any:
+    """Name of the loop, which is loaded when it is first asked for: the options need no PyTorch."""
+    return getattr(importlib.import_module(".loop", __name__), name)

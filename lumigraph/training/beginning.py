@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from ..files.names import next_free
 from ..method import Method
 from ..opening import confirm, kind_of
 from ..run import Run, build, check_new
-from .loop import Outcome, Watch, fit
 from .options import DEFAULT_SECONDS, TrainOptions
 
 
@@ -29,27 +27,13 @@ def check_source(scene: str, method: str) -> None:
     check_kind(methods.check(method), kind.learns_from, found, scene, methods.learning_from)
 
 
-@dataclass(frozen=True)
-class BegunRun:
-    """A run that has begun, with its method, its data and its budget."""
-
-    run: Run
-    method: Method
-    data: Dataset
-    budget: Budget
-    seed: int
-
-    def fit(self, pause_at: int | None = None, watch: Watch | None = None) -> Outcome:
-        """Train; a run that learnt nothing is not kept."""
-        with self.run.kept_if_learnt():
-            budget, seed = self.budget, self.seed
-            return fit(self.method, self.data, self.run, budget=budget, seed=seed, pause_at=pause_at, watch=watch)
-
-
 def begin_run(
     name: str, data: Dataset, config: Any, device: torch.device, options: TrainOptions, output: Path | None = None
-) -> BegunRun:
-    """Begin a run of a method on its data. output: None for the next free runs/SCENE-METHOD-N"""
+) -> tuple[Run, Method, Budget]:
+    """Begin a run of a method on its data. output: None for the next free runs/SCENE-METHOD-N
+
+    Returns it with its method, before any training, and its budget.
+    """
     output = output or next_free(f"runs/{scene_name(data.source)}-{name}")
     check_new(output)
     seed = getattr(config, "seed", options.seed)
@@ -60,4 +44,4 @@ def begin_run(
         steps = method.steps_for(quality, data) if quality else None
         budget = Budget(steps, quality=quality) if quality else Budget(seconds=DEFAULT_SECONDS)
     run = Run.create(output, method, data, seed=seed, options=options.of_dataset, budget=budget.to_json())
-    return BegunRun(run, method, data, budget, seed)
+    return run, method, budget

@@ -1,4 +1,4 @@
-"""Options of training, without PyTorch."""
+"""Options of training, whole or in blocks, without PyTorch."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from tyro.conf import arg
+
 from ..budget import Quality, about_quality, given_budget
 from ..files.options import DeviceOption, ReaderOption, SeedOption, StepsOption, option
-from ..files.ranges import Count, Downscale, Scales, Seconds, Steps
+from ..files.ranges import Count, Downscale, Positive, Scales, Seconds, Steps
 
 DEFAULT_SECONDS = 60.0
+TRACKED_SIDE = 320  # pixels along the longer side of a frame, about, where the user says nothing
 
 
 @dataclass(frozen=True)
@@ -70,3 +73,46 @@ class ResumeOptions:
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """Options of tracking a depth camera."""
+
+    frames: Annotated[Count | None, option("N", "all")] = None
+    """Track only the first frames."""
+    downscale: Annotated[Downscale | None, option("N", f"to about {TRACKED_SIDE} pixels")] = None
+    """Reduce frames by this whole number; a larger one is faster, and maps less detail."""
+    extent: Annotated[Positive | None, option("M", "1.5 times the farthest depth of the first frame")] = None
+    """Half-size of the mapped box around the first camera, in metres; larger holds more, and less detail."""
+    steps_after: Annotated[Steps | None, option("N", "none")] = None
+    """Steps of mapping after the last frame; more give a better map."""
+    reader: ReaderOption = None
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
+    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
+    """Stop after this number of frames as if interrupted."""
+
+
+@dataclass(frozen=True)
+class BlockOptions:
+    """A large scene is trained in blocks, each a run of its own; from few photographs one block, an ordinary run.
+
+    --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After
+    Ctrl-C, a crash or a lost machine the same command continues; finished blocks are kept. RUN/blocks.png shows the
+    plan. `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting,
+    trains each block with another method; for clouds, RUN/cloud.ply joins each block's own cell.
+    """
+
+    blocks: Annotated[str | None, option("auto|N|FILE", "auto from 200 photographs on, else one block")] = None
+    """Positions of blocks: auto (street crossings, or evenly spread), a number of evenly spread ones, or a JSON file in
+    the frame of the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
+    workers: Annotated[Count | None, option("N", "1, in this process")] = None
+    """Number of blocks to train at a time on this machine, with Ray."""
+    address: Annotated[str | None, option("HOST:PORT", "this machine")] = None
+    """Train blocks on an existing Ray cluster; --output must be on storage that all its machines share."""
+    into: Annotated[Path | None, option("RUN", "a new run")] = None
+    """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
+    field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
