@@ -474,6 +474,7 @@ def test_an_export_shows_what_was_told(trained, tmp_path):
 
 def test_photographs_are_named(tmp_path):
     """A control that wants a photograph takes its name as well as its number."""
+    from lumigraph.export.loaded import Loaded
 
     scene = tiny.scene()
     made = ngp(scene, exposure_correction="yes", refine_cameras=True)

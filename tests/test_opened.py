@@ -12,6 +12,7 @@ from balls import RED, Splatted
 from budgets import budget
 
 import lumigraph
+from lumigraph.commands import render
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.film import film

@@ -33,7 +33,7 @@ COMMANDS = {
     "export points RUN OUT.ply": "lumigraph.export.points.render_depth_maps",
     "export panorama RUN OUT.png": "lumigraph.export.panorama.panorama",
     "export stereo RUN OUT.png": "lumigraph.export.panorama.stereo_pair",
-    "export web RUN OUT.html": "lumigraph.export.shared_page.views_page",
+    "export web RUN OUT.html": "lumigraph.export.page.views_page",
     "export splats RUN OUT.ply": "lumigraph.large.open_any",
     "compose RUN RUN --output OUT.json": "lumigraph.large.open_any",
     "explain ray RUN": "lumigraph.lab.explain.ray.along_ray",

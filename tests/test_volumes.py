@@ -141,7 +141,7 @@ def test_a_baked_run_is_seen_as_it_renders(grid, tmp_path, window, capsys, name,
 
 
 def test_a_field_becomes_an_octree_on_the_way(grid, tmp_path, capsys, monkeypatch):
-    quick = lambda *told, **more: convert(*told[:3], told[4], **small("plenoctrees", 4))  # noqa: E731
+    quick = lambda *told, **more: convert(*told[:3], device=told[4], **small("plenoctrees", 4))  # noqa: E731
     monkeypatch.setattr(lumigraph.derive.conversion, "convert", quick)
     assert main(["export", "web", str(grid), str(tmp_path / "page.html")]) == 0
     told = capsys.readouterr().out

@@ -38,10 +38,10 @@ class Clean(Reports, CleanOptions, CleanFiles):
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def of(self, opened: Any) -> Result:
-        from ..derive.cleaning import clean
+        from ..derive.parts import clean
 
-        made = clean(opened, self.output, self, self.overwrite, choose_device(self.device))
-        rows = {"Gaussians": f"{made.before - sum(made.removed.values()):,} of {made.before:,} stay"}
-        rows |= {reason: f"{count:,} went" for reason, count in made.removed.items()}
-        rows |= {"saved": str(self.output), "picture": str(made.picture), "next": f"lumigraph view {self.output}"}
+        before, removed, picture = clean(opened, self.output, self, self.overwrite, choose_device(self.device))
+        rows = {"Gaussians": f"{before - sum(removed.values()):,} of {before:,} stay"}
+        rows |= {reason: f"{count:,} went" for reason, count in removed.items()}
+        rows |= {"saved": str(self.output), "picture": str(picture), "next": f"lumigraph view {self.output}"}
         return Result(self.output, rows=rows)

@@ -88,38 +88,15 @@ def held(command: Any) -> Any:
     return command
 
 
-KINDS = {  # the class of each command, in the module of its name
-    "app": "AppCommand",
-    "demo": "Demo",
-    "capture": "CaptureCommand",
-    "depth": "Depth",
-    "photo3d": "Photo3DCommand",
-    "jump": "Jump",
-    "train": "Train",
-    "track": "Track",
-    "resume": "Resume",
-    "infer": "Infer",
-    "draw": "Draw",
-    "eval": "Eval",
-    "render": "Render",
-    "view": "ViewCommand",
-    "clean": "Clean",
-    "segment": "Segment",
-    "compose": "Compose",
-    "canonicalise": "Canonicalise",
-    "compress": "Compress",
-    "convert": "Convert",
-    "export": "Export",
-    "report": "Report",
-    "explain": "Explain",
-    "info": "Info",
-    "methods": "Methods",
-    "bench": "Bench",
-    "gallery": "Gallery",
-}
+NAMES = (
+    "app demo capture depth photo3d jump train track resume infer draw eval render "
+    "view clean segment compose canonicalise compress convert export report explain info methods bench gallery"
+).split()
+OTHER_KINDS = {"app": "AppCommand", "capture": "CaptureCommand", "photo3d": "Photo3DCommand", "view": "ViewCommand"}
 COMMANDS: dict[str, type] = {
-    name: getattr(importlib.import_module(f".{name}", __package__), kind) for name, kind in KINDS.items()
-}
+    name: getattr(importlib.import_module(f".{name}", __package__), OTHER_KINDS.get(name, name.capitalize()))
+    for name in NAMES
+}  # each in the module of its name
 DECISIVE = {"device": "auto", "preset": "auto", "field": ""}  # options on which defaults of others depend
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 

@@ -31,16 +31,18 @@ class Compress(Reports, CompressOptions, Output):
     """New folder for the smaller run."""
     device: DeviceOption = "auto"
 
-    def made(self) -> Result:
-        from ..run import Run
-
-        return self.of(Run(self.run_folder))
-
     def of(self, opened: Any) -> Result:
         from ..derive.compression import compress
+        from ..run import Run
 
         try:
-            made = compress(opened, self.output, self, choose_device(self.device), show=True)
+            made = compress(
+                opened if isinstance(opened, Run) else Run(self.run_folder),
+                self.output,
+                self,
+                choose_device(self.device),
+                show=True,
+            )
         except KeyboardInterrupt:
             say(f"Stopped; {self.run_folder} is as it was and nothing else is kept, so the same command begins anew")
             raise

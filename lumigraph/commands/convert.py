@@ -17,7 +17,6 @@ from .compress import size
 from .options import DeviceOption, needed
 from .results import Reports, Result
 
-NAMELESS = "Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW"
 LIST_WIDTH, INDENT = 80, 12  # letters
 
 
@@ -55,13 +54,15 @@ class Convert(Reports, ConvertOptions, ConvertFiles):
         if self.list:
             print(listed())
             return 0
+        if self.source is None or self.method is None or self.output is None:
+            raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")
         return super().run()
 
     def of(self, opened: Any) -> Result:
         from .. import methods
         from ..derive.conversion import convert
 
-        assert self.source is not None and self.method is not None and self.output is not None  # by `check`
+        assert self.source and self.method and self.output  # by `run`
         name, device = methods.check(self.method), choose_device(self.device)
         try:
             made = convert(opened, name, self.output, self, device, True, method_config(self, name))
@@ -74,12 +75,6 @@ class Convert(Reports, ConvertOptions, ConvertFiles):
         rows |= {"cost": cost(made), "learnt from": made.learnt_from, "saved": str(self.output)}
         rows |= {"verdict": verdict(made, self.source, self.output), "next": typed("view", self.output)}
         return Result(self.output, rows=rows)
-
-    def check(self) -> None:
-        """Raises LumigraphError for a missing name, and for more than one way to say how long."""
-        super().check()
-        if not self.list and None in (self.source, self.method, self.output):
-            raise LumigraphError(NAMELESS)
 
 
 def kept(output: Path) -> str:

@@ -65,7 +65,7 @@ class Draw:
         from ..method.capabilities import CanDraw, HasViewpoint, can, needs
         from ..metrics.distribution import FeatureNetwork, RandomFeatures, load_inception
         from ..run import Run
-        from ..run.controlled import controlled
+        from ..run.opened import controlled
         from ..system.progress import track
 
         seeds = numbers(self.seeds)

@@ -30,11 +30,6 @@ class Eval(Reports, EvaluationOptions):
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def made(self) -> Evaluation:
-        from ..large import open_run
-
-        return self.of(open_run(self.run_folder))
-
     def of(self, opened: Any) -> Evaluation:
         from ..evaluation.run import claim_evaluation, evaluate_run, stem
         from ..large import open_run
@@ -42,14 +37,12 @@ class Eval(Reports, EvaluationOptions):
         from ..metrics.detail import FineDetail
         from ..metrics.rows import last_psnr
         from ..run import Trained
-        from ..run.controlled import controlled
         from ..run.records import read_evaluation
         from .outcome import beside_training, next_commands
 
         run = opened if isinstance(opened, Trained) else open_run(self.run_folder)
         claim_evaluation(run, self, self.overwrite)
-        method, data = run.method_and_data(choose_device(self.device), self.scene, self.split)
-        method = controlled(run, method, self.settings)
+        method, data = run.method_and_data(choose_device(self.device), self.settings, self.scene, self.split)
         result = evaluate_run(run, method, data, self)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         if "detail" in result:

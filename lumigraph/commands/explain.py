@@ -158,7 +158,7 @@ class ExplainLightField:
         from ..files import claim
         from ..lab.explain.light_field import draw, measure, seen_along
         from ..run import Run
-        from ..run.controlled import controlled
+        from ..run.opened import controlled
 
         run = Run(self.run_folder)
         folder = self.output or run.folder / "lightfield"
@@ -211,7 +211,7 @@ class ExplainRay:
         from ..lab.explain.ray import along_ray
         from ..lab.explain.ray_figure import ray_figure
         from ..run import Run
-        from ..run.controlled import controlled
+        from ..run.opened import controlled
         from ..system.progress import counting
 
         run = Run(self.run_folder)

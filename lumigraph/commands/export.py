@@ -147,7 +147,7 @@ class ExportSplats(Reports, SplatsOptions, Files):
     def of(self, opened: Any) -> Exported:
         from ..exchange import check_ending, claim_splats, size_of
         from ..exchange.fourdgs import is_moving_file
-        from ..export.splats import export_moving, export_splats
+        from ..export.loaded import export_moving, export_splats
 
         if is_moving_file(self.output):
             claim(self.output, "splats", self.overwrite, [self.source])
@@ -427,7 +427,7 @@ class ExportWeb(Reports, PageOptions, Files):
     device: DeviceOption = "auto"
 
     def of(self, opened: Any) -> Exported:
-        from ..export.shared_page import export_page
+        from ..export.page import export_page
 
         claim(self.output, "page", self.overwrite, [self.source])
         loaded, rows = self.loaded(opened), dict[str, str]()

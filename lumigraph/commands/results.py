@@ -105,8 +105,7 @@ class Output:
 
 
 class Reports(ABC):
-    """A command on something that opens: `of` works on it and returns a result, `made` opens its `source`, `run` prints
-    the rows."""
+    """A command on something that opens: `of` works on it and returns a result, `made` opens it, `run` prints."""
 
     @abstractmethod
     def of(self, opened: Any) -> Any:
@@ -116,7 +115,7 @@ class Reports(ABC):
         """Open the source, do the work, and return a Result."""
         from ..large import open_any
 
-        return self.of(open_any(self.source))  # type: ignore[attr-defined]
+        return self.of(open_any(getattr(self, "source", None) or self.run_folder))  # type: ignore[attr-defined]
 
     def loaded(self, opened: Any) -> Any:
         """Opened source with its method, as the options of the command have it."""

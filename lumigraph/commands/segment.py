@@ -43,13 +43,13 @@ class Segment(Reports, SegmentOptions, SegmentFiles):
     device: DeviceOption = "auto"
 
     def of(self, opened: Any) -> Result:
-        from ..derive.segmenting import segment
+        from ..derive.parts import segment
 
         strokes = list(zip(self.strokes, self.view, strict=True))
-        made = segment(opened, strokes, self.output, self, self.overwrite, choose_device(self.device))
-        kind = "Gaussians" if made.is_cloud else "voxels"
-        rows = {kind: f"{made.chosen:,} of {made.of:,} selected", "saved": str(self.output)}
-        return Result(self.output, rows=rows | {"picture": str(made.picture)})
+        device = choose_device(self.device)
+        chosen, kind, picture = segment(opened, strokes, self.output, self, self.overwrite, device)
+        rows = {kind: f"{int(chosen.sum()):,} of {len(chosen):,} selected", "saved": str(self.output)}
+        return Result(self.output, rows=rows | {"picture": str(picture)})
 
     def check(self) -> None:
         """Raises LumigraphError unless each picture of strokes has its photograph."""

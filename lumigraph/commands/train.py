@@ -35,11 +35,11 @@ def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | No
     """Train all blocks of a scene. Returns the run and the exit code; None for a scene that is learnt as a whole."""
     import torch
 
-    from ..large.learning import begin_blocks, learn_again, places_in_blocks
+    from ..large.training import begin_blocks, places_in_blocks, update
 
     source = posed(train.scene)
     if blocks.into is not None:
-        ended = learn_again(blocks.into, source, train, blocks)
+        ended = update(blocks.into, source, train, blocks)
         if ended.done is None:
             say("Stopped and saved; the same command goes on")
             return blocks.into, exit_code(ended.signal)

@@ -58,7 +58,7 @@ class ViewCommand:
 
 def page_of(opened: Any, method: Any, cameras: Any) -> Any:
     """A function that makes the page of a baked method; `None` for any other method, and before it is baked."""
-    from ..export.shared_page import browsable, is_baked
+    from ..export.page import browsable, is_baked
 
     if not is_baked(method):
         return None

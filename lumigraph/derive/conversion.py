@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +22,7 @@ from ..camera.rays import Rendering
 from ..datasets.dataset import check_kind
 from ..datasets.images import ImageStore
 from ..datasets.scene import Scene
-from ..errors import LumigraphError, LumigraphWarning
+from ..errors import LumigraphError
 from ..evaluation.options import EvaluationOptions
 from ..evaluation.views import evaluate, warm_up
 from ..geometry import evenly, look_at
@@ -74,7 +73,8 @@ def convert(
     kind, device = methods.find(name), torch.device(device)
     aim = aim.limited(kind.taught_steps)
     check(source, kind)
-    scene, cameras, teacher = photographs(source, aim.scene), source.cameras(), source.method(device)
+    scene = source.photographs(aim.scene, "It learns from renderings instead")
+    cameras, teacher = source.cameras(), source.method(device)
     how = way(type(teacher), kind)
     assert how is not None  # for `check` has asked
     student = going_on[0].new_method(device) if going_on else new_student(kind, teacher, device, config, aim.seed)
@@ -198,19 +198,6 @@ def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, Conversion
     if begun is None or (begun.source, run.method_name) != (str(source.path.resolve()), name):
         return None
     return (run, begun) if Converted.read(output) is None else None
-
-
-def photographs(source: Opened, where: str | None) -> Scene | None:
-    """The photographs again; None where they are not at hand, and no other place is named."""
-    if source.open_scene is None:
-        return None
-    try:
-        return source.open_scene(where)
-    except LumigraphError as error:
-        if where is not None:
-            raise
-        warnings.warn(f"It learns from renderings instead, for {error}", LumigraphWarning, stacklevel=2)
-        return None
 
 
 def way(teacher: type[Method], student: type[Method]) -> Way | None:

@@ -29,7 +29,7 @@ from ..method.capabilities import HasGaussians, can
 from ..method.controls import Value
 from ..paths import film_cameras, fitting
 from ..paths.keyframes import CameraPath
-from ..run.controlled import stations_of
+from ..run.opened import stations_of
 from ..system.memory import ask_for_picture
 from ..system.progress import track
 from ..system.work import at_work

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool
@@ -15,6 +16,9 @@ from ..composition import FilteredCloud, PickedCloud, cropped
 from ..composition.floaters import STRENGTH, floaters
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
+from ..exchange import write_gaussians
+from ..exchange.fourdgs import write_moving
+from ..exchange.streamed_sog import Detail
 from ..gaussians import Gaussians
 from ..gaussians.cloud import gone, unwanted
 from ..gaussians.moving import MovingGaussians
@@ -22,8 +26,9 @@ from ..method import Method
 from ..method.capabilities import HasGaussians, HasMovingGaussians, can, needs
 from ..paths import Surroundings
 from ..run import Opened
-from ..run.controlled import at_one_moment, controlled
-from .options import Keeping, Scaling
+from ..run.files import SplatFile
+from ..run.opened import at_one_moment, controlled
+from .options import Keeping, Scaling, SplatsOptions
 
 
 @dataclass(frozen=True)
@@ -93,18 +98,23 @@ class Loaded:
         middle = view is None
         return train[Surroundings(train, self.frame).middle if middle else self.opened.find_view("train", view or "")]
 
-    def kept(self, gaussians: Gaussians, crop: Crop | None) -> Bool[Tensor, " gaussian"]:
-        """Mask of the Gaussians to keep. Raises LumigraphError if that is none."""
+    def unwanted(self, gaussians: Gaussians, crop: Crop | None) -> dict[str, Bool[Tensor, " gaussian"]]:
+        """Masks of the Gaussians to remove, by reason. Raises LumigraphError if none is left."""
         part = self.part
         strength = (STRENGTH if part.clean else 0.0) if part.strength is None else part.strength
-        floating = floaters(gaussians, self.photographers, self.frame, strength)
-        lost = gone(unwanted(gaussians, crop, part.max_scale, floating))
-        if len(gaussians) and lost.all():
+        reasons = unwanted(
+            gaussians, crop, part.max_scale, floaters(gaussians, self.photographers, self.frame, strength)
+        )
+        if len(gaussians) and gone(reasons).all():
             raise LumigraphError(
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
-                "or clean less"
+                "or a smaller --strength"
             )
-        return ~lost
+        return reasons
+
+    def kept(self, gaussians: Gaussians, crop: Crop | None) -> Bool[Tensor, " gaussian"]:
+        """Mask of the Gaussians to keep. Raises LumigraphError if that is none."""
+        return ~gone(self.unwanted(gaussians, crop))
 
     def gaussians(self) -> Gaussians:
         """Gaussians to keep, in the scene's frame. Raises LumigraphError if that is none."""
@@ -129,3 +139,41 @@ class Loaded:
     def without_floaters(self) -> Method:
         """All of the method but its floaters, for what crops by itself."""
         return replace(self, part=replace(self.part, box=None, sphere=None)).kept_method()
+
+
+def export_splats(
+    opened: Opened,
+    path: Path,
+    options: SplatsOptions = SplatsOptions(),
+    settings: Sequence[str] = (),
+    part: Keeping = Keeping(),
+    scaling: Scaling = Scaling(),
+) -> Gaussians:
+    """Write a cloud as it is at one moment, and return it. A splat file's own numbers stay as they are.
+
+    settings: controls, NAME=VALUE
+    """
+    if isinstance(opened, SplatFile):
+        if settings:
+            raise LumigraphError(f"{opened.path} is a file of Gaussians, which has no controls; leave out --set")
+        scaling.remember(opened)
+        cloud = opened.source_gaussians()
+        if part.crops or part.removes:
+            loaded = Loaded(opened, opened.ready("cpu"), {}, part)
+            cloud = cloud[loaded.kept(cloud, loaded.crop and loaded.crop.moved(opened.frame.to_source))]
+    else:
+        loaded = Loaded.of(opened, "cpu", settings, part, scaling)
+        cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix)
+    write_gaussians(path, cloud, Detail(**options.detail.given))
+    return cloud
+
+
+def export_moving(loaded: Loaded, path: Path, options: SplatsOptions = SplatsOptions()) -> MovingGaussians:
+    """Write every moment of a scene that moves, as .4dgs, and return it. Raises LumigraphError for levels of detail."""
+    if options.detail.given or options.detail.lod:
+        raise LumigraphError("A .4dgs has no levels of detail; leave out --lod and its options")
+    if "time" in loaded.method.settings:
+        raise LumigraphError("A .4dgs holds every moment; leave out --set time, or name a .spz for one of them")
+    moving = loaded.moving(options.duration)
+    write_moving(path, moving.transformed(loaded.frame.to_export.matrix))
+    return moving

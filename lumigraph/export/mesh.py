@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Literal
 
@@ -20,11 +19,10 @@ from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame, Scene
 from ..depth_maps import TSDF, DepthMap, Tolerance, agreed, fused_colours, hidden, measurements, render_depth_maps
-from ..errors import LumigraphError, LumigraphWarning
+from ..errors import LumigraphError
 from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasDensity, HasDistance, HasMesh, can, needs
-from ..run import Opened
 from ..system.progress import counting, track
 from ..system.work import at_work
 from .loaded import Loaded
@@ -65,24 +63,11 @@ def export_mesh(loaded: Loaded, options: MeshOptions = MeshOptions()) -> tuple[M
     """The mesh of what is loaded, in the frame of exports, and the source of its surface as text."""
     loaded = loaded.still
     why = best_way(loaded.method)[1] if options.way == "auto" else f"{options.way}, as --from says"
-    cameras, photographs = loaded.opened.survey(loaded.cameras["train"]), photographs_of(loaded.opened, options)
+    opened, gone = loaded.opened, "The texture is made of renderings" if options.texture else None
+    cameras = opened.survey(loaded.cameras["train"])
+    photographs = opened.photographs(options.scene, gone) if options.texture or opened.masked else None
     mesh = extract_mesh(loaded.without_floaters(), cameras, options, loaded.crop, photographs)
     return mesh.in_source(loaded.frame), why
-
-
-def photographs_of(opened: Opened, options: MeshOptions) -> Scene | None:
-    """The photographs, if their colours or masks are used; None, with a warning, where they are gone.
-    Raises LumigraphError if they are not where the options say."""
-    if opened.open_scene is None or not (options.texture or opened.masked):
-        return None
-    try:
-        return opened.open_scene(options.scene)
-    except LumigraphError as error:
-        if options.scene is not None:
-            raise
-        if options.texture:
-            warnings.warn(f"The texture is made of renderings, for {error}", LumigraphWarning, stacklevel=2)
-        return None
 
 
 @torch.no_grad()

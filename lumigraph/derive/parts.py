@@ -1,9 +1,8 @@
-"""Segmenting: a part of a scene that strokes on photographs select is extracted, deleted, recoloured or moved."""
+"""Parts: what strokes select of a scene is extracted, deleted, recoloured or moved; a cloud is cleaned or cropped."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +11,19 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from ..camera import Camera
+from ..camera import Camera, ring
 from ..camera.rays import Rendering
-from ..composition import mask_of
+from ..composition import PickedCloud, mask_of
+from ..composition.floaters import CANDIDATE_COLOUR
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
-from ..exchange import SUFFIXES, names_splats, write_gaussians
+from ..exchange import SUFFIXES, names_splats, place_of, write_gaussians
+from ..export.loaded import Loaded
+from ..export.options import Keeping
 from ..figures import Row, contact_sheet, save_picture
 from ..files import claim, claim_folder, replacing_folder
-from ..gaussians import joined
+from ..gaussians import Gaussians, joined
+from ..gaussians.cloud import gone, painted
 from ..geometry import Similarity, evenly
 from ..large import open_any
 from ..method import Method
@@ -40,23 +43,13 @@ from ..selection import (
 )
 from ..selection.cutting import cut, motion, tinted
 from ..system.progress import track
-from .options import SegmentOptions
+from .options import CleanOptions, SegmentOptions
 
 SIZE = 400  # pixels of the longer side of the pictures that compare
 TINT = (0.1, 1.0, 0.3)  # of the selected part in them
 UNKNOWN_STRIPES = 6  # pixels of the hatching where nothing is known
 MAX_VIEWS = 60  # photographs whose features are distilled, evenly chosen
 MASK_OPACITY = 0.5  # share of a pixel that shows the part, from which on a mask has it
-
-
-@dataclass(frozen=True)
-class Segmented:
-    """A part that was selected: its number of points, of how many, whether these are Gaussians, and the picture."""
-
-    chosen: int
-    of: int
-    is_cloud: bool
-    picture: Path
 
 
 def segment(
@@ -66,9 +59,10 @@ def segment(
     options: SegmentOptions = SegmentOptions(),
     overwrite: bool | None = None,
     device: torch.device | str = "auto",
-) -> Segmented:
+) -> tuple[Bool[Tensor, " point"], str, Path]:
     """Select a part by strokes, write the result of the options' action, and a picture of views before and after.
 
+    Returns the mask of the selected points, what these are, and the picture.
     strokes: picture of strokes, and name of the photograph that it was drawn on
     Raises LumigraphError for what has no photographs, and for strokes that select nothing or everything.
     """
@@ -99,7 +93,7 @@ def segment(
     result = None if action == "masks" else output
     sheet = before_and_after(opened, selection, chosen, cameras, result, action == "extract")
     save_picture(picture, sheet, "comparison", ours=picture.parent == output)
-    return Segmented(int(chosen.sum()), len(chosen), is_cloud, picture)
+    return chosen, "Gaussians" if is_cloud else "voxels", picture
 
 
 def check_result(
@@ -239,3 +233,46 @@ def hatched(
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     stripes = ((rows + columns) // UNKNOWN_STRIPES % 2).float()[..., None].expand(-1, -1, 3)
     return torch.where(where[..., None], 0.35 + 0.3 * stripes, rgb)
+
+
+def clean(
+    opened: Opened,
+    output: Path,
+    options: CleanOptions = CleanOptions(),
+    overwrite: bool | None = None,
+    device: torch.device | str = "auto",
+) -> tuple[int, dict[str, int], Path]:
+    """Write a cloud without floaters, cropped, as a run or a splat file, and a picture that compares.
+
+    Returns the number of its Gaussians before, the numbers of those removed by reason, and the picture.
+    """
+    check_output(opened, output, overwrite, [opened.path])
+    place = place_of(output)
+    picture = place.with_name(f"{place.name}.png") if names_splats(output) else output / "clean.png"
+    claim(picture, "comparison", overwrite, [opened.path])
+    loaded = Loaded.of(opened, device, part=Keeping(**vars(options.part), clean=True, strength=options.strength))
+    gaussians = needs(loaded.method, HasGaussians).gaussians()
+    reasons = loaded.unwanted(gaussians, loaded.crop)
+    which = gone(reasons)
+    counts = {reason: count for reason, some in reasons.items() if (count := int(some.sum()))}
+    sheet = cleaned_sheet(opened, gaussians, which)  # reads the cameras, so it comes before anything is written
+    save_picked(opened, ~which.cpu(), output, {"removed": counts})
+    save_picture(picture, sheet, "comparison")
+    return len(gaussians), counts, picture
+
+
+def cleaned_sheet(opened: Opened, gaussians: Gaussians, gone: Bool[Tensor, " gaussian"]) -> Image.Image:
+    """A sheet of some views: all Gaussians, the removed ones coloured, those that stay. Two are from afar, where
+    floaters show."""
+    shown = gaussians, painted(gaussians, gone, CANDIDATE_COLOUR), gaussians[~gone]
+    clouds = [PickedCloud(opened.frame, some) for some in shown]
+    around = ring(opened.frame.bounds, size=SIZE)
+    views = [around[i] for i in evenly(range(len(around)), 3)[:2]]
+    if opened.photographed:
+        own = opened.cameras()["train"]
+        views = [own[i] for i in evenly(range(len(own)), 4)[1:]] + views
+    rows = [
+        Row("", [cloud.render(camera.resized(min(1.0, SIZE / int(camera.size.max())))).rgb for cloud in clouds])
+        for camera in track(views, "Drawing before and after", len(views))
+    ]
+    return contact_sheet(opened.title, ("before", "removed Gaussians coloured", "after"), rows, SIZE)
