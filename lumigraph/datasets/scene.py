@@ -293,6 +293,20 @@ class Scene:
     def __len__(self) -> int:
         return len(self.names)
 
+    def find(self, name: str) -> int:
+        """Number of a photograph by its name, with or without its folder and ending, or by that number as text.
+
+        Raises LumigraphError if there is none, or several.
+        """
+        paths = [Path(x) for x in self.names]
+        for names in (self.names, [x.name for x in paths], [x.stem for x in paths], list(map(str, range(len(self))))):
+            if names.count(name) == 1:
+                return names.index(name)
+        shown = ", ".join([*self.names[:4], "..."] if len(self) > 4 else self.names)
+        raise LumigraphError(
+            f"{self.source} has no photograph {name!r}; there are {shown}, and numbers up to {len(self) - 1}"
+        )
+
     def __repr__(self) -> str:
         """Five lines: photographs, their sizes, the frame, what else is known, the source."""
         sizes = sorted({(int(w), int(h)) for w, h in self.cameras.size.tolist()}, reverse=True)

@@ -15,7 +15,6 @@ from .block_cache import Nearby as Nearby
 from .block_run import BlockRun as BlockRun
 from .compositing import InBlocks as InBlocks
 from .compositing import merged as merged
-from .opening import held_open as held_open
 from .opening import open_any as open_any
 from .opening import open_run as open_run
 from .weights import Mixing as Mixing

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -34,7 +35,7 @@ from ..opening import open_dataset
 from ..readers import Before, CapturePart
 from ..run.checkpoint import State
 from ..run.folder import Run
-from ..run.opened import Trained
+from ..run.opened import Trained, controlled
 from ..run.records import warn_of_changes
 from ..run.settings import Settings, Source
 from .block_cache import Nearby
@@ -221,6 +222,13 @@ class BlockRun(Trained):
     @property
     def learnt_from(self) -> Source:
         return self.plan.scene
+
+    def method_and_data(
+        self, device: torch.device | str, settings: Iterable[str] = (), source: str | None = None, split: str = "test"
+    ) -> tuple[Method, Scene]:
+        """Method by the exposures of the photographs that it will be given, and these."""
+        data = self.dataset(source, split)
+        return controlled(self, self.method(device, data.about.get("exposure")), settings), data
 
     @property
     def method_name(self) -> str:

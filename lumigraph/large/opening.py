@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
-from contextvars import ContextVar
 from pathlib import Path
 
 from ..errors import LumigraphError
@@ -16,24 +13,6 @@ from ..run.composition import CANONICAL_FORMAT, Canonicalised, Composition, Nest
 from ..run.files import MovingFile, SnergFolder, SplatFile
 from .block_run import BlockRun
 
-_held: ContextVar[Opened | None] = ContextVar("held", default=None)  # what `held_open` returns for its own path
-
-
-@contextlib.contextmanager
-def held_open(opened: Opened) -> Iterator[None]:
-    """Block in which `open_any` and `open_run` return this object for its path, with its loaded weights."""
-    token = _held.set(opened)
-    try:
-        yield
-    finally:
-        _held.reset(token)
-
-
-def held_at(path: Path) -> Opened | None:
-    """The object of `held_open`, if it has this path."""
-    held = _held.get()
-    return held if held is not None and held.path == path else None
-
 
 @reads()
 def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
@@ -44,8 +23,6 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     Raises LumigraphError, in one sentence, for anything else.
     """
     path = Path(path)
-    if within is None and (held := held_at(path)) is not None:
-        return held
     if fourdgs.is_moving_file(path):
         return MovingFile(path)
     if is_splat_file(path):
@@ -63,7 +40,4 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
 @reads()
 def open_run(path: Path | str) -> Trained:
     """A run, of one field or in blocks. Raises LumigraphError for a folder that is neither."""
-    held = held_at(Path(path))
-    if isinstance(held, Trained):
-        return held
     return BlockRun(path) if is_block_run(Path(path)) else Run(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from .. import files
-from ..budget import Budget
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files.plain import alike
@@ -21,10 +20,11 @@ from ..opening import read_capture
 from ..readers import Places, places_of
 from ..run import check_new, processor
 from ..run.folder import versions
+from ..training.options import DEFAULT_SECONDS, BlockOptions, TrainOptions
 from .layout import lay_out
 from .plan import BLOCKS_FOLDER, PLAN_FILE, TASK_FILE, Block, Plan, Task, source_of
 
-DEFAULT_SECONDS = 60.0  # per block
+SCENE_OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 PICTURE_FILE = "blocks.png"
 DRAWING_SIDE, SUPERSAMPLING = 1000, 3  # pixels of the longer side; supersampling factor
 MARGIN, HEADER_HEIGHT = 40, 60
@@ -39,51 +39,39 @@ def survey(source: str, reader: str | None = None) -> Places:
     return places_of(read_capture(source, reader))
 
 
-@dataclass(frozen=True)
-class BlockRecipe:
-    """Training of every block.
-
-    options: of `open_dataset` for the whole scene
-    budget:  of all blocks together, divided evenly; None for a minute each, or a quality
-    here:    whether the device is this machine's
-    """
-
-    method: str
-    config: Any
-    options: dict[str, Any]
-    budget: Budget | None = None
-    quality: str | None = None
-    seed: int = 0
-    device: str = "cpu"
-    here: bool = True
-
-    def budget_of_each(self, blocks: int) -> dict[str, Any]:
-        """Budget of each of `blocks` blocks."""
-        if self.quality:
-            return {"quality": self.quality}
-        if self.budget is None:
-            return {"seconds": DEFAULT_SECONDS}
-        if self.budget.steps is not None:
-            return {"steps": max(1, math.ceil(self.budget.steps / blocks))}
-        return {"seconds": self.budget.total / blocks}
-
-
-def make_plan(source: str, places: Places, wish: str, recipe: BlockRecipe) -> Plan:
-    """Plan of a scene: its blocks, see `lay_out`, and the training of each."""
-    blocks = lay_out(places, wish, source)
+def make_plan(
+    source: str,
+    places: Places,
+    method: str,
+    config: Any,
+    train: TrainOptions,
+    blocks: BlockOptions = BlockOptions(),
+    device: str = "cpu",
+) -> Plan:
+    """The plan of a scene: its blocks, see `lay_out`, and what each of them learns, by a method of its own."""
+    parts = lay_out(places, blocks.blocks or "auto", source)
     turn: Any = tuple(tuple(float(x) for x in row) for row in places.upright)
     return Plan(
-        recipe.method,
-        asdict(recipe.config),
-        source_of(source, recipe.options),
+        method,
+        asdict(config),
+        source_of(source, {name: getattr(train, name) for name in SCENE_OPTIONS}),
         turn,
-        blocks,
-        recipe.budget_of_each(len(blocks)),
-        recipe.seed,
-        recipe.device,
-        processor(torch.device(recipe.device)) if recipe.here else "machines of a cluster",
+        parts,
+        budget_of_each(train, len(parts)),
+        getattr(config, "seed", train.seed),
+        device,
+        processor(torch.device(device)) if blocks.address is None else "machines of a cluster",
         versions(),
     )
+
+
+def budget_of_each(train: TrainOptions, blocks: int) -> dict[str, Any]:
+    """Budget of one of so many blocks: the steps or seconds are shared out, and a quality is that of each."""
+    if train.quality:
+        return {"quality": train.quality}
+    if train.steps is not None:
+        return {"steps": max(1, math.ceil(train.steps / blocks))}
+    return {"seconds": DEFAULT_SECONDS if train.seconds is None else train.seconds / blocks}
 
 
 def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int | None = None) -> Plan:

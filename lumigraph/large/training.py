@@ -20,23 +20,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from .. import files, methods
-from ..budget import Budget
+from ..budget import given_budget
 from ..components.fields.appearance import Appearance
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
+from ..files import scene_name
 from ..files.locks import held
+from ..files.names import next_free
 from ..method.capabilities import HasGaussians, can
+from ..opening import kind_of
 from ..readers import Places
+from ..system.memory import free_memory
 from ..system.signals import Interrupt
+from ..training.options import BlockOptions, TrainOptions
 from .alignment import align_appearance
 from .block_cache import Nearby
 from .block_run import BlockRun
-from .layout import Disc, members
+from .layout import MIN_LARGE_VIEWS, Disc, members
 from .monitor import Watching, in_order
-from .plan import PLAN_FILE, TASK_FILE, Block, Done, Plan, Task, source_of
-from .planning import place_of, write_task
+from .plan import DONE_FILE, PLAN_FILE, TASK_FILE, Block, Done, Plan, Task, source_of
+from .planning import SCENE_OPTIONS, begin, difference, make_plan, place_of, survey, write_task
 from .worker import Conducted, Ended, finished, train_block, writable
 
 CLOUD_FILE = "cloud.ply"
@@ -108,22 +115,20 @@ def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
     return plan
 
 
-def update(
-    run: Path, name: str, source: str, places: Places, options: dict[str, Any], budget: Budget | None, show: bool = True
-) -> Ended:
-    """Retrain a block of a run, replace the old one, and align it to its neighbours.
+def update(run: Path, source: str, train: TrainOptions, blocks: BlockOptions, show: bool = True) -> Ended:
+    """Learn a block of a run again, put it into its place, and align it to its neighbours.
 
-    source, places: of the new photographs, in the frame of the old ones
-    options: of `open_dataset` for them
-    budget:  None for the block's previous one
-    The old block is replaced when the new one is done; an interrupted update continues. Files of other blocks are not
-    changed. Raises LumigraphError for an unknown block, and for one without photographs in the source.
+    source: of the new photographs, in the frame of the old ones
+    The new block replaces the old one when it is done; an interrupted update continues. Files of other blocks stay.
+    Raises LumigraphError for an unknown block, and where no photograph is of it.
     """
+    if (name := blocks.blocks) is None or not name.isdigit():
+        raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
     if not files.is_file(run / PLAN_FILE):
         raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
     with held(run, "trained"):
         plan = Plan.read(run / PLAN_FILE)
-        block = again(plan.block(name), source, places, options, budget)
+        block = again(plan.block(name), source, train)
         task, place = plan.task(block), place_of(run, block)
         if not ((place / TASK_FILE).exists() and Task.read(place).key == task.key and finished(place, task)):
             folder = run / UPDATES_FOLDER / f"{name}-{task.key[:8]}"
@@ -134,14 +139,15 @@ def update(
                 return ended
             files.exchange(folder, place)
             shutil.rmtree(folder, ignore_errors=True)  # what was there before
-        blocks = [block if one.name == name else one for one in plan.blocks]
-        replace(plan, blocks=blocks).write(run / PLAN_FILE)
+        replace(plan, blocks=[block if one.name == name else one for one in plan.blocks]).write(run / PLAN_FILE)
         finish(run, again=[name])
     return Ended(finished(place, task))
 
 
-def again(block: Block, source: str, places: Places, options: dict[str, Any], budget: Budget | None) -> Block:
-    """The block with other photographs."""
+def again(block: Block, source: str, train: TrainOptions) -> Block:
+    """The block as it will learn from other photographs, by the budget of the options, or the one that it had."""
+    places, budget = survey(source, train.reader), given_budget(train.steps, train.seconds, train.quality)
+    options = {name: getattr(train, name) for name in SCENE_OPTIONS}
     chosen = members(places, Disc(block.centre, block.radius))
     learnt = np.array([split == "train" for split in places.splits])
     if (chosen & learnt).sum() < 2:
@@ -290,3 +296,56 @@ def sentence(fault: BaseException) -> str:
 def first_line(fault: BaseException) -> str:
     lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
     return (lines[-1] if lines else type(fault).__name__).rstrip(".")
+
+
+MEMORY_BYTES = 2 << 30  # bytes reserved for a block
+
+
+def places_in_blocks(source: str, train: TrainOptions, blocks: BlockOptions) -> Places | None:
+    """Positions of the photographs of a scene that is learnt in blocks; None for one that is learnt as a whole."""
+    if kind_of(source, Scene) is not Scene or Path(source).is_file() or (blocks.blocks == "1" and not blocks.field):
+        return None  # a file is a single picture
+    places = survey(source, train.reader)
+    few = places.splits.count("train") < MIN_LARGE_VIEWS
+    if few and not blocks.field and (blocks.blocks, blocks.workers, blocks.address) == (None, None, None):
+        return None
+    for name in ("view", "pause_at", "views", "depth_from"):
+        if getattr(train, name, None):
+            raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
+    return places
+
+
+def begin_blocks(
+    source: str,
+    places: Places,
+    method: str,
+    config: Any,
+    device: torch.device,
+    train: TrainOptions,
+    blocks: BlockOptions,
+    output: Path | None = None,
+) -> tuple[Path, Plan, Workers]:
+    """Begin a run in blocks, or go on with the latest one of the same plan. Returns its folder, plan and workers.
+
+    config: of the method of the blocks, which is the user's unless the options name another
+    """
+    learner, here = methods.check(blocks.field or method), blocks.address is None
+    plan = make_plan(source, places, learner, config, train, blocks, str(device))
+    folder = output or unfinished(f"runs/{scene_name(source)}-{methods.check(method)}", plan)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = blocks.workers
+    cpus = max(1, cores // count) if count else 1
+    plan = begin(folder, plan, places, None if here and count is None else cpus)
+    memory = min(MEMORY_BYTES, free_memory() // (2 * count)) if here and count else MEMORY_BYTES
+    return folder, plan, Workers(count, blocks.address, cpus, 1.0 if device.type == "cuda" else 0.0, memory)
+
+
+def unfinished(prefix: str, plan: Plan) -> Path:
+    """The latest run of this name, if it is the same and not done; else the next name that is free."""
+    free = next_free(prefix)
+    number = int(free.name.rpartition("-")[2])
+    latest = free.with_name(f"{free.name.rpartition('-')[0]}-{number - 1}")
+    if (latest / PLAN_FILE).is_file() and difference(known := Plan.read(latest / PLAN_FILE), plan) is None:
+        if not all((place_of(latest, block) / DONE_FILE).exists() for block in known.blocks):
+            return latest
+    return free

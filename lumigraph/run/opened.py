@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from ..camera import Camera, dome, ring
 from ..camera.rays import Rendering
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..exchange import size_of
 from ..figures import png
 from ..files import refuse_link
@@ -108,6 +109,21 @@ class Opened(ABC):
         photographs."""
         return None
 
+    def photographs(self, source: str | None, instead: str | None) -> Scene | None:
+        """Photographs; None where there are none, and with a warning where they are gone.
+
+        source:  their present path, if they have moved; Raises LumigraphError if they are not there
+        instead: sentence on what is done without them; None for no warning
+        """
+        try:
+            return self.open_scene and self.open_scene(source)
+        except LumigraphError as error:
+            if source is not None:
+                raise
+            if instead:
+                warnings.warn(f"{instead}, for {error}", LumigraphWarning, stacklevel=3)
+            return None
+
     @property
     def conversion_fault(self) -> str | None:
         """Reason why `convert` refuses it, and a way out; None if it can be converted."""
@@ -127,6 +143,19 @@ class Opened(ABC):
     def view_names(self) -> dict[str, list[str]]:
         """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         return {}
+
+    def find_view(self, split: str, view: str) -> int:
+        """Number of a photograph in a split, by its name or number. Raises LumigraphError if there is none."""
+        names = self.view_names().get(split, [])
+        if not names:
+            raise LumigraphError(f"{self.path} has no views in the split {split!r}; choose another --split")
+        number = names.index(view) if view in names else int(view) if view.isdecimal() else len(names)
+        if number >= len(names):
+            raise LumigraphError(
+                f"There is no view {view!r} in the split {split!r} of {self.path}; give --view a number from 0 to "
+                f"{len(names) - 1}, or a name such as {names[0]}"
+            )
+        return number
 
     def survey(self, cameras: Camera) -> Camera:
         """Cameras for extracting meshes and points: its own, or a dome above its ring."""
@@ -172,6 +201,12 @@ class Trained(Opened):
     def dataset(self, source: str | None = None) -> Dataset:
         """Open the training dataset again. source: its present path, if it has moved"""
 
+    def method_and_data(
+        self, device: torch.device | str, settings: Iterable[str] = (), source: str | None = None, split: str = "test"
+    ) -> tuple[Method, Any]:
+        """Method with controls, NAME=VALUE, and the dataset with a split to compare it with. source: see `dataset`"""
+        return controlled(self, self.ready(device), settings), self.dataset(source)
+
     @property
     def title(self) -> str:
         """Name of its folder: that of its pages and of files made from it."""
@@ -190,3 +225,57 @@ class Trained(Opened):
         """Contents of eval.json, if it has been evaluated."""
         path = self.folder / "eval.json"
         return read_evaluation(path) if path.exists() else None
+
+
+def controlled(opened: Opened, method: Method, settings: Iterable[str]) -> Method:
+    """The method with the controls of --set. Raises LumigraphError for controls that it does not have."""
+    values = dict(parted("--set", "NAME=VALUE", text) for text in settings)
+    return method.given(**{name: by_number(opened, method, name, value) for name, value in values.items()})
+
+
+def stations_of(opened: Opened, method: Method, animations: Iterable[str]) -> dict[str, list[str]]:
+    """Values of each control of --animate, NAME=A:B. Raises LumigraphError for controls that are set already."""
+    stations = {}
+    for name, text in (parted("--animate", "NAME=A:B", text) for text in animations):
+        if name in method.settings:
+            raise LumigraphError(f"{name} is both set and animated; leave out --set {name} or --animate {name}")
+        if ":" not in text:
+            raise LumigraphError(f"--animate {name}={text} goes nowhere; write where it goes, as in {name}=A:B")
+        stations[name] = [by_number(opened, method, name, value) for value in text.split(":")]
+    return stations
+
+
+def parted(option: str, form: str, text: str) -> tuple[str, str]:
+    """The two sides of NAME=VALUE."""
+    name, equals, value = text.partition("=")
+    if not (name.strip() and equals and value.strip()):
+        raise LumigraphError(f"{option} {text} gives no value for a control; write {option} {form}")
+    return name.strip().replace("-", "_"), value.strip()
+
+
+def by_number(opened: Opened, method: Method, name: str, value: str) -> str:
+    """The value, or the number of the photograph that it names if the control takes one; in a blend, A:B:0.5, the
+    numbers of both."""
+    control = next((control for control in method.controls if control.name == name), None)
+    if control is None or not control.of_photographs:
+        return value
+    by_name = numbers(opened)
+    if value in by_name or not control.blends:
+        return by_name.get(value, value)
+    return ":".join(by_name.get(part, part) for part in value.split(":"))
+
+
+def numbers(opened: Opened) -> dict[str, str]:
+    """The number of each photograph, by its name."""
+    cameras = opened.cameras()
+    return {
+        name: str(number)
+        for split, names in opened.view_names().items()
+        for name, number in zip(names, cameras[split].image_index.tolist(), strict=True)  # type: ignore[union-attr]
+    }
+
+
+def at_one_moment(method: Method) -> Method:
+    """A method that moves, at the moment of --set or at its first one, for all cameras; any other as it is."""
+    control = next((one for one in method.controls if one.name == "time"), None)
+    return method if control is None else method.given(time=method.control("time"))

@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 from collections.abc import Container, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,8 +53,9 @@ from .folder import (
     write_model,
 )
 from .georeference import Georeference, georeference, gps_positions, upright
-from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens, prior, write_database
+from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, group_by_lens, prior, write_database
 from .moving import MovingFeatures, check_still, check_times, leave_out_moving
+from .options import MotionOptions
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .photos import Intake, Photo, gather
 from .photos.photo import Track, untracked
@@ -65,7 +66,6 @@ from .stitching import stitch
 MIN_VIEWS = 3  # photographs of a model
 MIN_PARALLAX = 0.3  # degrees, median over points: below it photographs that turned have no depth
 BLACK = -10.5  # mean log2 of the luminance, below which a photograph is black: 2 of 255
-MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
 FEATURE_BUDGETS = ((80, MAX_FEATURES), (200, 4096))  # most photographs, and features of each; matching is quadratic
 MIN_FEATURE_BUDGET = 2048
@@ -83,26 +83,6 @@ SNAPSHOTS, MAX_SNAPSHOTS = "snapshots", 40  # folder among the work of models wh
 MOVING_FILE = "moving.json"  # among the work: features that move
 UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
 OUTPUT_VERSION = 4  # another number makes all outputs be written again
-
-
-@dataclass(frozen=True)
-class MotionOptions:
-    """Options of a reconstruction.
-
-    frames:   number of frames of a video; None: by its length
-    mapper:   incremental (one photograph after the other) or global (all at once)
-    matching: pairs to match; auto: neighbours for a video, all up to 80 photographs, else similar ones
-    camera:   photographs that share a lens; spherical: they are panoramas of 360 by 180 degrees
-    max_size: longer side in pixels to which photographs are reduced for feature detection
-    moving:   whether the scene is dynamic: moving features are not matched, and each photograph gets its time
-    """
-
-    frames: int | None = None
-    mapper: Literal["incremental", "global"] = "incremental"
-    matching: Matching = "auto"
-    camera: Sharing = "auto"
-    max_size: int = MAX_SIDE
-    moving: bool = False
 
 
 def reconstruct(
@@ -578,7 +558,8 @@ class Reconstruction:
             "key": key,
             "source": self.intake.source,
             "sources": [str(path.resolve()) for path in self.sources],
-            "options": asdict(self.options) | {"matching": self.matching, "features": self.features},
+            "options": {x.name: getattr(self.options, x.name) for x in fields(MotionOptions)}
+            | {"matching": self.matching, "features": self.features},
             **asdict(diagnosis),
             "cameras": cameras,
             "gps": gps,

@@ -13,10 +13,11 @@ import numpy as np
 from ..errors import LumigraphError
 from ..files import claim_folder, is_file, read_json, replacing_folder, write_json
 from .folder import POINTS_FILE
+from .options import MotionOptions
 from .photos.copies import save
 from .photos.photo import Track, untracked
 from .photos.video import duration, is_video, opened, picked, speed, upright
-from .reconstruction import MIN_VIEWS, MotionOptions, reconstruct
+from .reconstruction import MIN_VIEWS, reconstruct
 
 CLOCKS_FILE = "clocks.json"  # seconds after the first camera at which each video begins, by its name
 MAX_MOMENTS = 120  # taken by default

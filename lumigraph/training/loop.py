@@ -22,7 +22,7 @@ from ..figures import save_picture
 from ..method import Lesson, Method
 from ..run import Run, State, check_memory
 from ..system.memory import peak_memory
-from ..system.progress import counting
+from ..system.progress import counting, report
 from ..system.signals import Interrupt
 from ..system.work import at_work
 from .demand import about_memory
@@ -157,6 +157,7 @@ def fit(
             display.update(step, clock.seconds, budget, batch, row)
             if watch:
                 ended = bool(watch.note(step, progress, row))
+            report("Training", step, budget.steps)
             if logged:
                 losses.clear()
             if run and logged:
