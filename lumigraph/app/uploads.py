@@ -288,7 +288,7 @@ def kind_of_file(name: str) -> str | None:
     """ "photograph" or "video" by a name's ending; None for any other file."""
     from ..readers.raw.library import RAW_SUFFIXES
     from ..sfm.photos.gather import PHOTOGRAPHS
-    from ..sfm.photos.video import VIDEOS
+    from ..sfm.photos.film import VIDEOS
 
     ending = PurePosixPath(name).suffix.lower()
     if ending in VIDEOS:
