@@ -8,7 +8,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..exchange import fourdgs, is_splat_file, place_of, snerg
+from ..exchange import is_moving, is_splat_file, place_of, snerg
 from ..files import is_file, read_json
 from ..files.reading import reads
 from ..run import Opened, Run, Trained, is_block_run
@@ -46,7 +46,7 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     path = Path(path)
     if within is None and (held := held_at(path)) is not None:
         return held
-    if fourdgs.is_moving_file(path):
+    if is_moving(path):
         return MovingFile(path)
     if is_splat_file(path):
         return SplatFile(place_of(path))
