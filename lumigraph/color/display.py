@@ -85,13 +85,13 @@ def curve(transfer: int) -> Float[np.ndarray, " 65536"]:
 def light_of_pq(signal: np.ndarray) -> np.ndarray:
     """PQ's electro-optical transfer function (BT.2100, table 4), in cd/m2."""
     power = signal ** (1 / M2)
-    return (np.maximum(power - C1, 0) / (C2 - C3 * power)) ** (1 / M1) * PQ_PEAK
+    return np.asarray((np.maximum(power - C1, 0) / (C2 - C3 * power)) ** (1 / M1) * PQ_PEAK)
 
 
 def pq_of_light(light: np.ndarray) -> np.ndarray:
     """The inverse of `light_of_pq`."""
     power = (light / PQ_PEAK) ** M1
-    return ((C1 + C2 * power) / (1 + C3 * power)) ** M2
+    return np.asarray(((C1 + C2 * power) / (1 + C3 * power)) ** M2)
 
 
 def rolled_off(light: Colours, white: float, peak: float) -> Colours:

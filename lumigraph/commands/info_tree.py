@@ -192,7 +192,7 @@ def cloud_tree(name: str, cloud: Gaussians) -> Tree:
 
 
 def moving_tree(name: str, moving: MovingGaussians) -> Tree:
-    """What a moving cloud holds."""
+    """Tree of a moving cloud."""
     tree = cloud_tree(name, moving.cloud)
     tree.label = bold(name) + f"  a moving cloud of {len(moving):,} spans of Gaussians"
     rows = {"duration": f"{moving.duration:.4g} s", "moving": f"{moving.moving:,} spans of those that move"}

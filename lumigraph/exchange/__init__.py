@@ -114,7 +114,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog
 
 @dataclass(frozen=True)
 class Offset:
-    """What is to be added to the centres of a file whose numbers are too coarse for them, in the source's units."""
+    """Offset to add to the centres of a file, whose numbers are too coarse for them, in its units."""
 
     offset: tuple[float, float, float]
 

@@ -46,14 +46,20 @@ def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = 
 
 
 def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
-    """The same cloud, with ±20 for infinite logits of opacity.
+    """The same cloud, with ±20 for infinite logits of opacity and no rotation for quaternions of length zero.
 
     Raises LumigraphError, which begins with `subject` and ends with `way_out`, for numbers that are not finite.
     """
     check_harmonics(gaussians, subject)
     faults = unsound(gaussians)
+    nowhere = faults.pop(NO_ROTATION)[:, None]
     if bad := int(torch.stack(list(faults.values())).any(0).sum()):
         raise LumigraphError(f"{subject} holds {bad} of {len(gaussians)} Gaussians with {listed(faults)}; {way_out}")
+    quaternions = torch.where(nowhere, gaussians.quaternions.new_tensor([1, 0, 0, 0]), gaussians.quaternions)
+    return replace(finite_logits(gaussians), quaternions=quaternions)
+
+
+def finite_logits(gaussians: Gaussians) -> Gaussians:
     return replace(gaussians, opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT))
 
 
@@ -71,8 +77,7 @@ def without_unsound(gaussians: Gaussians, path: Path) -> tuple[Gaussians, Bool[T
             raise LumigraphError(f"{text}, and no other; write it again")
         warnings.warn(f"{text}; they are left out", LumigraphWarning, stacklevel=2)
         gaussians = gaussians[good]
-    sound = replace(gaussians, opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT))
-    return sound, None if good.all() else good
+    return finite_logits(gaussians), None if good.all() else good
 
 
 def check_harmonics(gaussians: Gaussians, subject: str) -> None:
@@ -90,7 +95,7 @@ def unsound(gaussians: Gaussians) -> dict[str, Bool[Tensor, " gaussian"]]:
 
 
 def listed(faults: dict[str, Bool[Tensor, " gaussian"]]) -> str:
-    """What is wrong, and with how many: "no rotation (a half-written file?): 3"."""
+    """Faults and numbers of Gaussians as text: "no rotation (a half-written file?): 3"."""
     counts = {what: int(bad.sum()) for what, bad in faults.items() if bad.any()}
     none = counts.pop(NO_ROTATION, 0)
     parts = (

@@ -89,7 +89,7 @@ def paired(names: Iterable[str], others: Iterable[str]) -> dict[str, str]:
 
 
 def ends_of(names: Iterable[str]) -> dict[str, list[str]]:
-    """Of each name the ends of its path, from the whole one to that below the folder that all are in."""
+    """Ends of each path, from the whole one to that below the folder that all are in, by name."""
     paths = {name: PurePosixPath(name.replace("\\", "/")).with_suffix("").parts for name in names}
     if not paths:
         return {}

@@ -288,7 +288,7 @@ def read_deep(path: Path, turn: bool) -> np.ndarray:
 
 
 def deep_colours(path: Path) -> Colours:
-    """What a file of more than eight bits says of its colours."""
+    """Colour description of a file of more than eight bits."""
     if path.suffix.lower() in TIFF_SUFFIXES:
         return Colours(profile=bytes(tiff_tags(path).get(ICC_TAG, b"")))
     if path.suffix.lower() != ".png":

@@ -87,7 +87,7 @@ class Colours:
 
 
 def colours_of(image: Image.Image) -> Colours:
-    """What an opened file says of its colours."""
+    """Colour description of an opened file."""
     if image.info.get("icc_profile"):
         return Colours(profile=image.info["icc_profile"])
     if (nclx := image.info.get("nclx_profile")) is not None:

@@ -48,7 +48,7 @@ FIELDS = {  # names of H.273's numbers, for the record of a capture
 
 @dataclass(frozen=True)
 class Tags:
-    """What a film says of its pictures. Numbers are those of ITU-T H.273, and 2 where it says nothing.
+    """Description of the pictures in a film. Numbers are those of ITU-T H.273, and 2 where it says nothing.
 
     aspect:     width of a pixel by its height
     interlaced: whether a frame is two fields of two moments
@@ -173,7 +173,7 @@ def track_of(path: Path, container: InputContainer) -> VideoStream:
 
 
 def tags_of(path: Path) -> Tags:
-    """What a film says of its pictures, in its tracks and its first frames."""
+    """Description of the pictures in a film, by its tracks and its first frames."""
     stat = path.stat()
     return _tags_of(path, stat.st_mtime_ns, stat.st_size)
 
@@ -202,7 +202,7 @@ def _tags_of(path: Path, modified: int, size: int) -> Tags:
 
 
 def not_followed(tags: Tags, stream: VideoStream) -> str:
-    """What a film says of its colours and cannot be followed."""
+    """Colours of a film that cannot be followed, as the end of a sentence; empty where there are none."""
     if stream.codec_context.codec_tag in ("dvh1", "dvhe") and tags.transfer == UNKNOWN:
         return (
             "the film is Dolby Vision without a base that other programs show (profile 5), so its colours will be "
