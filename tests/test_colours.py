@@ -19,6 +19,10 @@ from PIL import Image, ImageCms, PngImagePlugin
 
 from lumigraph.color import display
 from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
+from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.files.exr import LUMINANCE, from_luminance
+from lumigraph.light import EnvironmentLight
+from lumigraph.readers.numbers import read_numbers
 from lumigraph.readers.pictures import read_deep, read_image, reads_heic
 from lumigraph.readers.profiles import SRGB_PROFILE, curve_of
 from lumigraph.sfm.photos import gather
@@ -319,3 +323,51 @@ def test_raw_files_beside_their_pictures_count_once(tmp_path):
     found = gather([tmp_path], tmp_path / "work")
     assert [photo.name for photo in found.photos] == ["DSC_0.JPG", "DSC_1.JPG", "DSC_2.JPG"]
     assert "3 photographs are raw files with pictures beside them" in found.remarks[0]
+
+
+# OpenEXR
+
+
+def exr(path: Path, channels: dict[str, np.ndarray], **header) -> Path:
+    import OpenEXR
+
+    named = {name: OpenEXR.Channel(name, values, *steps) for name, (values, *steps) in channels.items()}
+    about = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
+    with OpenEXR.File(about, named) as file:
+        file.write(str(path))
+    return path
+
+
+def test_exr_of_all_kinds(tmp_path):
+    import OpenEXR
+
+    random = np.random.default_rng(0)
+    light = random.uniform(0.1, 2, (36, 48, 3)).astype(np.float32)
+    by_name = {name: (light[..., i].copy(),) for i, name in enumerate("RGB")}
+    for i, compression in enumerate((OpenEXR.PXR24_COMPRESSION, OpenEXR.PIZ_COMPRESSION, OpenEXR.DWAA_COMPRESSION)):
+        found = read_numbers(exr(tmp_path / f"{i}.exr", by_name, compression=compression))
+        np.testing.assert_allclose(found, light, rtol=0.05)
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    np.testing.assert_array_equal(read_numbers(exr(tmp_path / "t.exr", by_name, **tiles)), light)
+    layered = {f"beauty.{name}": values for name, values in by_name.items()} | {"depth.Z": (light[..., 0].copy(),)}
+    np.testing.assert_array_equal(read_numbers(exr(tmp_path / "l.exr", layered)), light)
+    flat = np.repeat(np.repeat(light[::2, ::2], 2, 0), 2, 1)
+    y = (flat @ LUMINANCE).astype(np.float32)
+    chroma = [((flat[..., i] - y) / y)[::2, ::2].astype(np.float32).copy() for i in (0, 2)]
+    np.testing.assert_allclose(from_luminance(y, *chroma), flat, rtol=1e-4)
+    part = {"dataWindow": (np.array([10, 5], np.int32), np.array([57, 40], np.int32)),
+            "displayWindow": (np.array([0, 0], np.int32), np.array([59, 49], np.int32))}  # fmt: skip
+    found = read_numbers(exr(tmp_path / "w.exr", by_name, **part))
+    assert found.shape == (50, 60, 3) and not found[:5].any() and np.array_equal(found[5:41, 10:58], light)
+    light[3, 4] = np.nan, np.inf, 1
+    bad = exr(tmp_path / "n.exr", {name: (light[..., i].copy(),) for i, name in enumerate("RGB")})
+    with pytest.warns(LumigraphWarning, match="1 pixels that are not finite"):
+        assert read_image(bad, True, (48, 36))[3, 4].tolist() == [0, 0, 255]
+
+
+def test_maps_of_other_shapes_are_named(tmp_path):
+    for size, what in (((24, 144), "cube map"), ((64, 64), "mirrored ball"), ((50, 64), r"64 x 50 pixels;")):
+        values = np.ones(size, np.float32)
+        path = exr(tmp_path / f"{size[0]}.exr", {name: (values,) for name in "RGB"})
+        with pytest.raises(LumigraphError, match=what):
+            EnvironmentLight.open(path)

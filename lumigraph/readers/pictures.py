@@ -15,9 +15,10 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from ..datasets.images import ImageSource, resized
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import is_file
 from ..files.reading import reading
+from ..system.memory import free_memory
 from .capture import PixelPlane, Shot
 from .numbers import (
     DECODING_COPIES,
@@ -47,7 +48,8 @@ EXIF_UPRIGHT = (None, 0, 1)
 EXIF_SIDEWAYS = (5, 6, 7, 8)
 
 Size = tuple[int, int]
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `check_pixels` limits the size
+Image.MAX_IMAGE_PIXELS = free_memory() // (8 * DECODING_COPIES)  # refused from twice that; `check_pixels` is stricter
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
 def find_file(path: Path) -> Path:
@@ -283,6 +285,9 @@ def read_deep(path: Path, turn: bool) -> np.ndarray:
     """All bits of a photograph in sRGB, RGB or RGBA, upright if asked."""
     with readable(path):
         values = read_numbers(path)
+        if values.dtype.kind == "f" and (bad := int((~np.isfinite(values)).any(-1).sum() if values.ndim == 3 else 0)):
+            warnings.warn(f"{path} has {bad:,} pixels that are not finite; they count as black", LumigraphWarning, 2)
+            values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
         values = deep_colours(path).deep_to_srgb(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
         return turned(values, measure(path)[1]) if turn else values
 
