@@ -49,6 +49,7 @@ from .eval import Eval
 from .explain import Explain
 from .export import Export
 from .gallery import Gallery
+from .georeference import GeoreferenceCommand
 from .infer import Infer
 from .info import Info
 from .jump import Jump
@@ -131,6 +132,7 @@ COMMANDS: dict[str, type] = {
     "view": ViewCommand,
     "clean": Clean,
     "segment": Segment,
+    "georeference": GeoreferenceCommand,
     "compose": Compose,
     "canonicalise": Canonicalise,
     "compress": Compress,

@@ -120,8 +120,8 @@ def read_sequence(folder: Path) -> MovingGaussians:
             velocities = (clouds[i + 1].means - cloud.means).float() * FRAMES_PER_SECOND
         times = [torch.full((len(cloud),), value) for value in (begin, begin, end, math.inf)]
         parts.append((cloud, velocities, *times))
-    cloud, *tensors = zip(*parts, strict=True)
-    return MovingGaussians(joined(list(cloud)), duration, *(torch.cat(list(one)) for one in tensors))
+    tensors = [torch.cat(values) for values in zip(*(times for _, *times in parts), strict=True)]
+    return MovingGaussians(joined(clouds), duration, *tensors)
 
 
 def follow(clouds: list[Gaussians]) -> bool:

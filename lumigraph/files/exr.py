@@ -40,7 +40,7 @@ def picture_of(names: Iterable[str]) -> list[str] | None:
     names = list(names)
     layers = sorted({name.rpartition(".")[0] for name in names}, key=len)
     for layer in layers:
-        full = {name.rpartition(".")[2]: name for name in names if name.rpartition(".")[0] == layer}
+        full = {one.rpartition(".")[2]: one for one in names if one.rpartition(".")[0] == layer}
         for wanted in (("R", "G", "B", "A"), ("R", "G", "B"), ("Y", "RY", "BY")):
             if full.keys() >= {*wanted}:
                 return [full[name] for name in wanted]

@@ -24,6 +24,10 @@ FROM_ICC = np.linalg.inv(  # XYZ of ICC's white, D50, to linear sRGB
 _made = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
 SRGB_PROFILE = bytes(_made[:24] + struct.pack(">6H", 2020, 1, 1, 0, 0, 0) + _made[36:])  # of one date, for equal files
 NCLX, CICP = b"colrnclx", b"cICP"  # boxes of HEIF and AVIF, chunks of PNG
+PLACES = {
+    "AVIF": (NCLX, ">HH"),
+    "PNG": (CICP, ">BB"),
+}  # by Pillow's name: what comes before the two numbers, their form
 HEADER_BYTES = 1 << 16  # of a file, in which they lie
 
 Kind = tuple[int, int]  # primaries and transfer, by the numbers of ITU-T H.273
@@ -56,6 +60,7 @@ class Colours:
             if transform is None:
                 return image
             made = ImageCms.applyTransform(colours, transform)
+            assert made is not None  # it is for inPlace alone
         else:
             signal = np.asarray(colours.convert("RGB")).astype(np.uint16) * 257
             made = Image.fromarray(np.rint(255 * self._encoded(signal)).astype(np.uint8))
@@ -92,9 +97,9 @@ def colours_of(image: Image.Image) -> Colours:
         return Colours(profile=image.info["icc_profile"])
     if (nclx := image.info.get("nclx_profile")) is not None:
         return Colours(kind=(int(nclx["color_primaries"]), int(nclx["transfer_characteristics"])))
-    mark, form = {"AVIF": (NCLX, ">HH"), "PNG": (CICP, ">BB")}.get(image.format or "", (b"", ""))
-    if mark and getattr(image, "filename", ""):
-        with open(image.filename, "rb") as file:
+    mark, form = PLACES.get(image.format or "", (b"", ""))
+    if mark and (path := getattr(image, "filename", "")):
+        with open(path, "rb") as file:
             header = file.read(HEADER_BYTES)
         at = header.find(mark)
         if at >= 0:

@@ -230,9 +230,10 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
 
 def within_circle(about: Posed, lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
     """Mask of the pixels in the circle that a fisheye's file gives; None without one."""
-    if about.fisheye_crop_radius is None:
+    if about.fisheye_crop_radius is None or not isinstance(lens, Fisheye | OpenCV | Pinhole):
         return None
-    x, y = (np.arange(pixels) + 0.5 - centre for pixels, centre in zip(size, lens.centre[0].tolist(), strict=True))
+    centres = lens.centre[0].tolist()
+    x, y = (np.arange(pixels) + 0.5 - centre for pixels, centre in zip(size, centres, strict=True))
     return np.hypot(x, y[:, None]) <= about.fisheye_crop_radius
 
 
@@ -341,7 +342,7 @@ def rational(powers: Sequence[float], tangential: tuple[float, float], corner: f
     corner: the largest radius on the picture, as bent
     """
     r = np.linspace(0, LARGEST_RADIUS, 4096)
-    factor = 1 + sum(k * r ** (2 * i + 2) for i, k in enumerate(powers))
+    factor = np.polynomial.Polynomial([1, *powers])(r**2)
     beyond = np.flatnonzero((r * factor > BEYOND * corner) | (np.gradient(r * factor) <= 0))
     r, factor = (x[: max(beyond[0] if len(beyond) else len(r), 16)] for x in (r, factor))
     columns = [r**2, r**4, r**6, -factor * r**2, -factor * r**4, -factor * r**6]

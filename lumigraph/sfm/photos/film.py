@@ -191,7 +191,9 @@ def _tags_of(path: Path, modified: int, size: int) -> Tags:
             return Tags()
         frame, aspect = first[0], stream.sample_aspect_ratio or Fraction(1)
         tags = Tags(
-            *(int(getattr(frame, name)) for name in ("color_primaries", "color_trc", "colorspace")),
+            int(frame.color_primaries),
+            int(frame.color_trc),
+            int(frame.colorspace),
             int(frame.color_range) == 2 or frame.format.name.startswith("yuvj"),
             (aspect.numerator, aspect.denominator) if aspect > 0 else (1, 1),
             any(frame.interlaced_frame for frame in first),
@@ -219,7 +221,7 @@ def not_followed(tags: Tags, stream: VideoStream) -> str:
 
 def turn_of(frame: VideoFrame) -> tuple[int, int, int, int]:
     """`Tags.turn` of a frame's display matrix, at the nearest quarter of a turn."""
-    found = frame.side_data.get(Type.DISPLAYMATRIX)
+    found = next((one for one in frame.side_data if one.type == Type.DISPLAYMATRIX), None)
     if found is None:
         return Tags.turn
     a, b, _, c, d = (int(x) for x in np.frombuffer(bytes(found), np.int32)[:5])
