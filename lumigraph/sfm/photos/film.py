@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -221,7 +222,7 @@ def not_followed(tags: Tags, stream: VideoStream) -> str:
 
 def turn_of(frame: VideoFrame) -> tuple[int, int, int, int]:
     """`Tags.turn` of a frame's display matrix, at the nearest quarter of a turn."""
-    found = next((one for one in frame.side_data if one.type == Type.DISPLAYMATRIX), None)
+    found: Any = frame.side_data.get(Type.DISPLAYMATRIX)  # type: ignore[call-overload]  # its stub says text
     if found is None:
         return Tags.turn
     a, b, _, c, d = (int(x) for x in np.frombuffer(bytes(found), np.int32)[:5])
