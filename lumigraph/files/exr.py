@@ -23,8 +23,8 @@ def read_exr(path: Path) -> np.ndarray:
     with OpenEXR.File(str(path), separate_channels=True) as file:
         parts = [part for part in file.parts if picture_of(part.channels) is not None]
         if not parts:
-            names = ", ".join(sorted({name for part in file.parts for name in part.channels}))
-            raise ValueError(f"its channels {names or 'of no kind'} are no picture")
+            known = ", ".join(sorted({name for part in file.parts for name in part.channels}))
+            raise ValueError(f"its channels {known or 'of no kind'} are no picture")
         header, channels = parts[0].header, parts[0].channels
         names = picture_of(channels) or []
         if names[0] == "Y" and len(names) == 3:
