@@ -45,7 +45,7 @@ if not torch.cuda.is_available():
 
 shape_checks.install()
 
-from lumigraph.system.allocation import settle_memory  # noqa: E402
+from lumigraph.system.allocation import settle_memory
 
 settle_memory()  # as commands do: memory that one training step frees is kept for the next
 

@@ -101,10 +101,16 @@ def held(command: Any) -> Any:
 
 
 NAMES = (
-    "app demo capture depth photo3d jump train track resume infer draw eval render "
-    "view clean segment compose canonicalise compress convert export report explain info methods bench gallery"
+    "app demo capture depth photo3d jump train track resume infer draw eval render view clean segment georeference "
+    "compose canonicalise compress convert export report explain info methods bench gallery"
 ).split()
-OTHER_KINDS = {"app": "AppCommand", "capture": "CaptureCommand", "photo3d": "Photo3DCommand", "view": "ViewCommand"}
+OTHER_KINDS = {
+    "app": "AppCommand",
+    "capture": "CaptureCommand",
+    "georeference": "GeoreferenceCommand",
+    "photo3d": "Photo3DCommand",
+    "view": "ViewCommand",
+}
 COMMANDS: dict[str, type] = {
     name: getattr(importlib.import_module(f".{name}", __package__), OTHER_KINDS.get(name, name.capitalize()))
     for name in NAMES

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
+from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, arg
 
 from .. import methods
 from ..budget import Quality, given_budget

@@ -95,6 +95,7 @@ class Frame:
     train_count: number of training photographs; 0 if unknown
     tracks:      boxes of moving rigid objects, in the scene's frame
     skeleton:    bones of a character at all times, in the scene's frame
+    world_from_source: similarity from the capture's frame to that of control points, if there are any
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -111,6 +112,7 @@ class Frame:
     train_count: Annotated[int, between(0, 10**6)] = 0
     tracks: tuple[BoxTrack, ...] = ()
     skeleton: Skeleton | None = None
+    world_from_source: tuple[Row, ...] | None = None
 
     @property
     def is_open(self) -> bool:
@@ -124,8 +126,9 @@ class Frame:
 
     @property
     def to_export(self) -> Similarity:
-        """Similarity to the frame of exports: that of the capture, in the unit of a length that the user knows."""
-        return Similarity.make(self.scale) @ self.to_source
+        """Similarity to the frame of exports: of control points, or of the capture in the unit of a known length."""
+        world = Similarity.make(self.scale) if self.world_from_source is None else Similarity.of(self.world_from_source)
+        return world @ self.to_source
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists, the exact inverse of `from_json`."""
@@ -138,7 +141,8 @@ class Frame:
         low, high = frame.bounds
         if not all(a < b for a, b in zip(low, high, strict=True)):
             raise LumigraphError(f"{where}: bounds from {low} to {high} hold nothing; correct them")
-        if not is_similarity(torch.tensor(frame.source_from_scene, dtype=torch.float64)):
+        rows = [frame.source_from_scene, *([frame.world_from_source] if frame.world_from_source else [])]
+        if not all(is_similarity(torch.tensor(one, dtype=torch.float64)) for one in rows):
             raise LumigraphError(f"{where}: source_from_scene does more than move, turn and scale; correct it")
         if frame.forward is not None and len(frame.forward.pose) != 3:
             raise LumigraphError(f"{where}: forward.pose should be 3 rows of 4 numbers; correct it")

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import LumigraphError
-from ..files import claim, claim_folder, exists, expanded
+import torch
+
+from ..errors import LumigraphError, LumigraphWarning
+from ..files import claim, claim_folder, exists, expanded, is_file, read_json, write_json
+from ..files.marks import is_ours
+from ..files.partials import remove
 from ..files.ply import read_header
-from ..files.reading import reading
+from ..files.reading import reading, reads
 from ..gaussians import Gaussians
+from ..gaussians.cloud import as_precise_as_needed
+from ..gaussians.moving import MovingGaussians
 from ..system.memory import free_memory
 from ..system.progress import counting
-from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
-from .checks import checked
+from . import compressed_ply, fourdgs, glb, moving_ply, ply, sog, splat, spz, streamed_sog
+from .checks import checked, without_unsound
 
 WRITERS = {
     ".compressed.ply": compressed_ply.write,
@@ -28,6 +36,7 @@ WRITERS = {
 READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
 SUFFIXES = tuple(WRITERS)
 FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
+OFFSET = "offset.json"  # beside a file, or in a folder
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
 
@@ -35,8 +44,9 @@ def read_gaussians(path: Path | str) -> Gaussians:
     """Read the Gaussians in a file of one of SUFFIXES, or a folder of FOLDERS, on the CPU, in the axes of PLY files;
     for a streamed SOG the finest level.
 
-    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20, quaternions
-    of length zero the identity. Raises LumigraphError for any other invalid file.
+    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20. Gaussians
+    with other numbers that are not finite, or without a rotation, are left out with a warning. Raises LumigraphError
+    for what is no cloud.
     """
     path = place_of(expanded(path))
     layout = layout_of(path)
@@ -52,7 +62,28 @@ def read_gaussians(path: Path | str) -> Gaussians:
             else:
                 header = read_header(path)
                 gaussians = (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
-    return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
+    gaussians = without_unsound(gaussians, path)[0]
+    if is_file(beside := offset_file(path)):
+        offset = torch.tensor(read_json(beside, Offset).offset, dtype=torch.float64)
+        means = as_precise_as_needed(gaussians.means.double() + offset, gaussians.log_scales)
+        gaussians = replace(gaussians, means=means)
+    return gaussians
+
+
+def is_moving(path: Path | str) -> bool:
+    """True if `read_moving` accepts a path: .4dgs, existing or not; Spacetime Gaussians; numbered clouds."""
+    path = expanded(path)
+    return fourdgs.is_moving_file(path) or moving_ply.has_motion(path) or moving_ply.is_sequence(path)
+
+
+@reads()
+def read_moving(path: Path | str) -> MovingGaussians:
+    """The moving cloud of a file or a folder. Raises LumigraphError for what it does not hold whole."""
+    path = expanded(path)
+    if fourdgs.is_moving_file(path):
+        return fourdgs.read_moving(path)
+    with counting(f"Reading {path.name}"):
+        return moving_ply.read_sequence(path) if path.is_dir() else moving_ply.read_spacetime(path)
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
@@ -67,11 +98,44 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog
     ending = check_ending(path)
     claim_splats(path)
     sound = checked(gaussians, f"what is to be written to {path}", "remove them first")
-    if path.name == streamed_sog.META:
-        streamed_sog.write(path, sound, detail)
-        return
+    offset = None
+    if sound.means.dtype == torch.float64 and ending != ".ply":
+        offset = sound.means.median(0).values.round()
+        sound = replace(sound, means=(sound.means - offset).float())
     with counting(f"Writing {path.name}"):
-        WRITERS[ending](path, sound)
+        if path.name == streamed_sog.META:
+            streamed_sog.write(path, sound, detail)
+        elif ending == ".glb":
+            glb.write(path, sound, None if offset is None else offset.numpy())
+        else:
+            WRITERS[ending](path, sound)
+    write_offset(path, None if offset is None or ending == ".glb" else offset.tolist())
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Offset to add to the centres of a file, whose numbers are too coarse for them, in its units."""
+
+    offset: tuple[float, float, float]
+
+
+def offset_file(path: Path) -> Path:
+    """The file that holds the offset of a file of Gaussians, or of a folder of them."""
+    folder = path.parent if path.name in FOLDERS else path
+    return folder / OFFSET if folder.is_dir() else path.with_name(f"{path.name}.{OFFSET}")
+
+
+def write_offset(path: Path, offset: list[float] | None) -> None:
+    """Write the offset of a new file beside it, or remove that of the file before it. Warns of what is beside."""
+    beside = offset_file(path)
+    if offset is not None:
+        write_json(beside, {"offset": offset}, "splats")
+        text = (
+            f"{path} holds centres relative to {', '.join(f'{x:.0f}' for x in offset)}, for its numbers are too coarse "
+        )
+        warnings.warn(f"{text}so far from the origin; {beside.name} has that offset", LumigraphWarning, stacklevel=3)
+    elif is_file(beside) and is_ours(beside, "splats"):
+        remove(beside)
 
 
 def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
@@ -93,7 +157,7 @@ def is_splat_file(path: Path | str) -> bool:
     if path.name.lower().endswith(".glb") and path.is_file():
         with reading(path):
             return glb.recognises(path)
-    return path.name.lower().endswith(SUFFIXES)
+    return path.name.lower().endswith(SUFFIXES) and not moving_ply.has_motion(path)
 
 
 def names_splats(path: Path | str) -> bool:

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from ..gaussians import Gaussians
+from ..gaussians.cloud import as_precise_as_needed
 
 # One row for each Gaussian
 Vectors = Float[np.ndarray, "gaussian 3"]
@@ -46,11 +47,13 @@ def cloud(
     harmonics: Float[np.ndarray, "gaussian coefficient 3"],
     antialiased: bool = False,
 ) -> Gaussians:
-    """Gaussians from arrays, copied as float32."""
+    """Gaussians of arrays, in float32 and in memory of their own; centres of float64 as they need it."""
     named = {"means": means, "quaternions": quaternions, "log_scales": log_scales}
     named |= {"opacities": opacities, "harmonics": harmonics}
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are found by `checks.checked`
         tensors = {name: torch.from_numpy(np.array(x, np.float32, order="C")) for name, x in named.items()}
+        if means.dtype == np.float64:
+            tensors["means"] = as_precise_as_needed(torch.from_numpy(np.array(means)), tensors["log_scales"])
     return Gaussians(**tensors, antialiased=antialiased)
 
 

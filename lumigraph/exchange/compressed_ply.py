@@ -81,7 +81,7 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
     if rest:
         harmonics = np.concatenate([harmonics, _from_bytes(by_coefficient(columns(rows["sh"], rest)))], 1)
     return cloud(
-        _between(_unpack(position), *ends["mean"]),
+        _between(_unpack(position), *ends["mean"]).astype(np.float32),
         _from_smallest_three(rotation),
         _between(_unpack(scale), *ends["scale"]),
         LOGITS[parts[:, 3]],

@@ -73,7 +73,7 @@ def to_bytes(moving: MovingGaussians) -> bytes:
     spans = np.stack([array(moving.begins), array(moving.ends)], 1).astype(np.float64)
     table, window = np.unique(spans, axis=0, return_inverse=True)
     bins[WINDOW] = window.reshape(-1, 1)
-    means, degree = array(moving.cloud.means), moving.cloud.degree
+    means, degree = moving.cloud.means.detach().cpu().double().numpy(), moving.cloud.degree
     box = [*means.min(0), *means.max(0)] if len(means) else [0.0] * 6
     data = bytearray(MAGIC)
     about = {"visibility_profile": "box", "color_space": "srgb", "producer": "lumigraph"}
@@ -97,7 +97,7 @@ def to_bytes(moving: MovingGaussians) -> bytes:
 def binned(moving: MovingGaussians) -> tuple[dict[int, Int[np.ndarray, "gaussian _"]], dict[str, float], list[float]]:
     """Quantised attributes except for the window; quantisation steps; origin of positions."""
     c = moving.cloud
-    means, scales = array(c.means).astype(np.float64), np.exp(array(c.log_scales).astype(np.float64))
+    means, scales = c.means.detach().cpu().double().numpy(), np.exp(array(c.log_scales).astype(np.float64))
     scales = scales.clip(MIN_SCALE, MAX_SCALE)
     size = float(np.median(scales.max(1))) if len(scales) else 1.0
     steps = {name: 2 * bound for name, bound in BOUNDS.items()} | {"pos": 2 * POSITION_SHARE * size}

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -161,7 +162,7 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
             raise LumigraphError(f"{file.path} stretches or mirrors its Gaussians by a node; apply its place to them")
         found = found.transformed(place)
     return cloud(
-        array(found.means) * TURN_MEAN,
+        found.means.numpy() * TURN_MEAN,
         array(found.quaternions) * TURN_ROTATION,
         array(found.log_scales),
         array(found.opacities),
@@ -170,8 +171,11 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
     )
 
 
-def write(path: Path, gaussians: Gaussians) -> None:
-    """Write a GLB file. Raises LumigraphError for an empty cloud, since glTF has no empty arrays."""
+def write(path: Path, gaussians: Gaussians, offset: Float[np.ndarray, " 3"] | None = None) -> None:
+    """Write a GLB file. Raises LumigraphError for an empty cloud, since glTF has no empty arrays.
+
+    offset: of the node, which is added to the centres
+    """
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     harmonics = array(gaussians.harmonics)
@@ -195,12 +199,15 @@ def write(path: Path, gaussians: Gaussians) -> None:
     }
     if gaussians.antialiased:
         primitive["extras"] = {ANTIALIASED: True}
+    node: dict[str, Any] = {"mesh": 0}
+    if offset is not None:
+        node["translation"] = (offset * TURN_MEAN).tolist()
     about = {
         "asset": {"version": "2.0", "generator": "Lumigraph"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
     }
     write_bytes(path, gltf.encoded(about, [*columns.values()]), "splats")

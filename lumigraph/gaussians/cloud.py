@@ -22,6 +22,7 @@ from ..geometry import multiply, to_quaternion
 ISOLATION_NEIGHBOURS = 16  # nearest Gaussians whose mean distance measures isolation
 BAND_0 = 0.5 / math.sqrt(math.pi)  # the constant harmonic
 EXTENT_OPACITY = 0.1  # opacity from which on a Gaussian counts for the extent of the cloud
+ROUNDING = 0.01  # of a Gaussian's size, which a centre may be off by
 EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
 
 
@@ -29,7 +30,7 @@ EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
 class Gaussians:
     """A cloud of N Gaussians, in unconstrained parameters.
 
-    means:       centres, in the frame's units
+    means:       centres, in the frame's units; in double precision far from the origin, see `as_precise_as_needed`
     quaternions: rotations (w, x, y, z), of any length but zero
     log_scales:  natural logarithm of the standard deviation along each of the rotated axes
     opacities:   logits; the sigmoid is the opacity at the centre
@@ -70,7 +71,7 @@ class Gaussians:
         turn = to_quaternion(rotation).to(self.quaternions)
         return replace(
             self,
-            means=means.to(self.means),
+            means=as_precise_as_needed(means, self.log_scales + float(scale.log())),
             quaternions=multiply(turn[None], self.quaternions),
             log_scales=self.log_scales + float(scale.log()),
             harmonics=turned(self.harmonics, rotation),
@@ -80,6 +81,16 @@ class Gaussians:
         tensors = self.means, self.quaternions, self.log_scales, self.opacities, self.harmonics
         means, quaternions, log_scales, opacities, harmonics = map(change, tensors)
         return Gaussians(means, quaternions, log_scales, opacities, harmonics, self.antialiased)
+
+
+def as_precise_as_needed(
+    means: Float[Tensor, "gaussian 3"], log_scales: Float[Tensor, "gaussian 3"]
+) -> Float[Tensor, "gaussian 3"]:
+    """Centres in single precision, unless its step there is more than ROUNDING of most Gaussians' largest deviation."""
+    if means.dtype != torch.float64 or not len(means):
+        return means
+    steps = torch.finfo(torch.float32).eps * means.abs().amax(-1)
+    return means if (steps / log_scales.amax(-1).exp()).nanmedian() > ROUNDING else means.float()
 
 
 def turned(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..exchange import fourdgs, is_splat_file, place_of, snerg
+from ..exchange import is_moving, is_splat_file, place_of, snerg
 from ..files import is_file, read_json
 from ..files.reading import reads
 from ..run import Opened, Run, Trained, is_block_run
@@ -23,7 +23,7 @@ def open_any(path: Path | str, within: Nesting | None = None) -> Opened:
     Raises LumigraphError, in one sentence, for anything else.
     """
     path = Path(path)
-    if fourdgs.is_moving_file(path):
+    if is_moving(path):
         return MovingFile(path)
     if is_splat_file(path):
         return SplatFile(place_of(path))

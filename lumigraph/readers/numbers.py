@@ -1,6 +1,6 @@
 """Raw numbers of files: photographs of more than eight bits, depth, labels, arrays.
 
-Pillow keeps 16 bits of grey only, so colours of 16 bits and EXR go through FFmpeg (`av`), as films do.
+Pillow keeps 16 bits of grey only, so colours of 16 bits go through FFmpeg (`av`), as films do.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from ..color.srgb import srgb_from_linear
+from ..files.exr import picture_of, read_exr
 from ..files.ffmpeg import decode
 from ..system.memory import free_memory
 
@@ -148,13 +149,18 @@ def exr_kind(path: Path) -> Kind:
         types.append(struct.unpack_from("<i", channels, name_ends + 1)[0])
         at = name_ends + 17
     dtype = np.dtype(np.float16 if all(kind == EXR_HALF for kind in types) else np.float32)
-    return Kind((right - left + 1, bottom - top + 1), dtype, len(names) if set("RGB") <= set(names) else 1, True)
+    picture = picture_of(names) or names[:1]
+    if len(picture) == 3 and picture[0].endswith("Y"):
+        dtype = np.dtype(np.float32)  # colours are computed
+    return Kind((right - left + 1, bottom - top + 1), dtype, len(picture), True)
 
 
 def read_numbers(path: Path, name: str = "") -> np.ndarray:
     """All numbers as stored, (height, width) or (height, width, channels). name: as in `kind_of`"""
     if path.suffix.lower() in (".npy", ".npz"):
         return read_array(path, name)
+    if path.suffix.lower() == ".exr":
+        return read_exr(path).astype(exr_kind(path).dtype)
     kind, tiff = kind_of(path), path.suffix.lower() in TIFF_SUFFIXES
     grey_floats = tiff and kind.channels == 1 and kind.dtype.kind == "f"  # unknown to FFmpeg
     if kind.deep and not grey_floats:

@@ -15,9 +15,10 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from ..datasets.images import ImageSource, resized
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import is_file
 from ..files.reading import reading
+from ..system.memory import free_memory
 from .capture import PixelPlane, Shot
 from .numbers import (
     DECODING_COPIES,
@@ -30,6 +31,7 @@ from .numbers import (
     tiff_tags,
     turned,
 )
+from .profiles import Colours, colours_of
 
 DIGEST_SAMPLES, DIGEST_BYTES = 16, 1 << 12  # steps from one sample of a file's content to the next; bytes of a sample
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
@@ -41,11 +43,13 @@ IMAGE_SUFFIXES = (
 NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
+ICC_TAG = 34675  # of TIFF
 EXIF_UPRIGHT = (None, 0, 1)
 EXIF_SIDEWAYS = (5, 6, 7, 8)
 
 Size = tuple[int, int]
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `check_pixels` limits the size
+Image.MAX_IMAGE_PIXELS = free_memory() // (8 * DECODING_COPIES)  # refused from twice that; `check_pixels` is stricter
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
 def find_file(path: Path) -> Path:
@@ -254,8 +258,18 @@ def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
     if (kind := deep(path)) is not None:
         return as_bytes(resized(read_deep(path, turn), size, kind.encoding), kind.encoding)
     with readable(path), Image.open(path) as image:
-        upright = ImageOps.exif_transpose(image) if turn else image
-        return np.asarray(eight_bits(upright).resize(size, Image.Resampling.BOX))
+        return np.asarray(srgb_image(image, turn, size))
+
+
+def srgb_image(image: Image.Image, turn: bool, size: Size | None = None) -> Image.Image:
+    """An opened photograph as RGB or RGBA of 8 bits in sRGB, upright if asked, area-averaged down to a size."""
+    colours = colours_of(image)
+    made = ImageOps.exif_transpose(image) if turn else image
+    if made.mode not in ("RGB", "RGBA"):
+        made = colours.to_srgb(made)  # by its own channels
+        colours = colours if made.mode in ("P", "PA") else Colours()
+    made = eight_bits(made)
+    return colours.to_srgb(made if size is None else made.resize(size, Image.Resampling.BOX))
 
 
 def deep(path: Path) -> Kind | None:
@@ -268,11 +282,24 @@ def deep(path: Path) -> Kind | None:
 
 
 def read_deep(path: Path, turn: bool) -> np.ndarray:
-    """All bits of a photograph, RGB or RGBA, upright if asked."""
+    """All bits of a photograph in sRGB, RGB or RGBA, upright if asked."""
     with readable(path):
         values = read_numbers(path)
-        values = np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
+        if values.dtype.kind == "f" and (bad := int((~np.isfinite(values)).any(-1).sum() if values.ndim == 3 else 0)):
+            warnings.warn(f"{path} has {bad:,} pixels that are not finite; they count as black", LumigraphWarning, 2)
+            values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+        values = deep_colours(path).deep_to_srgb(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
         return turned(values, measure(path)[1]) if turn else values
+
+
+def deep_colours(path: Path) -> Colours:
+    """Colour description of a file of more than eight bits."""
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        return Colours(profile=bytes(tiff_tags(path).get(ICC_TAG, b"")))
+    if path.suffix.lower() != ".png":
+        return Colours()
+    with Image.open(path) as image:
+        return colours_of(image)
 
 
 def deep_plane(path: Path, turn: bool, identity: str) -> PixelPlane | None:

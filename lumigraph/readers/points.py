@@ -77,18 +77,21 @@ def read_points3d(path: Path) -> SparsePoints:
 
 
 def similarity(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> np.ndarray | None:
-    """The 4x4 least-squares similarity from source to target points (Umeyama 1991). None for a residual above 2% of
-    their spread, or too few points."""
-    if len(source) < 4:
+    """The 4x4 least-squares similarity from source to target points. None for a residual above 2% of their spread, or
+    too few points."""
+    if len(source) < 4 or min(np.ptp(source), np.ptp(target)) == 0:
         return None
+    matrix = umeyama(source, target)
+    left = ((target - source @ matrix[:3, :3].T - matrix[:3, 3]) ** 2).sum()
+    return matrix if left <= POSITION_TOLERANCE**2 * ((target - target.mean(0)) ** 2).sum() else None
+
+
+def umeyama(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "4 4"]:
+    """The 4x4 least-squares similarity from source to target points (Umeyama 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    spread_a, spread_b = (a**2).sum(), (b**2).sum()
-    if min(spread_a, spread_b) == 0:
-        return None
     matrix = np.eye(4)
-    matrix[:3, :3] = (s * np.diag(sign)).sum() / spread_a * (u @ sign @ vt)
+    matrix[:3, :3] = (s * np.diag(sign)).sum() / (a**2).sum() * (u @ sign @ vt)
     matrix[:3, 3] = target.mean(0) - matrix[:3, :3] @ source.mean(0)
-    left = ((b - a @ matrix[:3, :3].T) ** 2).sum()
-    return matrix if left <= POSITION_TOLERANCE**2 * spread_b else None
+    return matrix

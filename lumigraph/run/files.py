@@ -14,7 +14,7 @@ from .. import methods
 from ..composition import PlayedCloud
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..exchange import fourdgs, read_gaussians, snerg
+from ..exchange import read_gaussians, read_moving, snerg
 from ..exchange.baked import Atlas
 from ..files.ranges import changed
 from ..gaussians import Gaussians
@@ -53,11 +53,11 @@ class SplatFile(Opened):
 
 
 class MovingFile(Opened):
-    """A moving cloud in a file, with a ring of cameras around it."""
+    """A moving cloud in a file or a folder, with a ring of cameras around it."""
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
-        self.moving = fourdgs.read_moving(self.path)
+        self.moving = read_moving(self.path)
         self.frame = replace(frame_of(self.moving.at(0.0)), times=(0.0, self.moving.duration))
 
     def method(self, device: torch.device | str = "cpu") -> Method:

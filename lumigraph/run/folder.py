@@ -39,6 +39,7 @@ from ..files.marks import MARKS_FILE
 from ..files.partials import PARTIAL_NAME
 from ..files.plain import alike, understood
 from ..files.ranges import check
+from ..geometry import Similarity
 from ..method import Method
 from ..opening import KINDS, open_dataset
 from ..readers import Before
@@ -134,8 +135,15 @@ class Run(Trained):
         self.settings.write(self._config)
 
     def set_scale(self, scale: float) -> None:
-        """Set the unit of exports. scale: see `Frame.scale`"""
-        self.frame = replace(self.frame, scale=scale)
+        """Remember the unit of exports. scale: see `Frame.scale`"""
+        self._remember(scale=scale, world_from_source=None)
+
+    def set_world(self, world: Similarity) -> None:
+        """Remember the frame of exports. world: see `Frame.world_from_source`"""
+        self._remember(scale=world.scale, world_from_source=world.rows)
+
+    def _remember(self, **numbers: Any) -> None:
+        self.frame = replace(self.frame, **numbers)
         self.settings = replace(self.settings, frame=self.frame)
         self.settings.write(self._config)
 

@@ -19,6 +19,7 @@ from ..exchange import size_of
 from ..figures import png
 from ..files import refuse_link
 from ..gaussians import Gaussians
+from ..geometry import Similarity
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
 from ..system.work import at_work
@@ -166,6 +167,10 @@ class Opened(ABC):
         raise LumigraphError(
             f"{self.path} remembers no scale, as a run does; export from the run, or scale the result in its program"
         )
+
+    def set_world(self, world: Similarity) -> None:
+        """Remember `Frame.world_from_source`, the frame of exports. Raises LumigraphError for what remembers none."""
+        raise LumigraphError(f"{self.path} remembers no frame, as a run does; give the run that it was made of")
 
     def metrics(self) -> list[dict[str, Any]]:
         """Training metrics, one row every few steps; empty where unknown."""

@@ -150,11 +150,12 @@ def leaves(said: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[t
 
 def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
     """Set a value at a path of nested JSON, unless something else than a dictionary is on the way."""
+    inner: Any = made
     for name in path[:-1]:
-        made = made.setdefault(name, {})
-        if not isinstance(made, dict):
+        inner = inner.setdefault(name, {})
+        if not isinstance(inner, dict):
             return
-    made[path[-1]] = value
+    inner[path[-1]] = value
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:

@@ -17,6 +17,7 @@ from ..files import read_json
 from ..geometry import evenly
 from ..readers import colmap
 from ..readers.capture import Capture, Shot
+from ..readers.finding import paired
 from ..readers.oddities import fold, in_steps
 from ..readers.pictures import eight_bits
 from ..readers.points import similarity
@@ -224,25 +225,29 @@ def tracks_of(capture: Capture) -> dict[str, TrackAgreement]:
     if place is None:
         return {}
     model = colmap.read_model(place)
-    shots = {Path(shot.name).stem: shot for shot in capture.shots}
-    images = {Path(i.name).stem: i for i in model.images.values() if i.has_pose and Path(i.name).stem in shots}
-    poses = {Path(name).stem: pose[:, 3] for name, pose in colmap.poses_of(model).items()}
-    matrix = similarity(np.array([poses[k] for k in images]), np.array([shots[k].pose[:, 3] for k in images]))
+    shots = {shot.name: shot for shot in capture.shots}
+    by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    images = {name: by_name[other] for name, other in paired(shots, by_name).items()}
+    poses = colmap.poses_of(model)
+    matrix = similarity(
+        np.array([poses[image.name][:, 3] for image in images.values()]),
+        np.array([shots[k].pose[:, 3] for k in images]),
+    )
     if matrix is None:
         return {}
     reliable = {k: p for k, p in model.points3D.items() if p.track.length() >= MIN_TRACK_LENGTH}
     found: dict[str, TrackAgreement] = {}
     measured: list[tuple[Shot, np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]] = []
-    for stem, image in images.items():
+    for name, image in images.items():
         seen = [(p.xy, reliable[p.point3D_id]) for p in image.get_observation_points2D() if p.point3D_id in reliable]
-        found[shots[stem].name] = TrackAgreement(len(seen))
+        found[name] = TrackAgreement(len(seen))
         if len(seen) < MIN_OBSERVATIONS:
             continue
         features, points = zip(*evenly(seen, MAX_OBSERVATIONS), strict=True)
         camera, there = model.cameras[image.camera_id], np.array([p.xyz for p in points])
         there = there @ matrix[:3, :3].T + matrix[:3, 3]
         colours = np.array([p.color for p in points], np.float64)
-        measured.append((shots[stem], np.array(features), there, colours, (camera.width, camera.height)))
+        measured.append((shots[name], np.array(features), there, colours, (camera.width, camera.height)))
 
     def agreement(i: int) -> TrackAgreement:
         shot, features, points, colours, size = measured[i]

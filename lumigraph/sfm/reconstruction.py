@@ -511,7 +511,7 @@ class Reconstruction:
             )
         if place is not None and not known:
             told.append(place.say)
-        diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
+        diagnosis = replace(diagnosis, warnings=[*self.intake.remarks, *diagnosis.warnings, *told])
         written, photos = model, self.photos
         if self.spherical:
             written, photos = flat_views(model, photos, self.folder, self.masks, self.track)
@@ -563,6 +563,7 @@ class Reconstruction:
             **asdict(diagnosis),
             "cameras": cameras,
             "gps": gps,
+            "film": self.intake.film and asdict(self.intake.film) | {"tags": str(self.intake.film)},
             "seconds": self.stages.seconds(),
         }
 

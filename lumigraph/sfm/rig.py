@@ -15,8 +15,9 @@ from ..files import claim_folder, is_file, read_json, replacing_folder, write_js
 from .folder import POINTS_FILE
 from .options import MotionOptions
 from .photos.copies import save
+from .photos.film import Tags, is_video, opened, tags_of
 from .photos.photo import Track, untracked
-from .photos.video import duration, is_video, opened, picked, speed, upright
+from .photos.video import picked
 from .reconstruction import MIN_VIEWS, reconstruct
 
 CLOCKS_FILE = "clocks.json"  # seconds after the first camera at which each video begins, by its name
@@ -63,7 +64,7 @@ def films_of(folder: Path) -> list[RigVideo]:
     found = []
     for path in videos:
         with opened(path) as film:
-            found.append(RigVideo(path, clocks.get(path.name, 0.0), duration(film), speed(film)))
+            found.append(RigVideo(path, clocks.get(path.name, 0.0), film.seconds, film.rate))
     return found
 
 
@@ -113,8 +114,11 @@ def capture_rig(
     claim_folder(folder, "capture")
     folder.mkdir(parents=True, exist_ok=True)
     with replacing_folder(folder / "images", "capture") as partial:
-        for film in track(films, "Taking frames", len(films)):
-            take(film, moments, partial / film.path.stem)
+        tags = [tags_of(film.path) for film in films]
+        said += [f"{film.path.name}: {own.fault}" for film, own in zip(films, tags, strict=True) if own.fault]
+        brightest = max(one.peak for one in tags)  # one tone curve for all cameras
+        for film, own in track(list(zip(films, tags, strict=True)), "Taking frames", len(films)):
+            take(film, moments, partial / film.path.stem, replace(own, peak=brightest))
     lens: dict[str, Any] = {}
     poses, found = given_poses(source, films), ""
     if poses is None:
@@ -137,11 +141,12 @@ def step_of(moments: Sequence[float]) -> str:
     return f"{1000 * (moments[1] - moments[0]):.0f} ms apart" if len(moments) > 1 else "of one frame"
 
 
-def take(film: RigVideo, moments: Sequence[float], folder: Path) -> None:
-    """Write the frame at each time. Raises LumigraphError where the video ends before the last one."""
+def take(film: RigVideo, moments: Sequence[float], folder: Path, tags: Tags) -> None:
+    """Write the frame of each moment. tags: as in `opened`. Raises LumigraphError where the video ends before its last
+    one."""
     folder.mkdir(parents=True)
     numbers = film.numbers(moments)
-    pictures = {number: upright(frame) for number, frame, _ in picked(film.path, sorted(set(numbers)))}
+    pictures = {number: picture for number, picture, _ in picked(film.path, sorted(set(numbers)), tags)}
     if missing := [number for number in numbers if number not in pictures]:
         raise LumigraphError(f"{film.path} has no frame {missing[0]}, which its length promises; record it again")
     for i, number in enumerate(numbers):

@@ -9,12 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from PIL import Image, ImageOps
+from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry import evenly
-from ...readers.pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, eight_bits
+from ...readers.pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, srgb_image
+from ...readers.profiles import SRGB_PROFILE
 from ...readers.raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .photo import Track
 
@@ -121,24 +122,24 @@ def name_of_copy(name: str, image: Image.Image) -> str:
 
 
 def copy_upright(image: Image.Image, source: Path, path: Path) -> None:
-    """Write an upright copy of an opened image in 8 bits: JPEG, or lossless PNG, by the suffix of `path`.
+    """An upright copy of an opened image in 8 bits and sRGB: JPEG, or PNG without loss, by the suffix of `path`.
 
     A copy has its source's date, by which `is_current` recognises it.
     Raises LumigraphError for a failed write, and Pillow's errors for a damaged image.
     """
-    upright = eight_bits(ImageOps.exif_transpose(image))
+    upright = srgb_image(image, turn=True)
     with replacing(path, ours=True) as partial:
-        save(upright, partial, path.suffix, image.info.get("icc_profile"))
+        save(upright, partial, path.suffix)
         stat = source.stat()
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-def save(image: Image.Image, path: Path, suffix: str, profile: bytes | None = None) -> None:
-    """Write an image as JPEG or PNG, as a suffix says. profile: of the image's colours (ICC)."""
+def save(image: Image.Image, path: Path, suffix: str) -> None:
+    """Write an image in sRGB as JPEG or PNG, as a suffix says."""
     if suffix.lower() in JPEG_SUFFIXES:
-        image.save(path, "JPEG", icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
+        image.save(path, "JPEG", icc_profile=SRGB_PROFILE, quality=JPEG_QUALITY, subsampling=0)
     else:
-        image.save(path, "PNG", icc_profile=profile)
+        image.save(path, "PNG", icc_profile=SRGB_PROFILE)
 
 
 def is_current(path: Path, source: Path) -> bool:

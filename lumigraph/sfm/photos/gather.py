@@ -24,9 +24,10 @@ from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
+from .film import is_video, tags_of
 from .judge import blurred, duplicates, judge
 from .photo import Intake, Photo, Track, untracked
-from .video import extract, is_video
+from .video import extract
 
 PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", *HEIC_SUFFIXES}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
@@ -50,7 +51,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
     if films:
         return of_video(films[0], source, work, frames, track)
-    files = named_files(list_photographs(sources, work))
+    files, pairs = without_raw_twins(named_files(list_photographs(sources, work)))
     raw: dict[str, Developed] = {}
     unreadable: dict[str, str] = {}
     if all_raw(files, source):
@@ -66,7 +67,18 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     photos = with_altitudes([one.photo for one in seen])
-    return assess(Intake(source, photos, unreadable=unreadable, raw=raw), seen)
+    return assess(Intake(source, photos, unreadable=unreadable, raw=raw, remarks=pairs), seen)
+
+
+def without_raw_twins(files: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Files without raw ones beside which the camera's own picture of the same name lies, and a sentence on these."""
+    pictures = {Path(name).with_suffix("") for name, path in files.items() if not is_raw(path)}
+    twins = [name for name, path in files.items() if is_raw(path) and Path(name).with_suffix("") in pictures]
+    if not twins:
+        return dict(files), ()
+    count = counted(len(twins), "photograph")
+    told = f"{count} are raw files with pictures beside them, such as {twins[0]}; the pictures are taken"
+    return {name: path for name, path in files.items() if name not in twins}, (told,)
 
 
 def all_raw(files: Mapping[str, Path], source: str) -> bool:
@@ -91,8 +103,9 @@ def of_video(path: Path, source: str, work: Path, frames: int | None, track: Tra
         if isinstance(one, str):
             raise LumigraphError(f"{file} is damaged ({one}); delete {file.parent}, and frames will be taken anew")
         seen.append(replace(one, photo=replace(one.photo, device=path.name, time=seconds)))
-    photos = [one.photo for one in seen]
-    return assess(Intake(source, photos, in_order=True), seen)
+    photos, tags = [one.photo for one in seen], tags_of(path)
+    remarks = (tags.fault,) if tags.fault else ()
+    return assess(Intake(source, photos, in_order=True, film=tags, remarks=remarks), seen)
 
 
 def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, Candidate | str]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...readers.raw import Developed
+from .film import Tags
 
 # (items, what is being done, how many there will be) -> the items one by one; display.track is one
 Track = Callable[[Iterable[Any], str, int], Iterator[Any]]
@@ -51,6 +52,8 @@ class Intake:
     duplicates: names of exact or near duplicates; value: name of the other one. `photos` includes them
     unreadable: names of files that are no pictures, with the reason in a few words
     raw:        the raw files of developed photos, by the photos' names
+    film:       what a video says of its pictures; None for photographs
+    remarks:    sentences on how pictures were read or left out
     """
 
     source: str
@@ -60,6 +63,8 @@ class Intake:
     duplicates: dict[str, str] = field(default_factory=dict)
     unreadable: dict[str, str] = field(default_factory=dict)
     raw: dict[str, Developed] = field(default_factory=dict)
+    film: Tags | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def untracked(items: Iterable[Any], description: str, total: int) -> Iterator[Any]:

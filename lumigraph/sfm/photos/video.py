@@ -9,17 +9,13 @@ written in the second pass, unless it repeats an earlier one.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import av
 import numpy as np
-from av.container import InputContainer
-from av.video.frame import VideoFrame
 from jaxtyping import Float
 from PIL import Image
 from scipy.fft import irfft2, rfft2
@@ -28,12 +24,10 @@ from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
 from ...files.ranges import Lasted
 from .copies import save
+from .film import Tags, grey, opened, tags_of
 from .judge import DUPLICATE_CORRELATION, JUDGED_SIDE, sharpness, signature
 from .photo import Track, untracked
 
-VIDEOS = {
-    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
-}  # fmt: skip
 FRAMES_PER_SECOND, MIN_FRAMES, MAX_FRAMES = 2.5, 20, 150  # default number of frames
 JUDGED_PER_SECOND = 15.0  # frames per second that are judged, or
 CANDIDATES_PER_FRAME = 4  # for each selected frame, if that is more
@@ -50,18 +44,17 @@ WINDOW_MEAN_SQUARE = (3 / 8) ** 2  # mean square of the window that fades out a 
 
 @dataclass(frozen=True)
 class Index:
-    """frames.json: source film of the frames beside it, their requested number, and their times."""
+    """frames.json: source film of the frames beside it, their requested number, and their times.
+
+    film: description of its pictures, by which they were converted
+    """
 
     video: str = ""
     modified: int = 0
     bytes: int = 0
     asked: int | None = None
+    film: Tags = Tags()
     frames: dict[str, Lasted] = field(default_factory=dict)
-
-
-def is_video(path: Path) -> bool:
-    """True if a file is a video, by its suffix."""
-    return path.suffix.lower() in VIDEOS and path.is_file()
 
 
 def extract(path: Path, folder: Path, frames: int | None = None, track: Track = untracked) -> list[tuple[Path, float]]:
@@ -75,7 +68,7 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     if frames is not None and frames < 2:
         raise LumigraphError(f"{frames} frames of {path} are too few to find cameras for; ask for 2 at least")
     stat = path.stat()
-    wanted, index = Index(path.name, stat.st_mtime_ns, stat.st_size, frames), folder / "frames.json"
+    wanted, index = Index(path.name, stat.st_mtime_ns, stat.st_size, frames, tags_of(path)), folder / "frames.json"
     known = read_json(index, Index) if index.is_file() else Index()
     complete = all(Path(name).name == name and is_file(folder / name) for name in known.frames)
     if not complete or replace(known, frames={}) != wanted:
@@ -92,17 +85,17 @@ def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row,
     rows: list[tuple[int, float, float, float]] = []
     odometer, end = Odometer(), 0.0
     with opened(path) as film:
-        total = film.streams.video[0].frames or max(round(duration(film) * speed(film)), 1)
+        total = film.stream.frames or max(round(film.seconds * film.rate), 1)
         most = total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf
-        step = max(int(min(speed(film) / JUDGED_PER_SECOND, most)), 1)
-        for number, (frame, end) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
+        step = max(int(min(film.rate / JUDGED_PER_SECOND, most)), 1)
+        for number, (frame, end) in enumerate(track(film.frames(), f"Watching {path.name}", total)):
             if number % step == 0:
                 luminance = grey(frame, JUDGED_SIDE)
                 rows.append((number, end, sharpness(luminance), odometer.show(grey(frame, MOVEMENT_SIDE))))
         if not rows:
             raise LumigraphError(f"{path} has no frames; record it again or take it from its source")
-        if end - rows[0][1] < MIN_DURATION_SHARE * duration(film) - 1 / speed(film):
-            text = f"{path} breaks off after {end:.1f} of {duration(film):.1f} s; what comes before is used"
+        if end - rows[0][1] < MIN_DURATION_SHARE * film.seconds - 1 / film.rate:
+            text = f"{path} breaks off after {end:.1f} of {film.seconds:.1f} s; what comes before is used"
             warnings.warn(LumigraphWarning(text), stacklevel=2)
     numbers = [number for number, *_ in rows]
     times, sharp, travelled = np.array([figures for _, *figures in rows]).T
@@ -125,8 +118,7 @@ def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict
     """Write the chosen frames except repetitions of earlier ones. Returns names and seconds from the first frame on."""
     written: dict[str, float] = {}
     signatures: list[np.ndarray] = []
-    for number, frame, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
-        image = upright(frame)
+    for number, image, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
         new = signature(image.convert("L"))
         if not any(new @ old > DUPLICATE_CORRELATION for old in signatures):
             name = f"{number:06d}.jpg"
@@ -136,76 +128,16 @@ def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict
     return written
 
 
-def picked(path: Path, chosen: Sequence[int]) -> Iterator[tuple[int, VideoFrame, float]]:
+def picked(path: Path, chosen: Sequence[int], tags: Tags | None = None) -> Iterator[tuple[int, Image.Image, float]]:
+    """Numbers, pictures and seconds from the first on of chosen frames. tags: as in `opened`"""
     wanted, beginning = set(chosen), 0.0
-    with opened(path) as film:
-        for number, (frame, seconds) in enumerate(decoded(path, film)):
+    with opened(path, tags) as film:
+        for number, (frame, seconds) in enumerate(film.frames()):
             beginning = seconds if number == 0 else beginning
             if number in wanted:
-                yield number, frame, seconds - beginning
+                yield number, film.picture(frame), seconds - beginning
             if number == chosen[-1]:
                 return
-
-
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[InputContainer]:
-    """Open a film. Raises LumigraphError for one without pictures."""
-    try:
-        container = av.open(str(path))
-    except (av.FFmpegError, ValueError) as fault:
-        raise LumigraphError(
-            f"{path} cannot be read as a video ({why(fault)}); take it from its source again, or convert it to MP4"
-        ) from fault
-    with container:
-        if not container.streams.video:
-            raise LumigraphError(f"{path} holds no pictures, only other tracks such as sound; name another video")
-        container.streams.video[0].thread_type = "AUTO"
-        yield container
-
-
-def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, with their times in seconds, up to the first damaged one. Raises LumigraphError if no frame can
-    be decoded."""
-    rate, count = speed(film), 0
-    try:
-        for frame in film.decode(video=0):
-            yield frame, count / rate if frame.time is None else float(frame.time)
-            count += 1
-    except av.FFmpegError as fault:
-        if count == 0:
-            raise LumigraphError(
-                f"{path} cannot be decoded ({why(fault)}); take it from its source again, or convert it to MP4"
-            ) from fault
-
-
-def speed(film: InputContainer) -> float:
-    """Frames per second, on average."""
-    stream = film.streams.video[0]
-    return float(stream.average_rate or stream.guessed_rate or 30)
-
-
-def duration(film: InputContainer) -> float:
-    """Duration in seconds; 0 if the file does not state it."""
-    stream = film.streams.video[0]
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * stream.time_base)
-    return (film.duration or 0) / av.time_base
-
-
-def grey(frame: VideoFrame, longest: int) -> Float[np.ndarray, "height width"]:
-    """Luminance from 0 to 255, reduced so that the longer side is at most `longest` pixels. Not rotated upright."""
-    times = max(frame.width / longest, frame.height / longest, 1.0)
-    width, height = (max(round(side / times), 1) for side in (frame.width, frame.height))
-    return frame.reformat(width, height, format="gray", interpolation="AREA").to_ndarray().astype(np.float32)
-
-
-def upright(frame: VideoFrame) -> Image.Image:
-    """A frame rotated upright, in sRGB bytes."""
-    return frame.to_image().rotate(frame.rotation, expand=True)
-
-
-def why(fault: Exception) -> str:
-    return (getattr(fault, "strerror", None) or str(fault)).lower()
 
 
 class Odometer:
