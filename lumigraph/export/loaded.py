@@ -123,7 +123,10 @@ class Loaded:
 
     def moving(self, duration: float) -> MovingGaussians:
         """Moving Gaussians to keep, in the scene's frame. duration: seconds of the whole capture when it is played"""
-        moving = needs(self.method, HasMovingGaussians).moving(duration)
+        if can(self.method, HasMovingGaussians):
+            moving = needs(self.method, HasMovingGaussians).moving(duration)
+        else:
+            moving = MovingGaussians.still(needs(self.method, HasGaussians).gaussians(), duration)
         return moving[self.kept(moving.cloud, self.crop)]
 
     def kept_method(self) -> Method:

@@ -39,6 +39,13 @@ class MovingGaussians:
     ends: Float[Tensor, " gaussian"]
     fades: Float[Tensor, " gaussian"]
 
+    @classmethod
+    def still(cls, cloud: Gaussians, duration: float) -> MovingGaussians:
+        """Gaussians that stand still all the time."""
+        begins = torch.zeros(len(cloud), device=cloud.means.device)
+        times = begins, begins, begins + duration, begins + torch.inf
+        return cls(cloud, duration, torch.zeros_like(cloud.means, dtype=torch.float32), *times)
+
     def __len__(self) -> int:
         return len(self.cloud)
 

@@ -211,6 +211,9 @@ LACKING = {
     CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of eg3d",
     CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
     RendersRays: "renders whole pictures, so single rays have no colour",
+    HasMovingGaussians: "holds no Gaussians that move; deformable-splatting does",
+    HasViewpoint: "does not know where its objects are usually seen from; eg3d does",
+    DrawsPictures: "draws one picture at a time",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }
 
