@@ -166,7 +166,7 @@ def export_splats(
             cloud = cloud[loaded.kept(cloud, loaded.crop and loaded.crop.moved(opened.frame.to_source))]
     else:
         loaded = Loaded.of(opened, "cpu", settings, part, scaling)
-        cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix)
+        cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix, far=True)
     write_gaussians(path, cloud, Detail(**options.detail.given))
     return cloud
 
@@ -178,5 +178,5 @@ def export_moving(loaded: Loaded, path: Path, options: SplatsOptions = SplatsOpt
     if "time" in loaded.method.settings:
         raise LumigraphError("A .4dgs holds every moment; leave out --set time, or name a .spz for one of them")
     moving = loaded.moving(options.duration)
-    write_moving(path, moving.transformed(loaded.frame.to_export.matrix))
+    write_moving(path, moving.transformed(loaded.frame.to_export.matrix, far=True))
     return moving

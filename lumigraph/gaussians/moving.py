@@ -54,10 +54,10 @@ class MovingGaussians:
         tensors = self.velocities, self.middles, self.begins, self.ends, self.fades
         return MovingGaussians(self.cloud[index], self.duration, *(x[index] for x in tensors))
 
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> MovingGaussians:
+    def transformed(self, similarity: Float[Tensor, "4 4"], far: bool = False) -> MovingGaussians:
         """The same in another frame, x' = M x."""
         turn = similarity[:3, :3].to(self.velocities)
-        return replace(self, cloud=self.cloud.transformed(similarity), velocities=self.velocities @ turn.T)
+        return replace(self, cloud=self.cloud.transformed(similarity, far), velocities=self.velocities @ turn.T)
 
     def lasting(self, duration: float) -> MovingGaussians:
         """The same motion stretched to another duration in seconds."""

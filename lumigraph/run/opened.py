@@ -139,7 +139,7 @@ class Opened(ABC):
         """Cloud in the source's frame, in the order of the method's. Raises LumigraphError for a model without
         Gaussians.
         """
-        return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix)
+        return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix, far=True)
 
     def view_names(self) -> dict[str, list[str]]:
         """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
