@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """Folder of this user for data that can be made again."""
+    """This user's folder for reproducible data."""
     if chosen := os.environ.get("LUMIGRAPH_CACHE"):
         return Path(chosen)
     if sys.platform == "darwin":
