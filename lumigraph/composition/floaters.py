@@ -50,7 +50,7 @@ class FloaterEvidence:
 
     @property
     def place(self) -> Float[Tensor, " gaussian"]:
-        """Evidence of position: the largest of in front, near a camera, or seen by few."""
+        """Evidence of position: in front, near a camera, or seen by few, combined as 1 - product of complements."""
         return 1 - (1 - self.in_front) * (1 - self.near) * (1 - FEW_WEIGHT * self.few)
 
     @property
