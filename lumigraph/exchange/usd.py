@@ -1,8 +1,8 @@
 """Clouds in OpenUSD as ParticleField3DGaussianSplat (schema of OpenUSD 26.03), which is written and not read.
 
 The stage has y up, so all is turned half around x, as in glTF. Numbers are float32: positions, scales without
-logarithm, opacities after the sigmoid, quaternions, and (degree + 1)^2 spherical harmonics to a Gaussian with the constant first,
-whose colour is 1/2 + sum, sRGB-encoded, as in the first release. `antialiased` is in customData.
+logarithm, opacities after the sigmoid, quaternions, and (degree + 1)^2 spherical harmonics to a Gaussian with the
+constant first, whose colour is 1/2 + sum, sRGB-encoded, as in the first release. `antialiased` is in customData.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Options of commands: how `--help` shows a field of a dataclass, in the field's annotation."""
+"""Options of commands: `--help` texts in the annotations of dataclass fields."""
 
 from __future__ import annotations
 

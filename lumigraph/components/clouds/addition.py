@@ -1,4 +1,4 @@
-"""Addition: a part of splatting, with hooks between the cloud and the loss; Step, which it changes there."""
+"""Addition: a part of splatting methods with hooks in a training step; Step, the state of a step."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from .dense_points import Points
 
 @dataclass
 class Step:
-    """One training step on its way from the cloud to the loss.
+    """State of one training step between the cloud and the loss.
 
-    chance:     random numbers of this step
-    whole:      the cloud that is learnt, with filters
-    cloud:      the cloud that is rasterized
-    camera:     of the photograph, with its learnt pose
-    picture:    rasterized, over black
-    rgb:        the picture in the photograph's appearance; in front of the background once `after_raster` is over
-    background: behind everything, one colour or one for each pixel
-    target:     colours that the loss compares with
-    residual:   rgb - target before pixels are left out
+    chance:     random generator of this step
+    whole:      the trained cloud, with filters
+    cloud:      the rasterised cloud
+    camera:     of the photograph, with its pose correction
+    picture:    rasterised, over black
+    rgb:        the picture in the photograph's appearance; composited over the background after `after_raster`
+    background: one colour or one for each pixel
+    target:     target colours of the loss
+    residual:   rgb - target before masking
     due:        whether density control is due after this step
     """
 
@@ -50,43 +50,43 @@ class Step:
 
 
 class Addition(Part):
-    """A part that changes how a cloud is learnt or shown. All hooks do nothing by default, and are visited in the order
-    in which parts were assigned. `method` is the CloudMethod that holds the part.
+    """A part that changes training or rendering of a cloud. All hooks do nothing by default, and are called in order of
+    assignment. `method` is the CloudMethod of the part.
 
-    base_colours: whether it keeps harmonics beyond the first at zero
+    base_colours: whether it keeps harmonics beyond degree 0 at zero
     """
 
     base_colours: bool = False
 
     def layers(self, data: Scene) -> tuple[str, ...]:
-        """Names of the layers that a step reads of its photograph."""
+        """Names of the layers of its photograph that a step reads."""
         return ()
 
     # The cloud
 
     def begin_cloud(self, method: Any) -> None:
-        """Follow a new cloud."""
+        """Initialise for a new cloud."""
 
     def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
-        """Initialise from the photographs. sweep: gives points that plane sweeps find"""
+        """Initialise from the photographs. sweep: returns points of plane sweeps"""
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        """Follow a cloud of which the Gaussians of a mask, or of indices, are left."""
+        """Update after pruning to the Gaussians of a mask, or of indices."""
 
     def filtered(self, cloud: Gaussians) -> Gaussians:
-        """The cloud as it is rasterized, in training and rendering."""
+        """The cloud with filters, as it is rasterised in training and rendering."""
         return cloud
 
     # A training step
 
     def before_raster(self, method: Any, step: Step) -> None:
-        """Change the cloud that a step rasterizes."""
+        """Change the cloud before rasterisation in a step."""
 
     def after_raster(self, method: Any, step: Step) -> None:
-        """Change the colours and the background of a step."""
+        """Change the colours and the background in a step."""
 
     def mask(self, method: Any, step: Step) -> None:
-        """Leave pixels out: their target becomes their own colour."""
+        """Mask pixels: their target becomes their own colour."""
 
     def regularize(self, method: Any, step: Step) -> None:
         """Add terms to the loss."""
