@@ -275,11 +275,12 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "adaptive.densify_grad_threshold": 2e-4,
         "refine.refine_every": 100,
     },
-    "humannerf": {  # Weng 2022, section 4.1 and supplement, from memory; 400 000 steps
+    "humannerf": {  # chungyiweng/humannerf, configs/default.yaml; 400 000 steps
         "hidden_width": 256,
         "network.depth": 8,
         "network.position_frequencies": 10,
         "learning_rate": 5e-4,
+        "final_learning_rate": 5e-4 * 0.1 ** (400 / 500),  # lrate_decay 500, after 400 000 steps
         "weights.weight_cells": 32,
         "weights.weight_code": 256,
         "weights.weights_lr": 5e-5,
@@ -287,7 +288,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "bones.pose_depth": 4,
         "bones.pose_width": 256,
         "bones.pose_lr": 5e-5,
-        "bones.pose_from": 20_000 / 400_000,
+        "bones.pose_from": 0.0,
         "nonrigid.nonrigid_depth": 6,
         "nonrigid.nonrigid_width": 128,
         "nonrigid.nonrigid_frequencies": 6,

@@ -33,19 +33,19 @@ PROBED_MOMENTS = 8  # at which an update of the occupancy grid asks for density
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers from memory; `HumanNeRF.preset` has those of a plain CPU."""
+    """Numbers of the release for ZJU-MoCap, chungyiweng/humannerf, configs/default.yaml."""
 
     network: NetworkNumbers = NetworkNumbers()
     table: HashNumbers = HashNumbers(sh_bands=1)
     occupancy: OccupancyNumbers = OccupancyNumbers()
     steps: StepNumbers = StepNumbers(256)
-    bones: BoneNumbers = BoneNumbers(pose_from=0.05)
+    bones: BoneNumbers = BoneNumbers()
     weights: WeightNumbers = WeightNumbers()
     nonrigid: NonRigidNumbers = NonRigidNumbers()
     field: Literal["hash", "network"] = "network"  # canonical field: the paper's network, or a faster hash table
     hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
     learning_rate: LearningRate = 5e-4  # Adam's learning rate of the canonical field at first
-    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
+    final_learning_rate: LearningRate = 5e-4 * 0.1**0.8  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
