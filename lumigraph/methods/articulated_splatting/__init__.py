@@ -113,7 +113,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
 
     def at(self, canonical: Gaussians, time: float) -> Gaussians:
         """A canonical cloud at a moment under the settings, as a picture or a map of contact."""
-        cloud = self.skin.at(self, canonical, time)
+        cloud = self.skin.at(self.settings, canonical, time)
         if self.settings.get("show", PICTURE) == PICTURE:
             return cloud
         return contact_map(cloud, self.body_of(canonical), self.config.contact_distance)
