@@ -21,6 +21,7 @@ from lumigraph import methods
 from lumigraph.budget import Budget
 from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import is_file, write_json
@@ -92,7 +93,7 @@ def figures(method: Any, scene: Scene, views: int) -> tuple[dict[str, float], to
     def keep(name: str, rendering: Rendering) -> None:
         seen.append(rendering.rgb.clamp(0, 1))
 
-    found = evaluate(method, scene, "test", keep, views)
+    found = evaluate(method, scene, EvaluationOptions("test", views), keep)
     middle = sorted(view.seconds for view in found.views)[len(found.views) // 2]
     return {"psnr": found.psnr, "seconds_per_view": middle}, seen[0]
 

@@ -15,9 +15,11 @@ from pathlib import Path
 import tyro
 from rich.table import Table
 
-from lumigraph.derive.compression import LADDER, CompressionTarget
+from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.compress import STAGES, Ladder, important, truth_of
-from lumigraph.evaluation import evaluate
+from lumigraph.derive.options import CompressOptions
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import scene_name, write_bytes, write_json
 from lumigraph.methods import colour
@@ -52,12 +54,12 @@ def rungs(run: Run, options: Options) -> list[dict]:
     ladder = Ladder(
         run,
         truth,
-        CompressionTarget(loss=0.0, steps=options.steps, seconds=timed),
+        CompressOptions(max_loss=0.0, steps=options.steps, seconds=timed),
         options.device,
         important(before, truth),
         NumberedStages(STAGES, "", show=False),
     )
-    psnr = evaluate(before, truth.scene, "test", views=options.views).psnr
+    psnr = evaluate(before, truth.scene, EvaluationOptions("test", options.views)).psnr
     rows = [
         {
             "method": run.method_name,
@@ -71,7 +73,7 @@ def rungs(run: Run, options: Options) -> list[dict]:
         begin, model = time.perf_counter(), ladder.at(number)
         ladder.tune(model, 1.0)
         size, seconds = len(model.packed()), time.perf_counter() - begin
-        psnr = evaluate(model.method, truth.scene, "test", views=options.views).psnr
+        psnr = evaluate(model.method, truth.scene, EvaluationOptions("test", options.views)).psnr
         rows.append({**rows[0], "rung": number, "bytes": size, "psnr": psnr, "seconds": seconds})
     return rows
 

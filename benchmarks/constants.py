@@ -19,7 +19,8 @@ import tyro
 from rich.table import Table
 
 from lumigraph import methods
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files import read_json, write_json
 from lumigraph.files.ranges import changed
 from lumigraph.opening import open_dataset
@@ -121,7 +122,7 @@ def held_out(name: str, data: Any, numbers: dict[str, Any], options: Options) ->
     config = changed(kind.Config(), **numbers)
     method = build(kind, data.frame, config, torch.device("cpu"), options.seed, learning=True)
     go_on_unless(fit(method, data, steps=options.steps, seed=options.seed, show=False).signal)
-    scores = evaluate(method, data, views=VIEWS)
+    scores = evaluate(method, data, EvaluationOptions(views=VIEWS))
     return {"psnr": round(scores.psnr, 2), "ssim": round(scores.ssim, 3), "halves": scores.protocol["halves"]}
 
 

@@ -25,7 +25,8 @@ import tyro
 
 from lumigraph import methods
 from lumigraph.commands.compress import size
-from lumigraph.derive.conversion import ConversionTarget, convert, new_student
+from lumigraph.derive.conversion import convert, new_student
+from lumigraph.derive.options import ConvertOptions
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.figures.charts import standalone
 from lumigraph.files import claim, is_file, write_bytes, write_json
@@ -100,11 +101,11 @@ class Template:
         teacher = source.method(self.device)
         around = source.cameras()["train"]
         for name in self.into:
-            student = new_student(methods.find(name), teacher, ConversionTarget(), torch.device(self.device))
+            student = new_student(methods.find(name), teacher, torch.device(self.device))
             needs(student, FromField).from_field(teacher, around)
             folder = self.output.with_suffix("") / name
             made = Converted.read(folder) or convert(
-                source, name, folder, ConversionTarget(seconds=self.seconds), self.device
+                source, name, folder, ConvertOptions(seconds=self.seconds), self.device
             )
             pictures = [x.render(camera).rgb.cpu() for x in (teacher, student.eval(), Run(folder).method(self.device))]
             rows.append(Row(("", f"{name}, {made.taking_over:.0f} s", f"{made.seconds:.0f} s"), pictures))

@@ -21,7 +21,7 @@ from lumigraph.components.clouds.dense_points import Points, seen_points
 from lumigraph.datasets.scene import Scene
 from lumigraph.depth_maps.depth_map import SurfacePoints, free
 from lumigraph.depth_maps.multi_view import multi_view_depth
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.opening import open_scene
 from lumigraph.run import build
 from lumigraph.system.signals import go_on_unless

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from lumigraph import methods
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import write_bytes
 from lumigraph.geometry import evenly
@@ -48,7 +49,7 @@ def main(options: Options) -> None:
         config = replace(config, deformation=replace(config.deformation, elastic_weight=weight))
         method = build(methods.find("nerfies"), scene.frame, config, torch.device("cpu"), 0, learning=True)
         go_on_unless(fit(method, scene, steps=options.steps, show=False).signal)
-        values, psnr = singular_values(method, scene), evaluate(method, scene, views=8).psnr
+        values, psnr = singular_values(method, scene), evaluate(method, scene, EvaluationOptions(views=8)).psnr
         name = f"weight {weight:g}"
         told = ", ".join(f"{100 * q:g} %: {np.quantile(values, q):.3f}" for q in QUANTILES)
         print(f"{name}: {told}; between 0.9 and 1.1: {np.mean(np.abs(values - 1) < 0.1):.3f}; held out {psnr:.2f} dB")

@@ -15,7 +15,8 @@ from typing import Any
 
 import tyro
 
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.geometry import evenly
 from lumigraph.readers.views import with_fewer_views
@@ -57,7 +58,10 @@ def main(options: Options) -> None:
     learnt = evenly(list(data.members("train")), options.members)
     for split in ("train", "test"):
         told = [method.given(instance=name.rpartition("-")[2].lstrip("0") or "0") for name, _ in learnt]
-        shown = [evaluate(x, scene, split, views=options.views) for x, (_, scene) in zip(told, learnt, strict=True)]
+        shown = [
+            evaluate(x, scene, EvaluationOptions(split, options.views))
+            for x, (_, scene) in zip(told, learnt, strict=True)
+        ]
         rows[f"learnt members, {split} views"] = shown
     table(rows)
     for (name, _), seen in list(zip(learnt, rows["learnt members, test views"], strict=True))[:4]:
@@ -68,13 +72,15 @@ def main(options: Options) -> None:
     unseen = evenly(list(data.members("test")), options.members)
     pictures = []
     for count in options.photographs:
-        rows = {"average code": [evaluate(method, scene, views=options.views) for _, scene in unseen]}
+        rows = {
+            "average code": [evaluate(method, scene, EvaluationOptions(views=options.views)) for _, scene in unseen]
+        }
         for step, without in STEPS.items():
             method.config, found = replace(config, **{name: 0 for name in without}), []
             for _, scene in unseen:
                 fewer = with_fewer_views(scene, count)
                 told = method.given(replace(fewer, splits={"train": fewer.splits["train"]}))
-                found.append(evaluate(told, scene, views=options.views))
+                found.append(evaluate(told, scene, EvaluationOptions(views=options.views)))
             rows[step] = found
         method.config = config
         table({f"{count} photographs, {step}": found for step, found in rows.items()})

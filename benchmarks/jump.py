@@ -21,6 +21,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import OmnidirectionalStereo
 from lumigraph.depth_maps.stereo import as_bytes, semi_global
 from lumigraph.export import jump
+from lumigraph.export.options import JumpOptions
 from lumigraph.figures import Row, contact_sheet
 from lumigraph.metrics import psnr
 from lumigraph.opening import open_scene
@@ -41,7 +42,7 @@ def main() -> None:
     name, *numbers = given.scene.removeprefix("procedural:").split(",")
     world = scenes.stage(name, **{key: int(value) for key, value in (one.split("=") for one in numbers)}).world
     scene = open_scene(given.scene)
-    found, _ = jump.stereo_panorama(scene, given.size)
+    found, _ = jump.stereo_panorama(scene, JumpOptions(given.size))
     size, rows = (given.size, given.size // 2), within(given.size // 2)
     forward, up, to_world = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]), scene.frame.to_source
     axes = [to_world.directions(axis.double()) for axis in (torch.linalg.cross(-up, forward), -up, forward)]

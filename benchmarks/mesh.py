@@ -34,9 +34,9 @@ from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.shapes.triangles import Triangles
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.export.mesh import extract_mesh
-from lumigraph.export.options import MeshOptions
+from lumigraph.export.options import MeshOptions, PointsOptions
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
 from lumigraph.method import Method
@@ -163,7 +163,7 @@ def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
     """Median distances between what is exported of one run."""
     method, cameras = run.method(), run.cameras()["train"]
     mesh = extract_mesh(method, cameras, MeshOptions(views=views)).in_source(run.frame)
-    points = extract_points(method, cameras, views=views).in_source(run.frame).positions
+    points = extract_points(method, cameras, PointsOptions(views=views)).in_source(run.frame).positions
     surface, _ = spread(mesh)
     low, high = surface.min(0), surface.max(0)
     tree = cKDTree(surface)

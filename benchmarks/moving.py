@@ -30,7 +30,8 @@ from torch import Tensor
 from lumigraph import methods
 from lumigraph import synthetic as procedural
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import to_bytes
 from lumigraph.files import write_json
 from lumigraph.method import Method
@@ -75,7 +76,7 @@ def main(options: Options) -> None:
             outcome = fit(
                 method, scene, steps=options.steps, seconds=options.seconds, show=False, rehearsal=options.steps is None
             )
-        found = evaluate(method, scene, views=options.compared).to_json()
+        found = evaluate(method, scene, EvaluationOptions(views=options.compared)).to_json()
         rows[method_name] = {
             **{kind: {k: v for k, v in part.items() if v is not None} for kind, part in found["by_held_out"].items()},
             **motion_scores(method, stage, scene),

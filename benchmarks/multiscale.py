@@ -18,7 +18,7 @@ from rich.table import Table
 
 from lumigraph import methods
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
 from lumigraph.opening import open_scene

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from lumigraph.components.fields import layers
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
-from lumigraph.components.sampling.occupancy import MaskNumbers, OccupancyMask
+from lumigraph.components.sampling.occupancy import OccupancyMask
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
@@ -124,7 +124,7 @@ def skipping(options: Options) -> dict[str, float | str]:
             f"{run.folder} is no run of nerf that learnt without a grid, and what a grid rules out is never learnt; "
             f"train one with --preset laptop --occupancy-resolution 0"
         )
-    cameras, grid = run.cameras()["test"], OccupancyMask(CELLS, MaskNumbers.occupancy_threshold).to(method.device)
+    cameras, grid = run.cameras()["test"], OccupancyMask(CELLS).to(method.device)
     whole = method.sampler.empty
     for seed in range(LOOKS):
         grid.grid.update(method.density, grid.thickness, torch.Generator().manual_seed(seed), decay=1.0)

@@ -37,6 +37,7 @@ from lumigraph.color.srgb import srgb_from_linear
 from lumigraph.composition import PickedCloud
 from lumigraph.exchange import read_gaussians
 from lumigraph.figures import Row, contact_sheet
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians import joined
 from lumigraph.geometry import Similarity, evenly
 from lumigraph.large import open_any
@@ -173,14 +174,14 @@ class RemovalOptions:
         variants: dict[str, Any] = {"object-nerf": {"guided": True}, "object-nerf, unguided": {"guided": False}}
         if self.identities:
             variants["gaussian-splatting"] = {}
-        for label, changed in variants.items():
+        for label, options in variants.items():
             kind_of = methods.find(label.partition(",")[0])
             config = kind_of.cpu_preset()
             if "splatting" in label:
-                config = replace(config, groups=replace(config.groups, objects="yes"))
+                config = changed(config, objects="yes")
             else:
-                config = replace(config, occupancy=replace(config.occupancy, samples_per_step=self.samples))
-            method = build(kind_of, scene.frame, replace(config, **changed), torch.device("cpu"), 0)
+                config = changed(config, samples_per_step=self.samples)
+            method = build(kind_of, scene.frame, changed(config, **options), torch.device("cpu"), 0)
             begin = time.process_time()
             go_on_unless(fit(method, scene, steps=self.steps, show=False, rehearsal=False).signal)
             seconds = time.process_time() - begin

@@ -23,6 +23,7 @@ from textured import rendered
 from viewer_drag import browser
 
 from lumigraph.datasets.scene import Scene
+from lumigraph.export.options import Photo3DOptions
 from lumigraph.export.photo3d import photo3d
 from lumigraph.figures import Row, contact_sheet
 from lumigraph.metrics import psnr
@@ -49,7 +50,7 @@ def main() -> None:
     for source in given.scenes:
         scene = burst(open_scene(source, given.downscale, whole=True))
         begin = time.process_time()
-        found = photo3d(scene, given.size)
+        found = photo3d(scene, Photo3DOptions(given.size))
         spent, scores, shares = time.process_time() - begin, [], []
         for number in scene.splits["test"].tolist():
             photograph = scene.photograph(number)

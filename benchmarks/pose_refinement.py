@@ -24,7 +24,7 @@ from lumigraph import methods
 from lumigraph.components.training.pose_refinement import PoseRefinement
 from lumigraph.datasets.alignment import moves
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
 from lumigraph.opening import open_scene

@@ -31,6 +31,7 @@ from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.color.srgb import linear_from_srgb
 from lumigraph.components.fields.development import encoded
 from lumigraph.datasets.scene import Frame
+from lumigraph.export.options import ProbesOptions
 from lumigraph.export.probes import bake_probes
 from lumigraph.export.probes_page import BALL_WHITE, flat_camera, probes_page
 from lumigraph.figures import to_image
@@ -148,7 +149,9 @@ def irradiance_rows(options: Options) -> list[dict[str, Any]]:
     # A probe at each point, a little above the surface: its cube sees half of it from inside nothing.
     raised = points + 0.03 * normals
     alone = [
-        bake_probes(exact, None, (tuple((p - 1e-3).tolist()), tuple((p + 1e-3).tolist())), counts=(1, 1, 1))
+        bake_probes(
+            exact, None, (tuple((p - 1e-3).tolist()), tuple((p + 1e-3).tolist())), ProbesOptions(counts=(1, 1, 1))
+        )
         for p in raised[:: len(raised) // 60]
     ]
     some = slice(None, None, len(raised) // 60)
@@ -163,7 +166,7 @@ def irradiance_rows(options: Options) -> list[dict[str, Any]]:
         sources.append((run.method_name, run.method(), run.cameras()["train"], run.frame.to_export))
     for name, method, cameras, to_export in sources:
         for counts in options.counts if name == "tracer" else options.counts[1:2]:
-            grid = bake_probes(method, cameras, method.frame.bounds, counts=counts)
+            grid = bake_probes(method, cameras, method.frame.bounds, ProbesOptions(counts=counts))
             there = points, normals
             if to_export is not None:  # the room's own frame is that of the photographs
                 assert torch.allclose(to_export.rotation, torch.eye(3, dtype=torch.float64), atol=1e-6)
@@ -202,7 +205,10 @@ def ball_rows(options: Options) -> list[dict[str, Any]]:
         for name, method, stage, (middle, radius, eye) in cases:
             camera = pinhole(np.stack([look_at(eye, middle)]), 240, 50.0)
             grid = bake_probes(
-                method, None, method.frame.bounds, counts=options.ball_counts, face_size=options.face_size
+                method,
+                None,
+                method.frame.bounds,
+                ProbesOptions(counts=options.ball_counts, resolution=options.face_size),
             )
             scene = method.frame.to_source.inverse
             length = scene.scale

@@ -106,12 +106,13 @@ def look(run: Path, pictures: int) -> None:
     """Open a run in the viewer, look at it from several places, save a path, go."""
     from viewer_client import Client
 
-    from lumigraph.commands.options import open_method
     from lumigraph.commands.view import subject_of
+    from lumigraph.export.loaded import Loaded
+    from lumigraph.large import open_any
     from lumigraph.viewer import Viewer, choose_address
 
-    opened, method, cameras = open_method(run, "cpu")
-    with Viewer(method, subject_of(opened, cameras), choose_address()) as viewer:
+    loaded = Loaded.of(open_any(run), "cpu")
+    with Viewer(loaded.method, subject_of(loaded.opened, loaded.cameras), choose_address()) as viewer:
         client = Client(viewer.address.url)
         for i in range(pictures):
             client.look_from((3.0, 0.4 * i, 0.5))

@@ -31,7 +31,7 @@ from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
 from lumigraph.datasets.scene import Scene
 from lumigraph.datasets.tracks import GraphNode, TrackEdit, TrackEdits, nodes_of
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import to_bytes
 from lumigraph.files import write_json
 from lumigraph.files.ranges import changed

@@ -16,7 +16,8 @@ from dataclasses import replace
 import torch
 
 from lumigraph import methods
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.method.depth import DepthNumbers
 from lumigraph.opening import open_scene
 from lumigraph.run import build
@@ -47,7 +48,7 @@ def main() -> None:
                 config = replace(kind.cpu_preset(), measured=DepthNumbers(weight))
                 method = build(kind, scene.frame, config, torch.device("cpu"), 0, learning=True)
                 go_on_unless(fit(method, scene, steps=given.steps, show=False).signal)
-                scores.append(evaluate(method, scene, views=TEST_VIEWS))
+                scores.append(evaluate(method, scene, EvaluationOptions(views=TEST_VIEWS)))
             (psnr, psnr_with), (depth, depth_with) = ([getattr(s, x) for s in scores] for x in ("psnr", "depth_error"))
             cells = [name, views, f"{psnr:.2f}", f"{psnr_with:.2f}", f"{depth:.1f} %", f"{depth_with:.1f} %"]
             print("|", " | ".join(map(str, [*cells, f"{time.process_time() - begin:.0f}"])), "|", flush=True)

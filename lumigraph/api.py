@@ -5,7 +5,8 @@
     run.export("web", "page.html")
 
 Each call is a command of the command line, with the same options; `commands.calls` says how they are written. Long work
-shows its progress on stderr.
+shows its progress on stderr. All but `train` and `call` also take progress=FUNCTION, which hears of each stage: its
+description, the items done, and all of them or None; what it raises ends the work, and so does true as its result.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ from .commands.results import Evaluation, Exported, Film, Reports
 from .datasets.dataset import Dataset
 from .datasets.scene import Scene
 from .errors import LumigraphError
-from .large import held_open, open_any
+from .large import open_any
 from .method import Method
 from .opening import open_scene
 from .run import Opened
+from .system.progress import Listener, heard_by
 
 Progress = Callable[[int, float, dict[str, Any]], object]
 
@@ -121,18 +123,14 @@ class Model:
         names = dict.fromkeys(name for row in rows for name, value in row.items() if isinstance(value, int | float))
         return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
-    def _made(self, name: str, *arguments: object, **options: Any) -> Any:
+    def _made(self, name: str, *arguments: object, progress: Listener | None = None, **options: Any) -> Any:
         """Result of a command on what is opened."""
-        made: Reports = command(name, self.opened.path, *arguments, **options)
-        with held_open(self.opened):
-            return quietly(made.made)[0]
+        asked: Reports = command(name, self.opened.path, *arguments, **options)
+        return quietly(lambda: asked.of(self.opened), progress)[0]
 
     def _derived(self, name: str, output: Path | str, *arguments: object, **options: Any) -> Model:
         """Run or file that a command makes of what is opened."""
-        made = command(name, self.opened.path, *arguments, output=output, **options)
-        with held_open(self.opened):
-            finished(quietly(made.run)[0])
-        return open(output)
+        return open(self._made(name, *arguments, output=output, **options).path)
 
 
 def open(path: str | Path) -> Model:
@@ -151,7 +149,12 @@ def call(name: str, /, *arguments: object, **options: Any) -> dict[str, str]:
     return {title: str(value) for title, value in rows.items()}
 
 
-def capture(photographs: str | Path | Iterable[str | Path], output: str | Path | None = None, **options: Any) -> Scene:
+def capture(
+    photographs: str | Path | Iterable[str | Path],
+    output: str | Path | None = None,
+    progress: Listener | None = None,
+    **options: Any,
+) -> Scene:
     """Find the camera poses of photographs or of a video, and open the scene.
 
     photographs: a folder, a video, or image files
@@ -160,7 +163,8 @@ def capture(photographs: str | Path | Iterable[str | Path], output: str | Path |
     """
     many = [photographs] if isinstance(photographs, str | Path) else list(photographs)
     folder = Path(output) if output is not None else scene_folder(tuple(map(Path, many)))
-    call("capture", *many, output=folder, **options)
+    with heard_by(progress):
+        call("capture", *many, output=folder, **options)
     return open_scene(folder)
 
 

@@ -120,3 +120,17 @@ Efforts = Mapping[Quality, Effort]
 BY_PHOTOGRAPH: Efforts = {"draft": Effort(10, 500), "good": Effort(60, 3000), "best": Effort(200, 10_000)}
 # Of methods that learn from single rays: Müller 2022 and Mildenhall 2020 see each pixel some 5 to 13 times.
 BY_RAY: Efforts = {"draft": Effort(0.05, 500), "good": Effort(0.5, 3000), "best": Effort(5.0, 10_000)}
+
+
+def given_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
+    """The Budget of --steps or --seconds; `None` without them. Raises LumigraphError, before anything is opened, for an
+    impossible value, and for more than one of these options."""
+    if sum(given is not None for given in (steps, seconds, quality)) > 1:
+        raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
+    return None if steps is None and seconds is None else Budget(steps, seconds)
+
+
+def about_quality(numbers: Mapping[str, str] = {}) -> str:
+    """Help text of --quality. numbers: further words on each quality"""
+    about = "Choose the steps by method, number of photographs and their size. "
+    return about + "; ".join(f"{name}, {means}{numbers.get(name, '')}" for name, means in MEANS.items()) + "."

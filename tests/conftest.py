@@ -8,8 +8,10 @@ worker has tests that compile none, because a kernel that two workers compile at
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,6 +19,10 @@ from typing import Any
 # long ours look, which outvotes OMP_WAIT_POLICY.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= {"OMP_NUM_THREADS": "1", "GOMP_SPINCOUNT": "0"}
+
+# Byte code is kept, here and in the processes that tests start: compiling takes each worker 20 s and each process 3 s.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import lumigraph  # noqa: F401  # isort: skip
 import pytest  # isort: skip
@@ -39,7 +45,7 @@ if not torch.cuda.is_available():
 
 shape_checks.install()
 
-from lumigraph.system.allocation import settle_memory  # noqa: E402
+from lumigraph.system.allocation import settle_memory
 
 settle_memory()  # as commands do: memory that one training step frees is kept for the next
 
@@ -63,6 +69,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     from lumigraph import methods
 
     LEDGER.methods = len(methods.available())
+    gc.collect()
+    gc.freeze()  # what collection made stays to the end; looking through it again takes a second each time
 
 
 @pytest.hookimpl(wrapper=True)
@@ -122,6 +130,7 @@ def pytest_testnodedown(node: Any) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    gc.unfreeze()  # libraries count what is left at the end of the process
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["costs"] = LEDGER.to_plain()
     elif exitstatus == 0 and LEDGER.excessive() and not busy():

@@ -625,7 +625,8 @@ def test_the_folder_is_shown_on_its_own_machine_alone(app, client, project, tmp_
 def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run):
     import tiny
 
-    from lumigraph.evaluation import evaluate_run
+    from lumigraph.evaluation.options import EvaluationOptions
+    from lumigraph.evaluation.run import evaluate_run
     from lumigraph.run import Run
 
     place = find_item(app.root, project).path / "runs" / "a"
@@ -637,7 +638,9 @@ def test_a_run_is_compared_with_its_photographs(app, running, project, ball_run)
     expected = {"run_folder": str(place), "split": "test", "views": 12, "save_images": True, "overwrite": True}
     assert calls(app, project) == [("eval", expected)]
     run = Run(place)
-    evaluate_run(run, run.method("cpu"), tiny.scene(), "test", True, 2)  # as the command does
+    evaluate_run(
+        run, run.method("cpu"), tiny.scene(), EvaluationOptions(views=2, save_images=True)
+    )  # as the command does
     compared = running.get(f"/api/items/{project}").json()["runs"][0]["compared"]
     assert len(compared["views"]) == 2 and not compared["stale"] and compared["views"][0]["held_out"]
     about = {"run": "a", "name": compared["views"][0]["name"]}

@@ -20,8 +20,9 @@ from lumigraph.composition import Placed
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
@@ -174,7 +175,9 @@ def test_unknown_exposures_count_as_usual():
 
 def test_the_light_of_a_held_out_photograph_is_found_on_its_left_half(lit):
     method, scene = lit
-    average, halves = (evaluate(x, scene, right_halves=True) for x in (method.given(appearance="average"), method))
+    average, halves = (
+        evaluate(x, scene, EvaluationOptions(right_halves=True)) for x in (method.given(appearance="average"), method)
+    )
     assert halves.psnr > average.psnr + 1
 
 

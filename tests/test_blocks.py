@@ -25,7 +25,6 @@ from safetensors.torch import load_file
 from streets import crossing_streets, write_street
 
 from lumigraph import methods
-from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.components.training.pose_refinement import PoseRefinement
 from lumigraph.composition import Placed
@@ -44,6 +43,7 @@ from lumigraph.readers import Places, places_of
 from lumigraph.run import Run
 from lumigraph.run.files import SplatFile
 from lumigraph.training import fit
+from lumigraph.training.options import BlockOptions, TrainOptions
 
 pytestmark = budget("runs", 25)
 
@@ -66,9 +66,9 @@ def run(street, tmp_path_factory) -> Path:
 
 
 def planned(street: Path, folder: Path, wish: str = "3", method: str = "voxel-grid") -> Plan:
-    recipe = planning.BlockRecipe(method, find(method).smallest(), {}, Budget(steps=3 * STEPS))
     places = places_of(read_capture(street))
-    plan = planning.make_plan(str(street), places, wish, recipe)
+    train, blocks = TrainOptions(steps=3 * STEPS), BlockOptions(wish)
+    plan = planning.make_plan(str(street), places, method, find(method).smallest(), train, blocks)
     return planning.begin(folder, plan, places, threads=1)
 
 

@@ -13,7 +13,8 @@ from lumigraph import methods
 from lumigraph.budget import QUALITIES, REJOIN_PROGRESS, Budget, Effort, lasting
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate, held_out_poses
+from lumigraph.evaluation import held_out_poses
+from lumigraph.evaluation.views import evaluate
 from lumigraph.method import Method
 from lumigraph.run import Run, build
 from lumigraph.training import fit

@@ -19,7 +19,6 @@ import lumigraph
 from lumigraph.commands.calls import command
 from lumigraph.commands.cli import COMMANDS, parse
 from lumigraph.errors import LumigraphError
-from lumigraph.large import held_open, open_any, open_run
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
 
@@ -144,11 +143,46 @@ def test_weights_are_loaded_once_for_all_calls(own_run, tmp_path, monkeypatch):
     assert len(opens) == 1 and found.path.name == "eval.json"
 
 
-def test_a_held_run_is_that_of_its_own_path_alone(own_run, ball_run):
-    with held_open(own_run.opened):
-        assert open_any(own_run.path) is own_run.opened is open_run(str(own_run.path))
-        assert open_any(ball_run.path) is not own_run.opened
-    assert open_any(own_run.path) is not own_run.opened
+@pytest.mark.parametrize("how", ["raise", "true"])
+@pytest.mark.parametrize("work", ["film", "mesh", "points", "web", "evaluate", "convert"])
+def test_work_is_heard_of_and_cancelled_without_a_trace(work, how, own_run, tmp_path, monkeypatch):
+    """Its function hears of stages; an exception of it, and true, end the work before any file is there."""
+    heard = []
+
+    def progress(description, count, total):
+        heard.append((description, count, total))
+        if how == "raise" and count == 1:
+            raise ValueError("enough")
+        return count == 1
+
+    monkeypatch.setattr(Run, "dataset", lambda *_: tiny.scene())
+    small = {"size": 16, "views": 4, "progress": progress}
+    calls = {
+        "film": lambda: own_run.film(tmp_path / "new.gif", frames=3, size=16, progress=progress),
+        "mesh": lambda: own_run.export("mesh", tmp_path / "new.ply", cell_size=0.2, **small),
+        "points": lambda: own_run.export("points", tmp_path / "new.ply", **small),
+        "web": lambda: own_run.export("web", tmp_path / "new.html", as_="views", **small),
+        "evaluate": lambda: own_run.evaluate(views=2, progress=progress),
+        "convert": lambda: own_run.convert("voxel-grid", tmp_path / "new", steps=3, views=1, progress=progress),
+    }
+    before = {path: path.read_bytes() for path in own_run.path.rglob("*") if path.is_file()}
+    with pytest.raises(ValueError if how == "raise" else KeyboardInterrupt):
+        calls[work]()
+    assert heard[0][1] == 0 and heard[-1][1] == 1 and all(total is None or count <= total for _, count, total in heard)
+    assert not list(tmp_path.glob("new*")) and not list(tmp_path.glob(".*partial*"))
+    assert {path: path.read_bytes() for path in own_run.path.rglob("*") if path.is_file()} == before
+
+
+def test_training_that_is_cancelled_keeps_its_last_state(ball_folder, tmp_path):
+    """A fault of the function ends it, and the run opens or is not there."""
+
+    def progress(step, share, row):
+        if step == 5:
+            raise ValueError("enough")
+
+    with pytest.raises(ValueError, match="enough"):
+        lumigraph.train(ball_folder, "voxel-grid", tmp_path / "run", steps=30, cells=6, progress=progress)
+    assert not (tmp_path / "run").exists() or lumigraph.open(tmp_path / "run").state.step <= 5
 
 
 def test_a_model_has_all_that_was_opened(own_run, tmp_path):

@@ -30,16 +30,17 @@ from lumigraph.opening import open_scene
 from lumigraph.readers.colmap import read as read_colmap
 from lumigraph.readers.oddities import jumps
 from lumigraph.readers.transforms import read as read_transforms
-from lumigraph.sfm import MotionOptions, demand, diagnosis, reconstruct, reconstruction, sphere, worker
+from lumigraph.sfm import demand, diagnosis, reconstruction, sphere, worker
 from lumigraph.sfm.agreement import Agreement, agreement
 from lumigraph.sfm.coverage import use_of
 from lumigraph.sfm.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.sfm.georeference import georeference, upright
 from lumigraph.sfm.lenses import group_by_lens, prior, write_database
+from lumigraph.sfm.options import MotionOptions
 from lumigraph.sfm.pairs import aggregated, alike, choose_matching, exhaustive, sequential
 from lumigraph.sfm.pairs import near as near_by
 from lumigraph.sfm.photos import Intake, Photo
-from lumigraph.sfm.reconstruction import Reconstruction
+from lumigraph.sfm.reconstruction import Reconstruction, reconstruct
 from lumigraph.sfm.stages import WORKER, Stages, key_of
 
 pytestmark = budget("capture", 45)  # 43 s measured, with captures of two scenes, a sphere and turned photographs

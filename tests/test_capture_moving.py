@@ -17,11 +17,11 @@ from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.export.video import open_video
 from lumigraph.opening import open_scene
-from lumigraph.sfm import capture_rig, is_rig
 from lumigraph.sfm.moving import MovingFeatures, check_still, check_times, leave_out_moving
+from lumigraph.sfm.options import MotionOptions
 from lumigraph.sfm.photos import Intake, Photo
-from lumigraph.sfm.reconstruction import MotionOptions, nothing_fits
-from lumigraph.sfm.rig import CLOCKS_FILE, common_moments, films_of
+from lumigraph.sfm.reconstruction import nothing_fits
+from lumigraph.sfm.rig import CLOCKS_FILE, capture_rig, common_moments, films_of, is_rig
 
 pytestmark = budget("capture", 5)
 STILL, MOVING, VIEWS, FOCAL = 60, 20, 4, 300.0

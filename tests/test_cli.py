@@ -209,6 +209,14 @@ def test_a_group_of_numbers_hides_no_option_of_train(capsys):
     assert "--steps N" in capsys.readouterr().out
 
 
+def test_options_need_no_pytorch():
+    """In a process of their own: dataclasses of options, which commands, apps and scripts declare nothing of again."""
+    rooms = "derive", "evaluation", "export", "sfm", "training"
+    asked = "; ".join(f"import lumigraph.{room}.options" for room in rooms)
+    script = f"import sys; {asked}; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
+
+
 def test_help_does_not_wait_for_pytorch():
     script = "import sys; from lumigraph.commands.cli import main; main(['methods']); sys.exit('torch' in sys.modules)"
     begin = time.perf_counter()

@@ -16,10 +16,11 @@ from test_gaussian_splatting import new
 
 from lumigraph import methods
 from lumigraph.commands.cli import main
-from lumigraph.commands.compress import bytes_in, verdict
+from lumigraph.commands.compress import verdict
 from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.compress import bytes_of, decibels, rendered, squared_error
 from lumigraph.derive.compression.model import RUNG_POSITIONS, CompressedModel, rung_at
+from lumigraph.derive.options import CompressOptions
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import held_out_poses
 from lumigraph.opening import open_scene
@@ -200,7 +201,7 @@ def test_a_rendering_is_a_photograph_with_straight_alpha(cloud_run):
     ("text", "bytes_"), [("5MB", 5e6), ("800 kb", 8e5), ("2MiB", 2**21), ("0.5g", 5e8), ("17", 17)]
 )
 def test_sizes_as_people_write_them(text, bytes_):
-    assert bytes_in(text) == bytes_
+    assert CompressOptions(to=text).bytes == bytes_
 
 
 def test_what_compressing_came_to_is_read_by_its_layout(small, tmp_path):

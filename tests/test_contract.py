@@ -37,13 +37,15 @@ from lumigraph.depth_maps import depth_map
 from lumigraph.derive.compression import LADDER
 from lumigraph.derive.compression.model import CompressedModel
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate, held_out_poses
+from lumigraph.evaluation import held_out_poses
+from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.run import evaluate_run
+from lumigraph.evaluation.views import evaluate
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.export import points as export_points
 from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
-from lumigraph.export.options import MeshOptions
+from lumigraph.export.options import FilmOptions, MeshOptions, PageOptions, PointsOptions
 from lumigraph.export.page import splats_page, views_page
 from lumigraph.lab.benchmark.cell import CellSettings, evaluated
 from lumigraph.lab.explain.ray import along_ray
@@ -424,7 +426,7 @@ def coarse(lenient, **options) -> MeshOptions:
 
 
 def test_it_becomes_points_and_a_mesh(lenient):
-    points = export_points.extract_points(lenient.method, lenient.cameras, 200, views=6)
+    points = export_points.extract_points(lenient.method, lenient.cameras, PointsOptions(200, views=6))
     around(torch.from_numpy(points.positions))
     if can(lenient.method, HasMesh):
         mesh = lenient.method.mesh()
@@ -459,7 +461,7 @@ def test_its_distance_becomes_a_mesh(lenient):
 def test_its_evaluation_is_read_again(taught):
     if taught.kind.learns_from in (Scene, Shapes):
         return  # tests of commands evaluate these
-    evaluate_run(taught.straight, taught.method, taught.data, most=1)
+    evaluate_run(taught.straight, taught.method, taught.data, EvaluationOptions(views=1))
     result = Run(taught.straight.folder).evaluation()
     assert scores_of(result) and compared(result)
     assert evaluated(taught.straight.folder, CellSettings(eval_views=1)) or "views" in result["protocol"]
@@ -467,14 +469,14 @@ def test_its_evaluation_is_read_again(taught):
 
 def test_it_becomes_a_film(taught, tmp_path):
     cameras = camera_path("orbit", taught.cameras, taught.method.frame, 2, (16, 16)).to(taught.device)
-    about = film(taught.method, cameras, tmp_path / "orbit.mp4", depth=True, pictures="png")
+    about = film(taught.method, cameras, tmp_path / "orbit.mp4", FilmOptions(depth=True, pictures="png"))
     assert about["frames"] == 2 and len(list((tmp_path / "orbit").glob("*.png"))) == 4
     assert (tmp_path / "orbit.mp4").stat().st_size > 0
 
 
 def test_it_becomes_a_page(taught, tmp_path):
     page, opening = tmp_path / "page.html", opening_of_scene("tiny", taught.cameras, taught.method.frame)
-    views_page(page, taught.method, taught.cameras, opening, 2, 16)
+    views_page(page, taught.method, taught.cameras, opening, PageOptions(views=2, size=16))
     assert len(re.findall("<title>tiny</title>", page.read_text("utf-8"))) == 1
 
 

@@ -25,7 +25,8 @@ from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logi
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
 from lumigraph.derive import conversion
-from lumigraph.derive.conversion import ConversionTarget, between, convert, rendered_scene, ways
+from lumigraph.derive.conversion import between, convert, rendered_scene, ways
+from lumigraph.derive.options import ConvertOptions
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import to_matrix, unit
@@ -215,7 +216,7 @@ def made(ball_run, tmp_path_factory) -> Run:
     """A run without photographs as splats."""
     folder = tmp_path_factory.mktemp("made") / "splats"
     kind = methods.find("gaussian-splatting")
-    convert(ball_run, "gaussian-splatting", folder, ConversionTarget(kind.smallest(), steps=72, views=3))
+    convert(ball_run, "gaussian-splatting", folder, ConvertOptions(steps=72, views=3), config=kind.smallest())
     return Run(folder)
 
 
@@ -261,15 +262,15 @@ def test_defaults_follow_another_method(name, given, steps, seconds, own, ball_r
     """The octree's depth, and steps, where the user names none."""
     aims = []
 
-    def noted(source, name, output, aim, *rest, **more):
-        aims.append(aim)
+    def noted(source, name, output, aim, device, show, config):
+        aims.append((aim.limited(methods.find(name).taught_steps), config))
         raise LumigraphError("noted")
 
     monkeypatch.setattr(conversion, "convert", noted)
     words = ["convert", str(ball_run.folder), name, "--output", str(tmp_path / "new"), "--device", "cpu", *given]
     assert main(words) == 2
-    assert (aims[0].steps, aims[0].seconds) == (steps, seconds)
-    assert {key: getattr(aims[0].config, key) for key in own} == own
+    assert (aims[0][0].steps, aims[0][0].seconds) == (steps, seconds)
+    assert {key: getattr(aims[0][1], key) for key in own} == own
     assert methods.find("plenoctrees").preset(torch.device("cpu")).octree_depth == 8  # of training
 
 
@@ -305,29 +306,30 @@ def test_a_splat_file_is_a_teacher(made, tmp_path, monkeypatch):
         open_any(tmp_path / "cloud.ply"),
         "plenoxels",
         tmp_path / "out",
-        ConversionTarget(kind.smallest(), steps=4, views=1),
+        ConvertOptions(steps=4, views=1),
+        config=kind.smallest(),
     )
     assert said.how == "depth" and said.teacher.bytes == (tmp_path / "cloud.ply").stat().st_size
     assert Run(tmp_path / "out").method().render(held_out(made)[0].resized(0.5)).rgb.isfinite().all()
 
 
 def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monkeypatch):
-    aim = ConversionTarget(methods.find("plenoxels").smallest(), steps=12, views=1)
-    straight = convert(ball_run, "plenoxels", tmp_path / "straight", aim)
+    aim = {"aim": ConvertOptions(steps=12, views=1), "config": methods.find("plenoxels").smallest()}
+    straight = convert(ball_run, "plenoxels", tmp_path / "straight", **aim)
     stopping = lambda *told, **more: replace(fit(*told, **more, pause_at=5), signal=2)  # noqa: E731
     monkeypatch.setattr(sys.modules["lumigraph.derive.conversion"], "fit", stopping)  # the function has its name
     with pytest.raises(Stopped):
-        convert(ball_run, "plenoxels", tmp_path / "broken", aim)
+        convert(ball_run, "plenoxels", tmp_path / "broken", **aim)
     assert Converted.read(tmp_path / "broken") is None and Run(tmp_path / "broken").state.step == 5
     assert kept(tmp_path / "broken") == "Stopped and saved after step 5 of training; the same command goes on"
     assert kept(tmp_path / "none") == "Stopped before training, so nothing is kept; the same command begins anew"
     monkeypatch.undo()
-    broken = convert(ball_run, "plenoxels", tmp_path / "broken", aim)
+    broken = convert(ball_run, "plenoxels", tmp_path / "broken", **aim)
     one, other = (Run(tmp_path / name).method().state_dict() for name in ("straight", "broken"))
     assert all(torch.equal(value, other[name]) for name, value in one.items())
     assert broken.psnr == straight.psnr and broken.steps == 12
     with pytest.raises(LumigraphError, match="already holds a run"):
-        convert(ball_run, "plenoxels", tmp_path / "broken", aim)
+        convert(ball_run, "plenoxels", tmp_path / "broken", **aim)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from lumigraph.commands.cli import main
 from lumigraph.components.fields.voxels import VoxelGrid, corners, shape_of, tight_box
 from lumigraph.components.training.row_optimizers import LazyAdam
 from lumigraph.datasets.scene import Frame
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.lab.explain.activation import fits
 from lumigraph.methods.dvgo import DVGO, FINE_ALPHA, point_error, shift_of
 from lumigraph.run import build

@@ -41,7 +41,7 @@ def towards_the_ball() -> Rays:
 
 
 def test_a_ray_meets_a_ball_where_geometry_says_and_sees_its_normal():
-    method, rays = ball(march_steps=64, secant_steps=8), towards_the_ball()
+    method, rays = ball(march_steps=64), towards_the_ball()
     t, normals = method.met(rays)
     expected = AWAY - (RADIUS**2 - OFFSETS[:-1].square()).sqrt()
     torch.testing.assert_close(t[:-1], expected, atol=1e-4, rtol=0)
@@ -51,7 +51,7 @@ def test_a_ray_meets_a_ball_where_geometry_says_and_sees_its_normal():
 
 def test_the_gradient_of_depth_is_that_of_the_implicit_function():
     """Of a ball dt / dR = -R / sqrt(R^2 - x^2) (Niemeyer 2020, eq. 10)."""
-    method = ball(march_steps=64, secant_steps=12)
+    method = ball(march_steps=64)
     method.network.radius.requires_grad_(True)
     t, _ = method._met(towards_the_ball())
     for number, offset in enumerate(OFFSETS[:-1]):
@@ -61,7 +61,7 @@ def test_the_gradient_of_depth_is_that_of_the_implicit_function():
 
 def test_colour_errors_reach_the_surface_through_the_texture():
     """The gradient of a colour by the radius is grad t . r dt / dR."""
-    method = ball(march_steps=64, secant_steps=12)
+    method = ball(march_steps=64)
     method.network.radius.requires_grad_(True)
     torch.nn.init.normal_(method.network.network.weights[-1])
     with torch.no_grad():
@@ -156,7 +156,7 @@ def test_photographs_without_masks_are_refused():
 
 def test_the_papers_network_learns_the_same_terms():
     kind = methods.find("dvr")
-    config = replace(kind.smallest(), field="network", blocks=1, hull_cells=0)
+    config = replace(kind.smallest(), field="network", hull_cells=0)
     method = build(kind, tiny.scene().frame, config, torch.device("cpu"), 0)
     method.begin(tiny.scene())
     terms = method.loss(method.batch(tiny.scene(), torch.Generator().manual_seed(0)), 0)

@@ -18,7 +18,7 @@ from budgets import budget
 from listing import names
 from ply_files import ply_file
 
-from lumigraph.errors import LumigraphError
+from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import REORDERED, SUFFIXES, is_splat_file, read_gaussians, write_gaussians
 from lumigraph.exchange.codes import morton_order
 from lumigraph.exchange.spz import gzipped
@@ -310,7 +310,7 @@ def test_reads_older_spz_by_hand(tmp_path, version):
 
 def test_reads_splat_by_hand(tmp_path):
     record = struct.pack("<6f", 1, -2, 3.5, 1, math.e, 0.25) + bytes([0, 255, 51, 102, 192, 128, 0, 128])
-    flat = struct.pack("<6f", 0, 0, 0, 0, 1, 1) + bytes([0, 0, 0, 0, 128, 128, 128, 128])
+    flat = struct.pack("<6f", 0, 0, 0, 0, 1, 1) + bytes([0, 0, 0, 0, 255, 128, 128, 128])
     path = tmp_path / "a.SPLAT"
     path.write_bytes(record + flat)
     found = read_gaussians(path)
@@ -319,7 +319,7 @@ def test_reads_splat_by_hand(tmp_path):
     assert found.log_scales[1].tolist() == [pytest.approx(-87.3, abs=0.1), 0, 0]
     torch.testing.assert_close(found.harmonics[0, 0], torch.tensor([-0.5, 0.5, -0.3]) / C0)
     torch.testing.assert_close(found.opacities.sigmoid(), torch.tensor([0.4, 0.5 / 255]))
-    assert found.quaternions.tolist() == [[0.5, 0, -1, 0], [1, 0, 0, 0]]
+    assert found.quaternions.tolist() == [[0.5, 0, -1, 0], [127 / 128, 0, 0, 0]]
     write_gaussians(tmp_path / "b.splat", found[:1])
     # but for the rotation, which has length 1 now
     assert (tmp_path / "b.splat").read_bytes()[:28] == pytest.approx(record[:28])
@@ -524,9 +524,13 @@ def test_nothing_unsound_is_read(tmp_path):
     rows["f_rest_4"][1:3] = np.inf
     rows["opacity"][:] = np.inf, -np.inf, 1, 1, 1  # as they occur in good files
     write_rows(tmp_path / "b.ply", "splats", {"vertex": rows})
-    sentence = refusal(tmp_path / "b.ply")
-    assert "3 of 5 Gaussians" in sentence and "means: 2" in sentence and "colours: 2" in sentence
-    assert "opacities" not in sentence
+    rows["rot_0"][4:] = rows["rot_1"][4:] = rows["rot_2"][4:] = rows["rot_3"][4:] = 0  # a row that was never written
+    write_rows(tmp_path / "c.ply", "splats", {"vertex": rows})
+    for name, left, told in (("b", [3, 4], "3 of 5"), ("c", [3], "4 of 5")):
+        with pytest.warns(LumigraphWarning, match=rf"{told} Gaussians .*means: 2, colours: 2.* are left out") as found:
+            read = read_gaussians(tmp_path / f"{name}.ply")
+        assert "opacities" not in str(found[0].message) and ("no rotation: 1" in str(found[0].message)) == (name == "c")
+        torch.testing.assert_close(read.means, cloud.means[left])
     record = struct.pack("<6f", 1, 1, 1, 1, -1, 1) + bytes(8)
     (tmp_path / "c.splat").write_bytes(record)
     assert "scales: 1" in refusal(tmp_path / "c.splat")
@@ -538,7 +542,7 @@ def test_a_point_cloud_is_no_cloud_of_gaussians(tmp_path):
     assert "7 points and no Gaussians" in refusal(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize("name", ["x", "opacity", "scale_2", "rot_0", "f_dc_1", "f_rest_0", "f_rest_44"])
+@pytest.mark.parametrize("name", ["x", "opacity", "scale_1", "rot_0", "f_dc_1", "f_rest_0", "f_rest_44"])
 def test_missing_properties(tmp_path, name):
     write_gaussians(tmp_path / "a.ply", make(2))
     data = (tmp_path / "a.ply").read_bytes()

@@ -22,9 +22,11 @@ from lumigraph.camera.lens import Equirectangular, Pinhole
 from lumigraph.commands.cli import main
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.report import write_report
+from lumigraph.evaluation.views import evaluate
 from lumigraph.export.film import film
+from lumigraph.export.options import FilmOptions
 from lumigraph.export.video import open_video
 from lumigraph.figures import EMPTY_COLOUR, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
 from lumigraph.geometry import look_at, unit
@@ -325,7 +327,7 @@ def test_errors_are_coloured_from_dark_to_bright():
 def test_a_film_of_a_method(ball_run, tmp_path):
     method = ball_run.method()
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 7, (26, 24))
-    about = film(method, path, tmp_path / "out" / "orbit.mp4", fps=10, depth=True, pictures="png")
+    about = film(method, path, tmp_path / "out" / "orbit.mp4", FilmOptions(fps=10, depth=True, pictures="png"))
     out = tmp_path / "out"
     assert names(out) == ["orbit", "orbit-depth.mp4", "orbit.json", "orbit.mp4"]
     assert len(frames_of(out / "orbit.mp4")) == len(frames_of(out / "orbit-depth.mp4")) == 7
@@ -334,13 +336,13 @@ def test_a_film_of_a_method(ball_run, tmp_path):
     kept = torch.from_numpy(np.array(Image.open(out / "orbit" / "0003.png"))) / 255
     assert kept.shape == (24, 26, 3) and (kept - seen).abs().max() < 0.01
     assert json.loads((out / "orbit.json").read_text())["frames"] == 7 == about["frames"]
-    film(method, path[:2], out / "orbit.mp4", depth=True, pictures="png")  # again: replaced, not mixed
+    film(method, path[:2], out / "orbit.mp4", FilmOptions(depth=True, pictures="png"))  # again: replaced, not mixed
     assert len(frames_of(out / "orbit.mp4")) == 2 and len(names(out / "orbit")) == 4
 
 
 def test_a_film_as_a_moving_picture_has_a_twin_of_depth(ball_run, tmp_path):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 3, (26, 24))
-    film(ball_run.method(), path, tmp_path / "orbit.webp", fps=10, depth=True)
+    film(ball_run.method(), path, tmp_path / "orbit.webp", FilmOptions(fps=10, depth=True))
     assert names(tmp_path) == ["orbit-depth.webp", "orbit.json", "orbit.webp"]
     assert len(pictures_of(tmp_path / "orbit.webp")) == len(pictures_of(tmp_path / "orbit-depth.webp")) == 3
 
@@ -405,14 +407,14 @@ def test_a_contact_sheet_shows_every_view_and_the_worst(ball_run):
 
 @pytest.mark.parametrize(("views", "expected"), [(1, [0]), (2, [0, 8]), (3, [0, 4, 8]), (9, [0, 4, 8])])
 def test_some_views_are_compared_alone(ball_run, views, expected):
-    result = evaluate(ball_run.method(), tiny.scene(), views=views).to_json()
+    result = evaluate(ball_run.method(), tiny.scene(), EvaluationOptions(views=views)).to_json()
     assert [view["name"] for view in result["views"]] == [f"ball_{i}" for i in expected]
     assert (result["protocol"]["views"], result["protocol"]["of"]) == (len(expected), 3)
 
 
 def test_evaluation_names_the_splits_there_are(ball_run):
     with pytest.raises(LumigraphError, match=r"no views in the split 'val'; choose one of: train \(9 views\), test"):
-        evaluate(ball_run.method(), tiny.scene(), "val")
+        evaluate(ball_run.method(), tiny.scene(), EvaluationOptions("val"))
 
 
 class Page(html.parser.HTMLParser):
@@ -430,7 +432,7 @@ class Page(html.parser.HTMLParser):
 
 def test_the_report_is_one_file_that_loads_nothing(ball_run):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 6, (24, 24))
-    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4", depth=True)
+    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4", FilmOptions(depth=True))
     evaluation = evaluate(ball_run.method(), tiny.scene())
     result = evaluation.to_json() | {"evaluated_on": "cpu", "steps": 3}
     (ball_run.folder / "eval.json").write_text(json.dumps(result))

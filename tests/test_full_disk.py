@@ -14,7 +14,8 @@ from test_priors import prior_run
 
 from lumigraph import methods
 from lumigraph.commands.cli import main
-from lumigraph.derive.conversion import ConversionTarget, convert
+from lumigraph.derive.conversion import convert
+from lumigraph.derive.options import ConvertOptions
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
 from lumigraph.run.derived import Converted
@@ -109,18 +110,18 @@ def test_an_inferred_run_is_whole_or_not_there(ball_folder, tmp_path, capsys, mo
 def test_a_conversion_goes_on_after_any_write_that_failed(name, ball_run, tmp_path, monkeypatch):
     kind = methods.find(name)
     small = kind.Config(rays=64) if name == "voxel-grid" else kind.smallest()
-    aim = ConversionTarget(small, steps=2, views=1)
+    aim = ConvertOptions(steps=2, views=1)
 
     def work(folder: Path) -> int:
         try:
-            convert(ball_run, name, folder, aim)
+            convert(ball_run, name, folder, aim, config=small)
         except LumigraphError as fault:
             assert "because the disk is full" in str(fault)
             return 2
         return 0
 
     def again(folder: Path) -> None:
-        assert convert(ball_run, name, folder, aim).steps == 2
+        assert convert(ball_run, name, folder, aim, config=small).steps == 2
         assert Converted.read(folder) is not None
 
     each_write(monkeypatch, work, again, tmp_path, step=4)

@@ -14,7 +14,7 @@ from lumigraph import methods
 from lumigraph.commands import cli
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.files.ranges import changed
 from lumigraph.gaussians.splatting import render

@@ -23,8 +23,9 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame
 from lumigraph.depth_maps.flat_view import FlatView
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.export.film import animated
 from lumigraph.files.ranges import changed
 from lumigraph.method.controls import Control, moment
@@ -372,10 +373,10 @@ def test_refined_cameras_have_the_rays_that_were_learnt_from():
     assert torch.allclose(rotation @ rotation.mT, torch.eye(3).expand(len(scene), 3, 3), atol=1e-5)
     assert torch.equal(refined.pose[held_out], scene.cameras.pose[held_out])
     assert not torch.equal(refined.pose[train], scene.cameras.pose[train])
-    protocols = [evaluate(method, scene, split, views=1).protocol["poses"] for split in ("test", "train")]
+    protocols = [evaluate(method, scene, EvaluationOptions(split, 1)).protocol["poses"] for split in ("test", "train")]
     assert all(said.startswith("as the method refined them; held-out ones") for said in protocols)
     plain = ngp(scene)
-    assert evaluate(plain, scene, views=1).protocol["poses"] == "as captured"
+    assert evaluate(plain, scene, EvaluationOptions(views=1)).protocol["poses"] == "as captured"
 
 
 def test_evaluation_sees_photographs_from_where_they_were_refined_to(monkeypatch):
@@ -385,7 +386,7 @@ def test_evaluation_sees_photographs_from_where_they_were_refined_to(monkeypatch
         method.poses.twist.fill_(0.05)
     render = InstantNGP.render
     monkeypatch.setattr(InstantNGP, "render", lambda self, camera: seen.append(camera.pose) or render(self, camera))
-    evaluate(method, scene, "train", views=1)
+    evaluate(method, scene, EvaluationOptions("train", 1))
     assert torch.equal(seen[-1], method.refined(scene.cameras[1:2]).pose)
 
 
@@ -473,19 +474,20 @@ def test_an_export_shows_what_was_told(trained, tmp_path):
 
 def test_photographs_are_named(tmp_path):
     """A control that wants a photograph takes its name as well as its number."""
-    from lumigraph.commands.options import open_method
+    from lumigraph.export.loaded import Loaded
 
     scene = tiny.scene()
     made = ngp(scene, exposure_correction="yes", refine_cameras=True)
     run = Run.create(tmp_path / "run", made, scene)
     fit(run.new_method(), scene, run, steps=1, show=False)
-    with_name, with_number = (open_method(run.folder, "cpu", [f"exposed-as={which}"])[1] for which in ("ball_5", "5"))
+    with_name, with_number = (Loaded.of(run, "cpu", [f"exposed-as={which}"]).method for which in ("ball_5", "5"))
     assert with_name.settings == with_number.settings == {"exposed_as": "5"}
-    _, method, cameras = open_method(run.folder, "cpu")
+    loaded = Loaded.of(run, "cpu")
+    method, cameras = loaded.method, loaded.cameras
     assert torch.equal(cameras["train"].pose, method.refined(scene.cameras[scene.splits["train"]]).pose)
     assert not torch.equal(cameras["train"].pose, run.cameras()["train"].pose)
     with pytest.raises(LumigraphError, match="exposed_as=ball_99 is no choice"):
-        open_method(run.folder, "cpu", ["exposed_as=ball_99"])
+        Loaded.of(run, "cpu", ["exposed_as=ball_99"])
 
 
 def test_a_moment_is_a_control_of_the_frames_times():

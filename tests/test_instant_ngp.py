@@ -12,7 +12,8 @@ from budgets import budget
 from lumigraph.camera.rays import Rays
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation import evaluate, held_out_poses
+from lumigraph.evaluation import held_out_poses
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed
 from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.run import Run, build

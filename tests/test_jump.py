@@ -17,6 +17,7 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.export import jump
+from lumigraph.export.options import JumpOptions
 from lumigraph.geometry import look_at
 
 pytestmark = budget("exports", 6)
@@ -55,7 +56,7 @@ def ring(missing: int | None = None) -> Scene:
 
 @cache
 def stitched():
-    return jump.stereo_panorama(ring(), 256)
+    return jump.stereo_panorama(ring(), JumpOptions(256))
 
 
 def test_panoramas_are_what_the_eyes_would_see():
@@ -109,7 +110,7 @@ def test_a_still_scene_keeps_its_disparities():
     later = replace(scene, images=ImageStore.from_arrays([x.numpy() for x in noisy]))
     changes = []
     for known in (None, before):
-        _, now = jump.stereo_panorama(later, 256, before=known)
+        _, now = jump.stereo_panorama(later, JumpOptions(256), before=known)
         changes.append(sum(float((a[1] - b[1]).abs().mean()) for a, b in zip(now, before, strict=True)))
     assert changes[1] < 0.9 * changes[0]
 
@@ -131,4 +132,4 @@ def test_cameras_that_look_elsewhere_are_no_rig():
 
 def test_eyes_wider_than_the_rig_are_a_fault():
     with pytest.raises(LumigraphError, match="farther apart"):
-        jump.stereo_panorama(ring(), 128, interpupillary=3 * RADIUS)
+        jump.stereo_panorama(ring(), JumpOptions(128, interpupillary=3 * RADIUS))

@@ -20,7 +20,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.files import locks
 from lumigraph.files.locks import held
 from lumigraph.run import Run
-from lumigraph.sfm import reconstruct
+from lumigraph.sfm.reconstruction import reconstruct
 from lumigraph.training import fit
 
 pytestmark = budget("runs")

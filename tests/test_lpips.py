@@ -11,7 +11,7 @@ import torch
 
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import compare
+from lumigraph.evaluation.views import compare
 from lumigraph.metrics.lpips import SHAPES, Lpips, load_lpips, named_files
 
 

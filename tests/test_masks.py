@@ -16,7 +16,7 @@ from test_gaussian_splatting import new
 
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.opening import open_scene
 from lumigraph.readers.objects import doubts, mask_object
 from lumigraph.readers.objects.segment import segment

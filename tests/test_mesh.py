@@ -31,7 +31,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
-from lumigraph.export.options import MeshOptions
+from lumigraph.export.options import MeshOptions, PointsOptions
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, simplified, smoothed, zero_level
 from lumigraph.files.ply import read_rows
@@ -372,7 +372,7 @@ def test_another_frame_moves_scales_and_keeps_the_outside_outside(solid_ball):
 
 
 def test_points_lie_on_the_surface_evenly():
-    points = extract_points(Seen(torus()), around(), 3000)
+    points = extract_points(Seen(torus()), around(), PointsOptions(3000))
     away = torus()(torch.from_numpy(points.positions).float()).abs()
     assert 2700 < len(points.positions) <= 3000 and away.mean() < 0.005 and away.max() < 0.05
     expected = 255 * painted(torch.from_numpy(points.positions).float()).numpy()
@@ -396,7 +396,7 @@ class Floater(Seen):
 
 
 def test_what_one_camera_alone_sees_is_no_point():
-    points = extract_points(Floater(ball()), around(), 3000)
+    points = extract_points(Floater(ball()), around(), PointsOptions(3000))
     assert np.abs(np.linalg.norm(points.positions, axis=-1) - 0.6).max() < 0.05
 
 
@@ -409,7 +409,7 @@ def test_thinning_gives_at_most_so_many_of_equal_spacing():
 
 def test_a_file_of_points(tmp_path):
     frame = Frame(source_from_scene=MOVED)
-    points = extract_points(Seen(ball()), around(), 500)
+    points = extract_points(Seen(ball()), around(), PointsOptions(500))
     write_points(tmp_path / "points.ply", points.in_source(frame))
     vertex = read_rows(tmp_path / "points.ply", ["vertex"])["vertex"]
     position, normal = (np.stack([vertex[x] for x in names], -1) for names in (("x", "y", "z"), ("nx", "ny", "nz")))

@@ -14,8 +14,8 @@ from captures import Tiny, write_nerfies, write_ngp, write_nr_nerf
 from lumigraph import synthetic as procedural
 from lumigraph.components.sampling.occupancy import visual_hull
 from lumigraph.errors import LumigraphWarning
-from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.held_out import held_out_kinds
+from lumigraph.evaluation.views import evaluate
 from lumigraph.metrics import psnr
 from lumigraph.opening import open_scene
 from lumigraph.readers.hull import Silhouette, hull_box

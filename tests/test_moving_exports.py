@@ -17,10 +17,11 @@ from windows import psnr as apart
 from windows import some_camera
 
 from lumigraph.commands.cli import main
-from lumigraph.commands.options import Keeping
 from lumigraph.composition import FilteredCloud, PlayedCloud
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import fourdgs, read_gaussians
+from lumigraph.export.loaded import Loaded
+from lumigraph.export.options import Keeping
 from lumigraph.export.page import moving_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.moving import MovingGaussians, fitted
@@ -236,7 +237,7 @@ def test_films_of_a_part_still_move(run, tmp_path):
     opened = open_any(run)
     for words in ([], ["--strength", "0.1"]):
         part = Keeping(box=(-0.5,) * 3 + (0.5,) * 3, strength=0.1 if words else None)
-        method = part.of_method(opened.method(), opened)
+        method = Loaded.of(opened, "cpu", part=part).kept_method()
         camera = opened.cameras()["train"][0].resized(0.5)
         begin, end = (method.given(time=t).render(camera).rgb for t in (1.0, 3.0))
         assert not torch.allclose(begin, end)

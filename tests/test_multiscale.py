@@ -15,7 +15,8 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.opening import open_scene
 from lumigraph.readers import multiscale
 from lumigraph.run import Run, State
@@ -155,5 +156,5 @@ def test_photographs_smaller_than_a_window_of_ssim_are_refused(folder, downscale
     method = tiny.method(scene.frame)
     size, part = 24 // downscale, "the right half of " if halves else ""
     with pytest.raises(LumigraphError, match=rf"11 x 11 pixels, and {part}\S+, of {size}x{size} pixels, has fewer"):
-        evaluate(method, scene, right_halves=halves)
-    assert len(evaluate(method, larger, views=1, right_halves=halves).views) == 1
+        evaluate(method, scene, EvaluationOptions(right_halves=halves))
+    assert len(evaluate(method, larger, EvaluationOptions(views=1, right_halves=halves)).views) == 1

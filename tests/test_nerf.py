@@ -18,7 +18,7 @@ from lumigraph.components.sampling.occupancy import OccupancyMask
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Forward, Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed
 from lumigraph.method import RayMethod
 from lumigraph.methods import mip_nerf, nerf

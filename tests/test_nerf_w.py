@@ -15,8 +15,9 @@ from lumigraph.components.fields.appearance import PhotographCodes, fitted
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.method.controls import Control
@@ -149,7 +150,7 @@ def test_the_light_of_a_photograph_is_found_on_its_left_half(taught):
     assert halves.psnr > average.psnr + 1
     assert "left half" in halves.protocol["halves"] and average.protocol["halves"] is None
     assert halves.compared == "right halves of 3 test views"
-    alone = evaluate(method.given(appearance="average"), scene, right_halves=True)
+    alone = evaluate(method.given(appearance="average"), scene, EvaluationOptions(right_halves=True))
     assert alone.compared == halves.compared and "no code is found" in alone.protocol["halves"]
     assert alone.psnr != average.psnr and halves.psnr > alone.psnr + 1
     shot = scene.photograph(0)

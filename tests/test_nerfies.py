@@ -12,6 +12,7 @@ from budgets import budget
 
 from lumigraph.components.sampling.spaces import Contraction, Space, space_of
 from lumigraph.datasets.scene import Frame
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import rotated
 from lumigraph.methods.nerfies import Nerfies
 from lumigraph.methods.nerfies.elastic import elastic_loss, geman_mcclure, log_singular_square, symmetric_eigenvalues
@@ -156,12 +157,9 @@ def test_codes_are_those_of_training_moments_and_interpolated_between():
 
 @pytest.mark.parametrize("field", ["hash", "network"])
 def test_both_canonical_scenes_deform_and_are_sliced(field):
-    base = Nerfies.smallest()
-    network = replace(base.network, depth=3, skip_layer=2, position_frequencies=3)
-    rays = replace(base.rays, coarse_samples=8, fine_samples=8, rays_per_step=64)
+    small = changed(Nerfies.smallest(), depth=3, skip_layer=2, position_frequencies=3, coarse_samples=8, fine_samples=8)
     for slices in (0, 2):
-        deformation = replace(base.deformation, slice_dimensions=slices)
-        method = Nerfies(FRAME, replace(base, field=field, network=network, rays=rays, deformation=deformation))
+        method = Nerfies(FRAME, changed(small, field=field, rays_per_step=64, slice_dimensions=slices))
         for parameter in method.parameters():
             parameter.data += 0.3 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(2))
         points = random(30, 3).float().clamp(-0.9, 0.9)
@@ -181,14 +179,14 @@ def test_later_moments_and_levels_join_while_the_budget_is_spent():
     scene = replace(scene, cameras=replace(scene.cameras, time=torch.arange(12).float()))
     scene = replace(scene, frame=replace(scene.frame, times=(0.0, 11.0)))
     base = Nerfies.smallest()
-    config = replace(base, table_annealing=0.5, deformation=replace(base.deformation, growth=0.5))
+    config = changed(base, table_annealing=0.5, growth=0.5)
     method, points = Nerfies(scene.frame, config), 2 * torch.rand(20, 3) - 1
     last = []
     for progress in (0.0, 0.25, 0.5):
         method.progress = progress
         method.before_step(0, progress)
         last.append(float(method.batch(scene, torch.Generator().manual_seed(0)).rays.time.max()))
-        encoded = method.network.canonical.encode(points).view(20, base.table.levels, -1)
+        encoded = method.network.canonical.encode(points).view(20, base.backbone.table.levels, -1)
         assert bool(encoded[:, -1].any()) == (progress == 0.5) and encoded[:, 0].any()
     assert last == [1.0, 6.0, 11.0]  # a tenth of the capture, 0.55 of it, and all
 

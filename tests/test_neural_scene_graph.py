@@ -23,6 +23,7 @@ from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.tracks import BoxTrack, TrackEdit, TrackEdits, nodes_of
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity, rotated, to_matrix
 from lumigraph.large import open_any
 from lumigraph.method.field_method import FieldMethod
@@ -132,7 +133,7 @@ def test_edits_move_turn_add_swap_and_remove():
 def graph(tracks: tuple[BoxTrack, ...] = tiny.TRACKS, **config) -> NeuralSceneGraph:
     kind = methods.find("neural-scene-graph")
     frame = replace(tiny.scene().frame, tracks=tracks)
-    return build(kind, frame, replace(kind.smallest(), **config), torch.device("cpu"), 0).eval()
+    return build(kind, frame, changed(kind.smallest(), **config), torch.device("cpu"), 0).eval()
 
 
 def test_without_its_things_a_graph_is_its_background():

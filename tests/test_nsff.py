@@ -10,6 +10,7 @@ import torch
 from budgets import budget
 
 from lumigraph.datasets.scene import Batch
+from lumigraph.files.ranges import changed
 from lumigraph.method import Field
 from lumigraph.methods.nsff import NSFF, Hop
 from lumigraph.methods.nsff.priors import checked_flow, partners
@@ -151,12 +152,11 @@ def test_two_fields_blend_by_the_weight_of_the_static_one():
 
 def test_both_kinds_of_fields_know_time_and_get_all_gradients():
     config = NSFF.smallest()
-    network = replace(config.network, depth=3, skip_layer=2, position_frequencies=3)
-    config = replace(config, network=network, samples=8, rays_per_step=64)
+    config = changed(config, depth=3, skip_layer=2, position_frequencies=3, samples=8, rays_per_step=64)
     scene = moving_scene()
     for field in ("hash", "network"):
-        flow = replace(config.flow, both_ways=field == "network", depth_source="files")
-        method = NSFF(scene.frame, replace(config, field=field, flow=flow)).train()
+        numbers = changed(config, field=field, both_ways=field == "network", depth_source="files")
+        method = NSFF(scene.frame, numbers).train()
         method.begin(scene)
         assert method.priors.depth.rows.isfinite().any() and method.priors.flow.rows.isfinite().any()
         method.before_step(0, 0.0)

@@ -13,6 +13,7 @@ from lumigraph.camera.rays import Rendering
 from lumigraph.components.instances import Edit, edit_of, labels_of
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
+from lumigraph.files.ranges import changed
 from lumigraph.methods.object_nerf import ObjectNeRF
 from lumigraph.methods.object_nerf.fields import InstanceBoxes
 from lumigraph.opening import open_scene
@@ -23,7 +24,7 @@ pytestmark = budget("methods", 12)
 
 
 def new(frame=None, **numbers):
-    config = replace(ObjectNeRF.smallest(), **numbers)
+    config = changed(ObjectNeRF.smallest(), **numbers)
     return build(ObjectNeRF, frame or tiny.scene().frame, config, torch.device("cpu"), 0)
 
 
@@ -111,8 +112,7 @@ def test_a_place_turns_about_the_middle():
 def learnt():
     """A still life of small pictures with its labels."""
     scene = open_scene("procedural:still-life,size=24,views=12")
-    config = replace(ObjectNeRF.cpu_preset(), instances=16)
-    config = replace(config, occupancy=replace(config.occupancy, samples_per_step=4096))
+    config = changed(ObjectNeRF.cpu_preset(), instances=16, samples_per_step=4096)
     method = build(ObjectNeRF, scene.frame, config, torch.device("cpu"), 0)
     return method, scene
 

@@ -12,7 +12,6 @@ from balls import RED, Splatted
 from budgets import budget
 
 import lumigraph
-from lumigraph import paths as films
 from lumigraph.commands import render
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
@@ -90,7 +89,6 @@ def test_python_makes_films_too(folder, tmp_path):
     assert torch.equal(held_out.pose, opened.cameras()["test"].pose)
     with pytest.raises(LumigraphError, match="no held-out views here"):
         film_cameras({"train": opened.cameras()["train"]}, opened.frame, "held-out")
-    assert render.PATH_KINDS == films.PATH_KINDS  # help shows them without loading this
 
 
 # What a run says of itself

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.files.ranges import groups_of
+from lumigraph.files.ranges import groups_of, holds, value_of
 
 pytestmark = budget("house", 3)
 PAGES = Path(__file__).parent.parent / "docs" / "methods"
@@ -810,10 +809,12 @@ def test_the_preset_paper_has_the_published_numbers(name):
 
 
 def number_of(config: Any, path: str) -> Any:
-    """An option by its path in a Config, or the constant of its name in the module of the option's dataclass."""
-    parts, _, name = path.rpartition(".")
-    owner = attrgetter(parts)(config) if parts else config
-    return getattr(owner, name) if hasattr(owner, name) else vars(sys.modules[type(owner).__module__])[name.upper()]
+    """An option by its path in the part of a Config that holds it, or the constant of its name in the part's module."""
+    *parts, name = path.split(".")
+    owner = config
+    for part in parts:
+        owner = value_of(owner, part)
+    return value_of(owner, name) if holds(owner, name) else vars(sys.modules[type(owner).__module__])[name.upper()]
 
 
 @pytest.mark.parametrize("name", NAMES)

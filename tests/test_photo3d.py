@@ -16,6 +16,7 @@ from lumigraph.commands.cli import main
 from lumigraph.depth_maps import DepthMap
 from lumigraph.errors import LumigraphError
 from lumigraph.export import photo3d as room
+from lumigraph.export.options import Photo3DOptions
 from lumigraph.export.photo3d import layers, stitching
 from lumigraph.geometry import evenly
 
@@ -102,9 +103,9 @@ def given_depth(monkeypatch):
 
 
 def test_a_burst_from_one_place_becomes_a_panorama(given_depth):
-    assert not room.photo3d(ball(), 90, views=3).flat
+    assert not room.photo3d(ball(), Photo3DOptions(90, 3)).flat
     given_depth[:] = [0.0, 0.001, 0.002]
-    assert room.photo3d(ball(), 90, views=3).flat
+    assert room.photo3d(ball(), Photo3DOptions(90, 3)).flat
 
 
 def test_a_photograph_without_any_depth_is_named(given_depth, monkeypatch):
@@ -114,11 +115,11 @@ def test_a_photograph_without_any_depth_is_named(given_depth, monkeypatch):
     scene = ball()
     name = scene.names[evenly(scene.splits["train"].tolist(), 3)[1]]
     with pytest.raises(LumigraphError, match=f"{name} shares too little with the others"):
-        room.photo3d(scene, 90, views=3)
+        room.photo3d(scene, Photo3DOptions(90, 3))
 
 
 def test_a_page_holds_the_picture_and_the_reach(given_depth, tmp_path):
-    found = room.photo3d(ball(), 90, views=3)
+    found = room.photo3d(ball(), Photo3DOptions(90, 3))
     assert found.reach == pytest.approx(0.3, abs=1e-3)
     room.write_page(tmp_path / "photo.html", found, "A square")
     page = (tmp_path / "photo.html").read_text()
@@ -129,7 +130,7 @@ def test_one_photograph_is_a_fault():
     scene = ball()
     alone = replace(scene, splits={"train": torch.arange(1), "test": torch.arange(0)})
     with pytest.raises(LumigraphError, match="has one photograph"):
-        room.photo3d(alone, 90)
+        room.photo3d(alone, Photo3DOptions(90))
 
 
 def test_photographs_without_poses_are_captured_first(tmp_path, monkeypatch, ball_folder, capsys):

@@ -27,10 +27,11 @@ from lumigraph.components.training.schedules import BEGINS, ENDS, INITIAL_BANDS,
 from lumigraph.datasets.alignment import aligning, moves
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation import evaluate
 from lumigraph.evaluation import held_out_poses as held_out_module
 from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.evaluation.held_out_poses import HeldOutPoses, colour_error, held_out_poses, pose_scores
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed, holds
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
@@ -344,12 +345,12 @@ def test_codes_are_found_from_refined_cameras(monkeypatch):
     monkeypatch.setattr(held_out_module, "STEPS", 2)
     given = Exposure.adapted
     monkeypatch.setattr(Exposure, "adapted", lambda *told: seen.append(told[2].camera.pose) or given(*told))
-    evaluate(method, scene, "train", views=1)
+    evaluate(method, scene, EvaluationOptions("train", 1))
     assert torch.equal(seen[-1], method.refined(scene.cameras[1]).pose) and not torch.equal(
         seen[-1], scene.cameras[1].pose
     )
     found = HeldOutPoses(method, scene).camera(0)
-    evaluate(method, scene, views=1)
+    evaluate(method, scene, EvaluationOptions(views=1))
     assert torch.equal(seen[-1], found.pose)
 
 

@@ -23,6 +23,7 @@ from lumigraph.composition import LitComposition, LitMesh, Placed, ShadedMesh
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
+from lumigraph.export.options import ProbesOptions
 from lumigraph.export.probes import bake_probes
 from lumigraph.export.probes_page import ball, probes_page
 from lumigraph.geometry import Similarity, look_at, unit
@@ -156,7 +157,7 @@ def test_probes_of_a_room_in_another_frame():
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)))[0]
     to_source = Similarity.make(2.5, turn * torch.linalg.det(turn), torch.tensor([1.0, 2.0, 3.0]))
     room = Room(Frame(bounds=BOX, near=0.01, source_from_scene=to_source.rows, scale=2.0), light=0.4)
-    grid = bake_probes(room, None, BOX, counts=(3, 3, 2), face_size=16)
+    grid = bake_probes(room, None, BOX, ProbesOptions(counts=(3, 3, 2), resolution=16))
     assert (grid.state == FREE).all() and grid.counts == (3, 3, 2)
     points, normals = 0.7 * directions(50), directions(50)
     there = room.frame.to_export
@@ -172,7 +173,7 @@ def test_walls_keep_light_out():
     """Behind a wall in the middle of a cell next to nothing of the light beyond it counts, and without visibility its
     trilinear share does."""
     room = Room(Frame(bounds=BOX, near=0.01), divided=True)
-    grid = bake_probes(room, None, BOX, counts=(2, 3, 3), face_size=16)
+    grid = bake_probes(room, None, BOX, ProbesOptions(counts=(2, 3, 3), resolution=16))
     points = torch.tensor([[0.25, y, 0.1] for y in (-0.3, 0.0, 0.4)])
     normals = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
     plain = dataclasses.replace(grid, mean=torch.full_like(grid.mean, grid.far))
@@ -185,15 +186,20 @@ def test_walls_keep_light_out():
 def test_probes_in_matter_are_marked():
     """A ball of even density: probes inside are in matter, those around it are free, and none sees an empty region."""
     method = Dense((0.9, 0.1, 0.1), radius=0.5)
-    grid = bake_probes(method, None, BOX, counts=(3, 3, 3), face_size=8)
+    grid = bake_probes(method, None, BOX, ProbesOptions(counts=(3, 3, 3), resolution=8))
     inside = grid.positions.norm(dim=-1) < 0.45
     assert (grid.state[inside] == MATTER).all() and (grid.state[grid.positions.norm(dim=-1) > 0.6] == FREE).all()
     with pytest.raises(LumigraphError, match="sees any matter"):
-        bake_probes(Dense((1.0, 0, 0), centre=(9.0, 9, 90), radius=0.01), None, BOX, counts=(1, 1, 1), face_size=8)
+        bake_probes(
+            Dense((1.0, 0, 0), centre=(9.0, 9, 90), radius=0.01),
+            None,
+            BOX,
+            ProbesOptions(counts=(1, 1, 1), resolution=8),
+        )
     with pytest.raises(LumigraphError, match="All probes lie in matter"):
-        bake_probes(method, None, ((-0.2,) * 3, (0.2,) * 3), counts=(2, 2, 2), face_size=8)
+        bake_probes(method, None, ((-0.2,) * 3, (0.2,) * 3), ProbesOptions(counts=(2, 2, 2), resolution=8))
     with pytest.raises(LumigraphError, match="is none that a file holds"):
-        bake_probes(method, None, BOX, counts=(0, 2, 2))
+        bake_probes(method, None, BOX, ProbesOptions(counts=(0, 2, 2)))
 
 
 def test_shading_normals_keep_creases():
@@ -226,7 +232,7 @@ def test_a_ball_hides_its_solid_angle():
 def test_a_mesh_in_a_room_casts_a_shadow():
     """The floor is darker under the ball, unchanged far from it, and hides the ball's lower half where it is nearer."""
     room = Room(Frame(bounds=BOX, near=0.01), light=0.6)
-    grid = bake_probes(room, None, BOX, counts=(3, 3, 3), face_size=8)
+    grid = bake_probes(room, None, BOX, ProbesOptions(counts=(3, 3, 3), resolution=8))
     placed = Placed(LitMesh(Frame(), ball(), grid, Similarity.make(0.3, None, torch.tensor([0.0, 0.0, -0.8]))),
                     Similarity.make(0.3, None, torch.tensor([0.0, 0.0, -0.8])))  # fmt: skip
     both = LitComposition(room.frame, [Placed(room, Similarity.make(1.0), leads=True), placed])
@@ -273,7 +279,7 @@ def test_from_the_command_line(ball_run, tmp_path, capsys):
 def test_the_page_lights_the_ball_as_we_do(tmp_path, window):
     """The ball in the page against our own rendering of it, and the mouse moves it."""
     room = Room(Frame(bounds=BOX, near=0.05), divided=True)
-    grid = bake_probes(room, None, BOX, counts=(4, 4, 4), face_size=8)
+    grid = bake_probes(room, None, BOX, ProbesOptions(counts=(4, 4, 4), resolution=8))
     position = torch.tensor([[-0.8, -0.7, 0.3]])
     pose = look_at(position, torch.tensor([[0.75, 0.8, -0.5]]), torch.tensor([0.0, 0.0, 1.0]))
     camera = Camera(

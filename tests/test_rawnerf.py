@@ -12,9 +12,9 @@ from lumigraph.camera.rays import Rendering
 from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
 from lumigraph.components.fields.development import decoded, encoded, exposed, toned, white
 from lumigraph.datasets.scene import Batch
-from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.views import in_light
+from lumigraph.evaluation.views import evaluate, in_light
 from lumigraph.export.film import exr, film
+from lumigraph.export.options import FilmOptions
 from lumigraph.files.ranges import changed
 from lumigraph.methods.rawnerf import RawNeRF, layers_of, through_lens
 from lumigraph.opening import open_scene
@@ -181,7 +181,7 @@ def test_light_is_compared_up_to_a_factor_and_an_offset():
 
 
 def test_frames_are_written_as_light(night, begun, tmp_path):
-    film(begun, night.cameras[:2], tmp_path / "film.mp4", pictures="exr")
+    film(begun, night.cameras[:2], tmp_path / "film.mp4", FilmOptions(pictures="exr"))
     path = tmp_path / "film" / "0001.exr"
     assert kind_of(path).linear and kind_of(path).size == (24, 24)
     np.testing.assert_array_equal(read_numbers(path), begun.render(night.cameras[1]).extra["radiance"].numpy())

@@ -23,6 +23,7 @@ from lumigraph.files import replacing, write_json
 from lumigraph.files.plain import alike, flatten, unflatten
 from lumigraph.files.ranges import typed
 from lumigraph.run import Run, State
+from lumigraph.run.settings import of_this_version
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 8)
@@ -72,6 +73,44 @@ def test_an_option_that_became_a_constant_opens(run):
     kind = methods.find("deepsdf")
     older = replace(settings, config=asdict(kind.smallest()) | {"fit_weight": 1e-4})
     assert older.method_config(kind, run.folder) == kind.smallest()
+
+
+@dataclass(frozen=True)
+class Layer:
+    width: int = 1
+    rate: float = 2.0
+
+
+@dataclass(frozen=True)
+class Stack:
+    inner: Layer = Layer()
+    steps: int = 3
+
+
+@dataclass(frozen=True)
+class Numbers:
+    outer: Stack = Stack()
+    size: int = 4
+
+
+def test_an_option_that_moved_opens():
+    """Down into a part or up out of one, alone or with its whole part; what is unknown is refused."""
+    for said, found in (
+        ({"steps": 5, "outer": {"inner": {"width": 6}}}, {"outer": {"steps": 5, "inner": {"width": 6}}}),
+        ({"inner": {"width": 6, "size": 7}}, {"outer": {"inner": {"width": 6}}, "size": 7}),
+        ({"outer": {"inner": 1}, "width": 2}, None),
+        ({"width": {"width": {"width": "wide"}}}, None),
+        ({"late": {"other": 3}}, None),
+    ):
+        with contextlib.nullcontext() if found else pytest.raises(LumigraphError):
+            numbers = typed(Numbers, of_this_version(said, Numbers, "a run"), "a run", closed=True)
+            assert alike(asdict(numbers), asdict(typed(Numbers, found, "a run")))
+    kind = methods.find("nerf-w")
+    said = asdict(kind.smallest())
+    said |= said.pop("backbone")
+    said["table"]["density_layers"] = 1
+    older = of_this_version(said, kind.Config, "a run")
+    assert typed(kind.Config, older, "a run", closed=True) == kind.smallest()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shutil
 
@@ -19,8 +20,10 @@ from lumigraph.errors import LumigraphError
 from lumigraph.methods.dream_fields import DreamFields
 from lumigraph.training import fit
 
-pytest.importorskip("diffusers")
-pytestmark = budget("methods", 4)
+pytestmark = [  # importing it takes 3 s, of each worker
+    budget("methods", 4),
+    pytest.mark.skipif(importlib.util.find_spec("diffusers") is None, reason="no diffusers"),
+]
 CPU, PROMPTS = torch.device("cpu"), ("a red ball, front view", "a red ball, side view")
 
 

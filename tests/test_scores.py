@@ -23,10 +23,11 @@ from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes
+from lumigraph.evaluation.options import EvaluationOptions
 from lumigraph.evaluation.report import write_report
-from lumigraph.evaluation.run import joined_shapes
-from lumigraph.evaluation.shapes import ShapeScore, ShapesEvaluation
+from lumigraph.evaluation.run import evaluate_collection, evaluate_on, evaluate_run, joined_shapes
+from lumigraph.evaluation.shapes import ShapeScore, ShapesEvaluation, evaluate_shapes
+from lumigraph.evaluation.views import evaluate
 from lumigraph.lab.benchmark.cell import Cell, CellSettings
 from lumigraph.lab.benchmark.conduct import conduct
 from lumigraph.lab.benchmark.table import markdown
@@ -127,12 +128,12 @@ def test_of_several_shapes_each_is_told_first():
     found = evaluate_shapes(ball(0.2), data, points=2000, cells=16, size=8)
     assert [shape.name for shape in found.shapes] == ["ball", "box"] and found.compared == "2 shapes"
     assert found.shapes[0].iou > 0.95 and 0.65 < found.shapes[1].iou < 0.75  # a ball cut by the box of interest
-    assert len(evaluate_shapes(ball(0.2), data, most=1, points=500, cells=16, size=8).shapes) == 1
+    assert len(evaluate_shapes(ball(0.2), data, EvaluationOptions(views=1), points=500, cells=16, size=8).shapes) == 1
 
 
 def test_shapes_that_are_not_there_are_refused():
     with pytest.raises(LumigraphError, match="no shapes in the split 'val'"):
-        evaluate_shapes(ball(0.9), tiny_shapes.shapes(), "val")
+        evaluate_shapes(ball(0.9), tiny_shapes.shapes(), EvaluationOptions("val"))
     with pytest.raises(LumigraphError, match="nowhere zero"):
         evaluate_shapes(ball(-1.0), tiny_shapes.shapes(), points=100, cells=16, size=8)
 
@@ -146,7 +147,7 @@ def test_a_member_of_a_collection_is_told_of_before_it_is_compared():
     alone = evaluate(method, data["amber"])
     assert names == [f"amber/ball_{i}" for i in (0, 4, 8)] == [view.name for view in told.views]
     assert told.psnr > alone.psnr + 1 and told.protocol["members"] == 1
-    assert evaluate_collection(method, data, "train", views=1).protocol["views"] == 3
+    assert evaluate_collection(method, data, EvaluationOptions("train", 1)).protocol["views"] == 3
 
 
 def test_members_count_the_same_however_many_views_they_have():

@@ -37,7 +37,7 @@ COMMANDS = {
     "export splats RUN OUT.ply": "lumigraph.large.open_any",
     "compose RUN RUN --output OUT.json": "lumigraph.large.open_any",
     "explain ray RUN": "lumigraph.lab.explain.ray.along_ray",
-    "capture SCENE --output OUT": "lumigraph.sfm.reconstruct",
+    "capture SCENE --output OUT": "lumigraph.sfm.reconstruction.reconstruct",
     "bench kernels": "lumigraph.kernels.bench.bench_kernels",
     "bench step voxel-grid SCENE": "lumigraph.lab.benchmark.step.bench_step",
     "bench methods --methods voxel-grid --scenes SCENE --output OUT": "lumigraph.lab.benchmark.conduct.conduct",

@@ -19,7 +19,7 @@ from lumigraph import methods
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.export.mesh import extract_mesh
-from lumigraph.export.options import MeshOptions
+from lumigraph.export.options import MeshOptions, PointsOptions
 from lumigraph.export.points import extract_points
 from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, can
@@ -71,7 +71,7 @@ def off(places: np.ndarray) -> np.ndarray:
 def test_points_lie_on_the_surface(field):
     """Depth is a mean over what is half-transparent, so that points lie a little inside: measured medians are -0.02 to
     -0.06, of radius 0.6, and the 5 % that are deepest begin at -0.04 to -0.11."""
-    points = extract_points(field, patterned().cameras, 400)
+    points = extract_points(field, patterned().cameras, PointsOptions(400))
     found = off(points.positions)
     assert len(found) > 200 and -0.09 < np.median(found) < 0.02
     assert np.quantile(found, 0.05) > -0.15 and found.max() < 0.05

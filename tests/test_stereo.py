@@ -150,4 +150,4 @@ def test_pairs_that_cannot_be_compared_are_a_fault(second, said):
 
 def test_an_unknown_photograph_is_a_fault(ball_folder, tmp_path, capsys):
     assert main(["depth", str(ball_folder), "--pair", "0", "nobody", "--output", str(tmp_path / "out")]) == 2
-    assert "has no photograph nobody" in capsys.readouterr().err
+    assert "has no photograph 'nobody'" in capsys.readouterr().err

@@ -29,6 +29,7 @@ from lumigraph.depth_maps import DepthMap
 from lumigraph.errors import LumigraphError
 from lumigraph.export.collision import convex_pieces
 from lumigraph.export.mesh_file import write_mesh
+from lumigraph.export.options import CollisionOptions
 from lumigraph.export.surface import tangents, vertex_normals
 from lumigraph.export.texture import PosedPicture, textured
 from lumigraph.export.texture.atlas import texels_of, unwrap
@@ -364,12 +365,12 @@ def test_convex_pieces_cover_an_angle(tmp_path):
     a, b = np.arange(6), np.roll(np.arange(6), -1)
     sides = np.concatenate([np.stack([a, b, b + 6], -1), np.stack([a, b + 6, a + 6], -1)])
     mesh = Mesh(vertices, np.concatenate([lid[:, ::-1], lid + 6, sides]), np.full((12, 3), 160, np.uint8))
-    pieces = convex_pieces(mesh, 0.05)
-    hulls = [trimesh.Trimesh(*piece) for piece in pieces]
+    pieces = convex_pieces(mesh)
+    hulls = [trimesh.Trimesh(*piece) for piece in pieces.values()]
     assert len(pieces) == 2 and all(hull.is_convex and hull.is_watertight for hull in hulls)
     assert sum(hull.volume for hull in hulls) == pytest.approx(5, rel=0.05)
-    assert len(convex_pieces(mesh, 0.05, 1)) == 1
-    write_mesh(tmp_path / "angle.glb", mesh, pieces={f"UCX_source_{i:02}": piece for i, piece in enumerate(pieces)})
+    assert len(convex_pieces(mesh, CollisionOptions(pieces=1))) == 1
+    write_mesh(tmp_path / "angle.glb", mesh, pieces=pieces)
     scene = trimesh.load_scene(tmp_path / "angle.glb", process=False)
     assert set(scene.graph.nodes_geometry) == {"source", "UCX_source_00", "UCX_source_01"}
     np.testing.assert_allclose(scene.bounds, [[0, 0, -3], [3, 1, 0]], atol=0.05)  # upright, as the mesh itself

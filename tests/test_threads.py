@@ -16,7 +16,9 @@ import torch
 
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.views import evaluate
+from lumigraph.export.options import PointsOptions
 from lumigraph.export.points import extract_points
 from lumigraph.system import threads, work
 from lumigraph.system.allocation import USER_SETTINGS
@@ -197,10 +199,10 @@ def test_python_works_as_the_command_line_does(watch, monkeypatch, way, ball_run
     elif way == "render":
         method.render(scene.cameras[0])
     elif way == "evaluate":
-        evaluate(method, scene, views=1)
+        evaluate(method, scene, EvaluationOptions(views=1))
     elif way == "export":
         with contextlib.suppress(LumigraphError):  # nothing of an untrained method is solid
-            extract_points(method, scene.cameras, count=10, size=8, views=2)
+            extract_points(method, scene.cameras, PointsOptions(count=10, size=8, views=2))
     else:
         assert main(["eval", str(ball_run.folder), "--views", "1"]) == 2  # its photographs are in memory alone
         assert main(["render", str(ball_run.folder), "--frames", "1", "--overwrite"]) == 0

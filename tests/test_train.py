@@ -11,7 +11,7 @@ import torch
 from budgets import budget
 
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.views import evaluate
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
 from lumigraph.training import Clock, finite, fit, rehearse, set_learning_rate

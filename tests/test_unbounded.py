@@ -9,7 +9,7 @@ from numba import njit
 
 from lumigraph.camera.rays import Look, Rays, Samples
 from lumigraph.components.sampling.proposal import Proposal, Proposed, edges_of, excess_of, proposal_loss
-from lumigraph.components.sampling.samplers import MIN_WEIGHT, ProposalNumbers, ProposalSampler
+from lumigraph.components.sampling.samplers import AIR_WEIGHT, MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.training.regularizers import depth_loss, distortion_loss, scale_gradients
 from lumigraph.datasets.scene import Forward
@@ -143,7 +143,7 @@ class Formula(Field):
 
 
 def sampler() -> ProposalSampler:
-    return ProposalSampler(SPACES["contracted"], ProposalNumbers(proposal_samples=32, samples_per_ray=16), 1024)
+    return ProposalSampler(SPACES["contracted"], ProposalNumbers(), 1024)
 
 
 def test_rays_end_at_places_that_are_known_until_half_of_the_budget_is_spent():
@@ -171,7 +171,7 @@ def test_air_between_cameras_is_clear_half_way_to_the_nearest_surface():
     (found,) = made.sample(rays(), Formula(lambda points: 0 * points[:, 0]), generator=generator)
 
     def air(formula) -> float:
-        return float(made.terms(formula, found, generator)["air"]) / made.numbers.air_weight
+        return float(made.terms(formula, found, generator)["air"]) / AIR_WEIGHT
 
     assert air(lambda points: 9.0 * (points.norm(dim=-1) > 1.25)) == 0.0  # 0.2 of it aside
     assert air(lambda points: 9.0 * (points.norm(dim=-1) < 0.9)) > 0.7

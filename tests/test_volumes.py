@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ import lumigraph.methods
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.commands.cli import main
-from lumigraph.derive.conversion import ConversionTarget, convert
+from lumigraph.derive.conversion import convert
+from lumigraph.derive.options import ConvertOptions
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange.baked import Octree, atlas_for_browser, breadth_first, clearance, octree_for_browser
 from lumigraph.export import page as pages
@@ -116,17 +118,18 @@ def test_an_atlas_is_seen_as_its_rays_say(tmp_path, window, network):
 def grid(ball_run, tmp_path_factory):
     """The folder of a run that knows density and colour at points."""
     folder = tmp_path_factory.mktemp("grid") / "run"
-    convert(open_any(ball_run.folder), "plenoxels", folder, small("plenoxels"))
+    convert(open_any(ball_run.folder), "plenoxels", folder, **small("plenoxels"))
     return folder
 
 
-def small(name: str, steps: int = 24) -> ConversionTarget:
-    return ConversionTarget(config=lumigraph.methods.find(name).smallest(), steps=steps, views=1)
+def small(name: str, steps: int = 24) -> dict[str, Any]:
+    """The least conversion, as arguments of `convert`."""
+    return {"aim": ConvertOptions(steps=steps, views=1), "config": lumigraph.methods.find(name).smallest()}
 
 
 @pytest.mark.parametrize(("name", "holds"), [("plenoctrees", "leaves of an octree"), ("snerg", "blocks of")])
 def test_a_baked_run_is_seen_as_it_renders(grid, tmp_path, window, capsys, name, holds):
-    convert(open_any(grid), name, tmp_path / "run", small(name))
+    convert(open_any(grid), name, tmp_path / "run", **small(name))
     assert main(["export", "web", str(tmp_path / "run"), str(tmp_path / "page.html")]) == 0
     assert holds in capsys.readouterr().out
     opened, method = window(tmp_path / "page.html"), open_any(tmp_path / "run").method()
@@ -138,7 +141,8 @@ def test_a_baked_run_is_seen_as_it_renders(grid, tmp_path, window, capsys, name,
 
 
 def test_a_field_becomes_an_octree_on_the_way(grid, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(lumigraph.derive.conversion, "ConversionTarget", lambda seconds: small("plenoctrees", 4))
+    quick = lambda *told, **more: convert(*told[:3], device=told[4], **small("plenoctrees", 4))  # noqa: E731
+    monkeypatch.setattr(lumigraph.derive.conversion, "convert", quick)
     assert main(["export", "web", str(grid), str(tmp_path / "page.html")]) == 0
     told = capsys.readouterr().out
     assert "leaves of an octree" in told and "--as views is quicker" in told and "dB to plenoxels" in told

@@ -19,6 +19,7 @@ from windows import SIZE, psnr, some_camera
 from lumigraph.camera import Camera
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
+from lumigraph.export.options import PageOptions
 from lumigraph.export.page import WEB, mesh_page, splats_page, views, views_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.splatting import render
@@ -183,7 +184,13 @@ def test_the_open_sky(tmp_path, window):
 
 def test_pictures_are_turned_over(tmp_path, window):
     made, cameras = tiny_method(), scene().cameras
-    views_page(tmp_path / "page.html", made, cameras, opening_of_scene("ball", cameras, made.frame), 8, 96)
+    views_page(
+        tmp_path / "page.html",
+        made,
+        cameras,
+        opening_of_scene("ball", cameras, made.frame),
+        PageOptions(views=8, size=96),
+    )
     assert (tmp_path / "page.html").stat().st_size < 1e5
     opened = window(tmp_path / "page.html", viewport={"width": 96, "height": 96})
     seen_from = views(Surroundings(cameras, made.frame), 8, (96, 96))

@@ -45,8 +45,8 @@ from lumigraph.components.training.photometric import spread_of_light
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import evaluate
 from lumigraph.files.ranges import changed
 from lumigraph.methods.gaussian_splatting import GaussianSplatting
 from lumigraph.methods.gaussian_splatting.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers

@@ -17,8 +17,8 @@ from lumigraph.camera.rays import Rendering
 from lumigraph.datasets.terrain import terrain
 from lumigraph.datasets.world import LABELS, BlockWorld
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluation import evaluate_walk, warped_difference
-from lumigraph.evaluation.walks import colours_by_label
+from lumigraph.evaluation.options import EvaluationOptions
+from lumigraph.evaluation.walks import colours_by_label, evaluate_walk, warped_difference
 from lumigraph.method import Method
 from lumigraph.methods.gancraft.landscapes import STYLES, landscape
 from lumigraph.opening import kind_of, open_dataset
@@ -195,4 +195,4 @@ def test_a_walk_is_evaluated_without_photographs():
     assert len(found.frames) == 3 and found.change == 0 and found.frames[0].change is None
     assert [score.name for score in found.scores] == ["warped difference", "colours by label"]
     with pytest.raises(LumigraphError, match="no frames in the split 'val'"):
-        evaluate_walk(Grey(world.frame, None), world, "val")
+        evaluate_walk(Grey(world.frame, None), world, EvaluationOptions("val"))

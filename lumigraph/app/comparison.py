@@ -29,7 +29,7 @@ def comparison(run: Path) -> dict[str, Any] | None:
 
 @lru_cache(512)
 def _comparison(folder: Path, version: tuple[int, ...]) -> dict[str, Any] | None:
-    from ..evaluation import stem
+    from ..evaluation.run import stem
     from ..run import Run
     from ..run.records import read_evaluation
 

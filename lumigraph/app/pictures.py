@@ -26,10 +26,10 @@ from ..readers.masks import MASKS
 from ..readers.numbers import check_pixels
 from ..readers.pictures import reads_heic
 from ..readers.raw import is_raw
+from ..sfm.photos.film import VIDEOS
 from ..sfm.photos.gather import PHOTOGRAPHS, walk
 from ..sfm.photos.judge import Judgement, blurred, duplicates, exposure_jumps, judge
 from ..sfm.photos.overlap import Descriptors, apart, details, shared
-from ..sfm.photos.video import VIDEOS
 from ..sfm.reconstruction import BLACK, MIN_VIEWS
 from ..system.children import start_python
 from . import reduce

@@ -287,8 +287,8 @@ def safe_part(part: str) -> str:
 def kind_of_file(name: str) -> str | None:
     """ "photograph" or "video" by a name's ending; None for any other file."""
     from ..readers.raw.library import RAW_SUFFIXES
+    from ..sfm.photos.film import VIDEOS
     from ..sfm.photos.gather import PHOTOGRAPHS
-    from ..sfm.photos.video import VIDEOS
 
     ending = PurePosixPath(name).suffix.lower()
     if ending in VIDEOS:

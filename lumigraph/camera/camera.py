@@ -1,4 +1,4 @@
-"""Cameras: where photographs were taken from, and the rays that made their pixels."""
+"""Cameras: poses, lenses and sizes of photographs, and the rays of their pixels."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Camera:
     pose:        camera-to-world, rotation and position; +x right, +y down, +z forward; position in scene units
     lens:        intrinsics, one row per camera
     size:        (width, height) in pixels
-    time:        moment of exposure, if the capture moves
-    image_index: which photograph each camera took, if any
+    time:        time of exposure, for a dynamic capture
+    image_index: number of each camera's photograph, if any
     """
 
     pose: Float[Tensor, "camera 3 4"]
@@ -98,7 +98,7 @@ class Camera:
     def project(
         self, points: Float[Tensor, "point 3"], index: Int[Tensor, " point"] | None = None
     ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
-        """Pixels (x, y) of points in the world, and whether the lens sees them (see `Lens.project`).
+        """Pixels (x, y) of points in the world, and a mask of valid projections (see `Lens.project`).
 
         index: the camera of each point; None means camera 0 for all
         """
@@ -106,7 +106,7 @@ class Camera:
         return self.lens.project(rotate(pose[:, :, :3].mT, points - pose[:, :, 3]), index)
 
     def locate(self, points: Float[Tensor, "point 3"]) -> tuple[Int[Tensor, "point 2"], Bool[Tensor, " point"]]:
-        """Row and column of the pixel that each point lies in, clamped to the picture, and whether it lies in one.
+        """Row and column of the pixel of each point, clamped to the picture, and a mask of points inside it.
 
         For a batch of one: the shared projection of cells into silhouettes, masks and superpixels.
         """
@@ -122,12 +122,12 @@ class Camera:
         return replace(self, size=size, lens=self.lens.resized((size.double() / self.size).to(self.pose.dtype)))
 
     def reduced(self, factor: int) -> Camera:
-        """Cameras of pictures a whole number of times smaller, without the rows and columns that fill no square."""
+        """Cameras of pictures a whole number of times smaller; incomplete squares at the border are cropped."""
         scale = torch.full((1, 2), 1 / factor, device=self.pose.device)
         return replace(self, lens=self.lens.resized(scale), size=self.size // factor)
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Camera:
-        """The cameras in another frame, x' = M x: positions and eyes' distances scale, rotations stay rotations."""
+        """The cameras in another frame, x' = M x: positions and stereo offsets scale, rotations stay rotations."""
         similarity = similarity.to(self.pose)
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
         rotation = similarity[:3, :3] / scale @ self.pose[:, :, :3]
@@ -136,8 +136,8 @@ class Camera:
         return replace(self, pose=pose, lens=self.lens.enlarged(float(scale)))
 
     def sheared(self, right: float, down: float, focus: float) -> Camera:
-        """The cameras moved aside in their own planes, as on a two-plane light field's: pictures move along, so that
-        all at the depth `focus` (scene units, along the axis) stays at its pixels. For lenses with a focal length."""
+        """The cameras shifted in their own planes with sheared projections, as on a two-plane light field: points at
+        the depth `focus` (scene units, along the axis) stay at their pixels. For lenses with a focal length."""
         lens: Any = self.lens
         aside = torch.tensor([right, down], dtype=self.pose.dtype, device=self.pose.device)
         position = self.position + (self.pose[:, :, :2] @ aside)
@@ -146,7 +146,7 @@ class Camera:
 
     @staticmethod
     def cat(cameras: Sequence[Camera]) -> Camera:
-        """One batch from several."""
+        """Concatenate batches of cameras."""
         pose, size = torch.cat([c.pose for c in cameras]), torch.cat([c.size for c in cameras])
         time, image_index = join(c.time for c in cameras), join(c.image_index for c in cameras)
         return Camera(pose, Lens.cat([c.lens for c in cameras]), size, time, image_index)
@@ -159,9 +159,9 @@ def ring(
     size: int = 800,
     count: int = RING_CAMERAS,
 ) -> Camera:
-    """Cameras on a circle around a box, turned to its middle, for scenes without photographs.
+    """Cameras on a circle around a box, looking at its centre, for scenes without photographs.
 
-    distance: from the middle, scene units
+    distance: from the centre, scene units
     angle:    of view, degrees
     size:     pixels a side
     """
@@ -176,7 +176,7 @@ def ring(
 
 
 def dome(ring: Camera) -> Camera:
-    """Cameras over a whole dome, at the distances and azimuths of a ring around the origin."""
+    """Cameras on a dome, at the distances and azimuths of a ring around the origin."""
     parts = []
     for degrees in DOME_ELEVATIONS:
         angle = torch.full((len(ring),), math.radians(degrees))
@@ -189,7 +189,7 @@ def dome(ring: Camera) -> Camera:
 
 
 def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 3"]:
-    """The first three columns of each matrix, times each vector."""
+    """Rotate each vector by the first three columns of its matrix."""
     if len(matrix) == 1:
         return vectors @ matrix[0, :, :3].mT
     x, y, z = vectors[:, :, None].unbind(1)
@@ -197,14 +197,14 @@ def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -
 
 
 def join(parts: Iterable[Tensor | None]) -> Tensor | None:
-    """One tensor from several, or None where any is missing."""
+    """Concatenate tensors; None if any is missing."""
     columns = list(parts)
     found = [x for x in columns if x is not None]
     return torch.cat(found) if len(found) == len(columns) else None
 
 
 def gather(values: Tensor | None, index: Tensor | None, count: int) -> Tensor | None:
-    """One value for each ray, or None where there are none."""
+    """One value for each ray, or None without values."""
     if values is None:
         return None
     return values[:1].expand(count) if index is None else values.index_select(0, index)

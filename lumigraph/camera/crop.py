@@ -1,4 +1,4 @@
-"""Crop: a box or a sphere that says which part of a scene counts."""
+"""Crop: a box or a sphere that bounds the used part of a scene."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ IDENTITY_ROWS: Rows = Similarity.make(1.0).rows
 
 
 class Crop(ABC):
-    """A part of space, by plain numbers, so that two are equal if they say the same.
+    """A part of space, in plain numbers, so that equal crops compare equal.
 
-    convex: whether all between where a ray enters and leaves is inside
+    convex: whether a ray is inside all the way between entry and exit
     """
 
     convex: ClassVar[bool] = True
@@ -31,11 +31,11 @@ class Crop(ABC):
 
     @abstractmethod
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Distances at which each ray enters and leaves; it leaves before it enters where it misses."""
+        """Entry and exit distances of each ray; exit is before entry for a miss."""
 
     @abstractmethod
     def moved(self, place: Similarity) -> Crop:
-        """The same part of space as another frame says it. place: from this frame to that one."""
+        """The same part of space in another frame. place: from this frame to that one"""
 
     @property
     @abstractmethod
@@ -43,11 +43,11 @@ class Crop(ABC):
         """The lower and the upper corner of the smallest upright box around it."""
 
     def coloured(self, points: Float[Tensor, "point 3"], rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Colours of a field at points of the part."""
+        """Colours of a field at points of the part, such as for a preview."""
         return rgb
 
     def entered(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Bool[Tensor, " ray"]]:
-        """Distance at which each ray is first inside, 0 for one that begins inside, and whether it ever is."""
+        """Distance of each ray's first point inside, 0 for an origin inside, and a mask of rays that enter at all."""
         enter, leave = self.through(rays)
         enter = enter.clamp_min(0)
         return enter, enter < leave
@@ -55,9 +55,9 @@ class Crop(ABC):
 
 @dataclass(frozen=True)
 class CropBox(Crop):
-    """A box by two corners, of which lower is nowhere above upper.
+    """A box by its lower and upper corner.
 
-    place: similarity from the frame in which the corners are said and the sides are upright
+    place: similarity from the frame in which the box is axis-aligned
     """
 
     lower: Vector
@@ -66,7 +66,7 @@ class CropBox(Crop):
 
     @property
     def corners(self) -> Float[Tensor, "8 3"]:
-        """In double precision; the numbers of two that share an edge differ in one bit."""
+        """Corners in double precision, indexed by bits; adjacent corners differ in one bit."""
         ends = zip(self.lower, self.upper, strict=True)
         return self._place.points(torch.tensor(list(itertools.product(*ends)), dtype=torch.float64))
 
@@ -99,7 +99,7 @@ class CropBox(Crop):
 
 @dataclass(frozen=True)
 class Sphere(Crop):
-    """A sphere by its middle and radius."""
+    """A sphere by its centre and radius."""
 
     middle: Vector
     radius: float
@@ -108,7 +108,9 @@ class Sphere(Crop):
         return (points - torch.tensor(self.middle).to(points)).norm(dim=-1) <= (1 + tolerance) * self.radius
 
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Solve |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), where b is how far along m is nearest, and a how near."""
+        """Solve |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), b the distance along the ray of its point closest to m, a
+        that point's distance from m.
+        """
         away = torch.tensor(self.middle).to(rays.origins) - rays.origins
         nearest = (away * rays.directions).sum(-1)
         beside = (away - nearest[:, None] * rays.directions).square().sum(-1)

@@ -1,6 +1,6 @@
-"""Lenses: where on the picture a direction lands, and which direction a pixel looks along.
+"""Lenses: maps from directions to pixels (project) and back (unproject).
 
-A lens works in the camera's own frame: +x right, +y down, +z forward. It is a value holding one row of numbers per
+A lens works in the camera's own frame: +x right, +y down, +z forward. It is a value with one row of numbers per
 camera of a batch. A new kind of lens is a new subclass with `unproject` and `project`; nothing else changes.
 """
 
@@ -62,22 +62,22 @@ class Lens(ABC):
     def unproject(
         self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None
     ) -> Float[Tensor, "ray 3"]:
-        """Unit directions in the camera's frame. A pixel that nothing reaches gets the outermost direction there is."""
+        """Unit directions in the camera's frame. A pixel outside the lens's range gets its outermost direction."""
 
     @abstractmethod
     def project(
         self, points: Float[Tensor, "point 3"], index: Int[Tensor, " point"] | None = None
     ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
-        """Pixels of points in the camera's frame, and whether the lens sees them at all.
+        """Pixels of points in the camera's frame, and a mask of valid projections.
 
-        False behind the camera and beyond a distortion's fold-over; their pixels are finite but mean nothing.
-        Whether a pixel lies inside the picture is another question.
+        False behind the camera and beyond a distortion's fold-over; their pixels are finite but meaningless. The mask
+        does not test whether a pixel lies inside the picture.
         """
 
     def origins(
         self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None
     ) -> Float[Tensor, "ray 3"] | None:
-        """Origins of rays in the camera's frame, in scene units; None where all begin at the camera's centre."""
+        """Origins of rays in the camera's frame, in scene units; None for rays from the camera's centre."""
         return None
 
     def solid_angle(
@@ -86,18 +86,18 @@ class Lens(ABC):
         directions: Float[Tensor, "ray 3"],
         index: Int[Tensor, " ray"] | None = None,
     ) -> Float[Tensor, " ray"]:
-        """Solid angle of each pixel, in steradians. `directions` are those that `unproject` gave."""
+        """Solid angle of each pixel, in steradians. directions: from `unproject`"""
         half_x, half_y = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
         across = self.unproject(pixels + half_x, index) - self.unproject(pixels - half_x, index)
         down = self.unproject(pixels + half_y, index) - self.unproject(pixels - half_y, index)
         return torch.linalg.cross(across, down).norm(dim=-1)
 
     def resized(self, scale: Float[Tensor, "#camera 2"]) -> Lens:
-        """The same lens behind a picture with (x, y) scaled pixels."""
+        """The same lens for a picture scaled by (x, y)."""
         return type(self)(**{k: v * scale if k in self.in_pixels else v for k, v in self._numbers().items()})
 
     def enlarged(self, scale: float) -> Lens:
-        """The same lens in a world so many times as large."""
+        """The same lens in a world scaled by a factor."""
         return self
 
     def __len__(self) -> int:
@@ -117,12 +117,12 @@ class Lens(ABC):
         return next(iter(self._numbers().values())).device
 
     def to_json(self) -> dict[str, Any]:
-        """Plain lists and a name; `Lens.from_json` turns them back exactly."""
+        """Plain lists and a name, the exact inverse of `Lens.from_json`."""
         return {"kind": type(self).__name__.lower(), **{k: v.tolist() for k, v in self._numbers().items()}}
 
     @staticmethod
     def from_json(data: Any, where: Any = "a lens") -> Lens:
-        """Read the lenses of cameras from a file's JSON. Raises LumigraphError, naming `where`, for what are none."""
+        """Read the lenses of cameras from a file's JSON. Raises LumigraphError, naming `where`, for invalid ones."""
         kind = Lens.kinds.get(typed(Named, data, where).kind)
         if kind is None:
             raise LumigraphError(f"{where} has a lens of kind {data['kind']!r}; there are {', '.join(Lens.kinds)}")
@@ -157,7 +157,7 @@ class Lens(ABC):
 
     @staticmethod
     def cat(lenses: Sequence[Lens]) -> Lens:
-        """One batch from several, which becomes `Mixed` where they are of different kinds."""
+        """Concatenate lenses; different kinds become `Mixed`."""
         first = lenses[0]
         if isinstance(first, Mixed) or any(type(lens) is not type(first) for lens in lenses):
             return mix([one for lens in lenses for one in (lens[i] for i in range(len(lens)))])
@@ -172,7 +172,7 @@ class Lens(ABC):
 
 @dataclass(frozen=True)
 class Pinhole(Lens):
-    """A flat image behind a point: (u, v) = f (x, y) / z + c.
+    """Pinhole camera: (u, v) = f (x, y) / z + c.
 
     focal, centre: pixels
     """
@@ -196,13 +196,13 @@ class Pinhole(Lens):
 
 @dataclass(frozen=True)
 class OpenCV(Lens):
-    """A flat image with rational radial and tangential distortion (OpenCV's camera model; Brown 1971).
+    """Pinhole with rational radial and tangential distortion (OpenCV's camera model; Brown 1971).
 
         (x, y) -> (x, y) q(r^2) + (2 p1 xy + p2 (r^2 + 2 x^2), p1 (r^2 + 2 y^2) + 2 p2 xy)
         q(s) = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3)
 
     focal, centre: pixels
-    distortion:    k1 k2 p1 p2 k3 k4 k5 k6, in OpenCV's order; zeros for what a calibration lacks
+    distortion:    k1 k2 p1 p2 k3 k4 k5 k6, in OpenCV's order; zeros where a calibration has none
     """
 
     focal: Float[Tensor, "camera 2"]
@@ -211,7 +211,7 @@ class OpenCV(Lens):
 
     @cached_property
     def fold(self) -> Float[Tensor, "camera 1"]:
-        """Radius on the plane z = 1 up to which the radial distortion only grows."""
+        """Radius on the plane z = 1 up to which radial distortion is monotonic."""
         r = torch.linspace(0, MAX_FLAT_ANGLE, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device).tan()
         k1, k2, _, _, k3, k4, k5, k6 = self.distortion.double().T[:, :, None]
         s = r * r
@@ -265,11 +265,11 @@ class OpenCV(Lens):
 
 @dataclass(frozen=True)
 class Fisheye(Lens):
-    """The angle from the axis, rather than its tangent, sets the distance from the centre (Kannala & Brandt 2006).
+    """Fisheye lens: distance from the centre is a polynomial of the angle from the axis (Kannala & Brandt 2006).
 
         distance = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
 
-    As OpenCV's fisheye model, but seeing behind itself where theta passes 90 degrees.
+    As OpenCV's fisheye model, but also valid beyond 90 degrees.
     focal, centre: pixels
     distortion:    k1 k2 k3 k4
     """
@@ -280,7 +280,7 @@ class Fisheye(Lens):
 
     @cached_property
     def fold(self) -> Float[Tensor, "camera 1"]:
-        """Angle from the axis up to which the distance from the centre only grows, at most pi."""
+        """Angle from the axis up to which the distance from the centre is monotonic, at most pi."""
         theta = torch.linspace(0, math.pi, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device)
         distance, _ = stretch(theta, self.distortion.double().T[:, :, None].unbind())
         return last_growing(theta, distance).to(self.focal.dtype)
@@ -318,10 +318,10 @@ class Fisheye(Lens):
 
 @dataclass(frozen=True)
 class Equirectangular(Lens):
-    """The whole sphere on one picture: longitude across, latitude down. The top looks along -y.
+    """Equirectangular panorama: longitude across, latitude down. The top looks along -y.
 
     size:   (width, height) in pixels of 360 by 180 degrees
-    centre: the pixel that looks along +z; half the size where nothing is said. Another one shows a part of the sphere
+    centre: the pixel that looks along +z; half the size by default. Another one shows a part of the sphere
     """
 
     in_pixels: ClassVar[tuple[str, ...]] = ("size", "centre")
@@ -355,10 +355,10 @@ class Equirectangular(Lens):
 
 @dataclass(frozen=True)
 class OmnidirectionalStereo(Equirectangular):
-    """One eye's panorama whose rays leave a level circle, the viewing circle, along its tangents (Peleg 2001).
+    """One eye's omnidirectional stereo panorama: rays are tangents of a level circle, the viewing circle (Peleg 2001).
 
-    Whichever way one turns, the eyes are beside each other: a ray of longitude a begins at s (cos a, 0, -sin a).
-    A point at a distance R from the vertical axis appears turned by asin(s / R) against what the circle's middle sees.
+    The eyes are side by side in every viewing direction: a ray of longitude a begins at s (cos a, 0, -sin a).
+    A point at a distance R from the vertical axis appears rotated by asin(s / R) compared with the circle's centre.
 
     offset: s in scene units, from the middle between the eyes to this one, positive to the right
     """
@@ -384,10 +384,10 @@ class OmnidirectionalStereo(Equirectangular):
 
 @dataclass(frozen=True)
 class Mixed(Lens):
-    """Lenses of several kinds in one batch, as from two sorts of camera at one place.
+    """Lenses of several kinds in one batch.
 
     parts: one batch of lenses for each kind
-    part:  which of them each camera has; the cameras of one part are in its order
+    part:  index into `parts` of each camera; the cameras of one part are in its order
     """
 
     parts: tuple[Lens, ...]
@@ -395,7 +395,7 @@ class Mixed(Lens):
 
     @property
     def row(self) -> Int[Tensor, " camera"]:
-        """Each camera's place within its part."""
+        """Each camera's index within its part."""
         mine = self.part[:, None] == torch.arange(len(self.parts), device=self.part.device)
         return (mine.cumsum(0) - 1).gather(1, self.part[:, None])[:, 0]
 
@@ -452,7 +452,7 @@ class Mixed(Lens):
         return mix([self.parts[part][row] for part, row in pairs])
 
     def _by_part(self, ask: Callable[..., tuple[Tensor, ...]], index: Tensor | None, *inputs: Tensor) -> list[Tensor]:
-        """Ask each part about its own rows of the inputs, and put the answers back in their places."""
+        """Apply a function to each part's rows of the inputs, and merge the results in the original order."""
         if index is None:
             index = self.part.new_zeros(len(inputs[0]))
         part, row = self.part[index], self.row[index]
@@ -463,7 +463,7 @@ class Mixed(Lens):
 
 
 def mix(lenses: Sequence[Lens]) -> Lens:
-    """One batch of single lenses: of their kind if they have one in common, else Mixed."""
+    """One batch of single lenses: of their common kind, else Mixed."""
     kinds = sorted({type(lens) for lens in lenses}, key=lambda kind: kind.__name__)
     parts = tuple(Lens.cat([lens for lens in lenses if type(lens) is kind]) for kind in kinds)
     if len(parts) == 1:
@@ -472,17 +472,17 @@ def mix(lenses: Sequence[Lens]) -> Lens:
 
 
 def rows(table: Tensor, index: Tensor | None) -> Tensor:
-    """One row for each ray; without an index the first, left to broadcast."""
+    """One row for each ray; without an index row 0, to be broadcast."""
     return table[:1] if index is None else table.index_select(0, index)
 
 
 def columns(table: Tensor, index: Tensor | None) -> tuple[Tensor, ...]:
-    """The same, each column by itself and contiguous, which is faster to compute with."""
+    """Columns of `rows`, each contiguous, which is faster to compute with."""
     return table[:1].T.unbind() if index is None else table.T.contiguous().index_select(1, index).unbind()
 
 
 def area(sides: Tensor, index: Tensor | None) -> Tensor:
-    """x times y of one row for each ray."""
+    """Product of both columns for each ray."""
     return columns(sides.prod(-1, keepdim=True), index)[0]
 
 
@@ -505,14 +505,14 @@ def through_plane(x: Float[Tensor, " ray"], y: Float[Tensor, " ray"]) -> Float[T
 
 
 def onto_plane(points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
-    """Points drawn towards the eye onto the plane z = 1, and whether they were in front of it."""
+    """Points projected onto the plane z = 1, and a mask of those in front of it."""
     z = points[:, 2:]
     valid = z > 1e-6 * points.norm(dim=-1, keepdim=True)
     return points[:, :2] / torch.where(valid, z, 1), valid[:, 0]
 
 
 def within(x: Tensor, y: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
-    """Points of the plane, drawn back onto the disc of a radius."""
+    """Points of the plane, clamped to a disc of a radius."""
     shrink = (limit * torch.rsqrt((x * x + y * y).clamp_min(1e-12))).clamp_max(1)
     return x * shrink, y * shrink
 
@@ -542,13 +542,13 @@ def bend(
 
 
 def stretch(theta: Tensor, distortion: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """The fisheye's distance from the centre at each angle, and its slope."""
+    """Distance from the fisheye's centre at each angle, and its derivative."""
     k1, k2, k3, k4 = distortion
     s = theta * theta
     return theta * polynomial(s, 1, k1, k2, k3, k4), polynomial(s, 1, 3 * k1, 5 * k2, 7 * k3, 9 * k4)
 
 
 def last_growing(at: Float[Tensor, " sample"], values: Float[Tensor, "camera sample"]) -> Float[Tensor, "camera 1"]:
-    """The last sample before a curve first stops growing."""
+    """Last sample before a curve first stops growing."""
     growing = (values.diff(dim=-1) > 0).cumprod(-1).sum(-1, keepdim=True)
     return at[growing]

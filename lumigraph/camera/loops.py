@@ -11,7 +11,7 @@ from numba import njit, prange
 
 @njit(inline="always")
 def distort(x, y, d):
-    """OpenCV's distortion and its Jacobian, as `bend` has them. d: k1 k2 p1 p2 k3 k4 k5 k6."""
+    """OpenCV's distortion and its Jacobian, as `bend`. d: k1 k2 p1 p2 k3 k4 k5 k6"""
     s = x * x + y * y
     below = 1 / (1 + s * (d[5] + s * (d[6] + s * d[7])))
     q = (1 + s * (d[0] + s * (d[1] + s * d[4]))) * below
@@ -25,7 +25,7 @@ def distort(x, y, d):
 
 @njit(inline="always")
 def clamp_radius(x, y, limit):
-    """A point of the plane, drawn back onto the disc of a radius."""
+    """A point of the plane, clamped to a disc of a radius."""
     s = x * x + y * y
     if s <= limit * limit:
         return x, y

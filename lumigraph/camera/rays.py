@@ -1,4 +1,4 @@
-"""Rays, the samples along them, what is looked up there, and what was seen: the nouns that every ray method speaks."""
+"""Rays, samples along them, field values there, and renderings: the data types of every ray method."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from .loops import fill_midpoints
 
 @dataclass(frozen=True)
 class Rays:
-    """Half-lines through the scene.
+    """Rays through the scene.
 
     origins:     scene units
     directions:  unit length
     radius:      pixel footprint's radius at distance one, in scene units (cones, Barron 2021)
-    time:        moment of exposure, if the capture moves
-    image_index: which photograph a ray belongs to, if any (appearance, exposure, pose corrections)
+    time:        time of exposure, for a dynamic capture
+    image_index: photograph of a ray, if any (appearance, exposure, pose corrections)
     """
 
     origins: Float[Tensor, "ray 3"]
@@ -46,8 +46,8 @@ class Rays:
         return self.origins + t[:, None] * self.directions
 
     def through_box(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Distances at which each ray enters and leaves a box (the slab test of Kay & Kajiya 1986). It leaves before it
-        enters where it misses."""
+        """Entry and exit distances of each ray in a box (the slab test of Kay & Kajiya 1986); exit is before entry
+        for a miss."""
         slow = self.directions.abs() < 1e-9
         inverse = 1 / torch.where(slow, 1e-9, self.directions)
         a, b = (box[0] - self.origins) * inverse, (box[1] - self.origins) * inverse
@@ -102,7 +102,7 @@ class Samples:
         return Samples(self.t_start.index_select(0, kept), self.t_end.index_select(0, kept), before[self.ray_starts])
 
     def along(self, rays: Rays) -> tuple[Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
-        """Midpoints as positions, and the direction each is seen along."""
+        """Positions of the midpoints, and the ray direction of each."""
         given = rays.origins, rays.directions, self.t_start, self.t_end
         if not rays.origins.is_cuda and not (torch.is_grad_enabled() and any(x.requires_grad for x in given)):
             positions, directions = (self.t_start.new_empty(len(self), 3) for _ in range(2))
@@ -116,7 +116,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Look:
-    """The samples of rays in one pass of a method, with the density and colour of its field at each.
+    """Samples of rays in one pass of a method, with the density and colour of its field at each.
 
     name:    of the pass, e.g. "coarse" and "fine"
     density: per scene unit, constant over each sample
@@ -133,9 +133,9 @@ class Look:
 class Rendering:
     """Output of rendering a camera or a batch of rays. Leading axes are (height, width) or (ray,).
 
-    rgb:     as photographed (sRGB-encoded), background already behind it
-    depth:   distance along the ray in scene units, expected over what is opaque; infinity where nothing is
-    opacity: share of light that the scene stops, in [0, 1]
+    rgb:     sRGB-encoded, composited over the background
+    depth:   expected distance along the ray in scene units, over its opacity; infinity for empty rays
+    opacity: accumulated opacity, in [0, 1]
     extra:   anything else by name, with the same leading axes (normals, features, uncertainty)
     """
 
@@ -153,7 +153,7 @@ class Rendering:
         return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape), extra)
 
     def _repr_png_(self) -> bytes | None:
-        """A notebook's view of a picture: its colours, and its depth beside them. None for rays."""
+        """Picture for a notebook: colours, and depth beside them. None for rays."""
         if self.depth.ndim != 2:
             return None
         depth = colour_depth(self.depth, self.opacity, depth_range(self.depth, self.opacity))

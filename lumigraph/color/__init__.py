@@ -1,1 +1,1 @@
-"""Colours: sRGB encoding, and compositing before a background."""
+"""Colours: sRGB encoding and alpha compositing over a background."""

@@ -1,4 +1,4 @@
-"""Colours before a background (Porter and Duff 1984): the one place where alpha meets what lies behind."""
+"""Alpha compositing over a background (Porter and Duff 1984), for straight and premultiplied colours."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ def before(
     alpha: Float[Tensor, "*pixels"] | None,
     background: Float[Tensor, "*#pixels 3"] | tuple[float, float, float],
 ) -> Float[Tensor, "*pixels 3"]:
-    """Colours that are not multiplied by alpha, as photographs have them, with a background behind what is not opaque.
+    """Composite straight (not premultiplied) colours, as in photographs, over a background.
 
-    alpha: None where all is opaque
+    alpha: None for opaque pictures
     """
     if alpha is None:
         return rgb
@@ -27,5 +27,5 @@ def over(
     opacity: Float[Tensor, "*pixels"],
     background: Float[Tensor, "*#pixels channel"],
 ) -> Float[Tensor, "*pixels channel"]:
-    """Light that was stopped on its way, as renderings have it (colours times opacity), and what passes from behind."""
+    """Composite premultiplied colours, as in renderings, over a background."""
     return light + (1 - opacity)[..., None] * background

@@ -15,10 +15,10 @@ from ..budget import Budget
 from ..errors import LumigraphError
 from ..files import claim
 from ..files.ranges import Count, Downscale, Scales, Seconds, Seed, Share, Steps
+from ..training.options import DEFAULT_SECONDS
 from .capture import posed
 from .common import choose_device, preset_device, say, scene_name, show, show_table
 from .options import DeviceOption, Overwrite, ReaderOption, SeedOption, StepsOption, needed, option
-from .train import DEFAULT_SECONDS
 
 FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
 

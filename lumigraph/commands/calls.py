@@ -19,6 +19,7 @@ from ..files.names import counted
 from ..files.options import option_name
 from ..files.ranges import coherent, hints, members, typed
 from ..system.children import Request
+from ..system.progress import Listener, heard_by
 from ..system.work import at_work
 from .common import kept_rows
 from .request import kind_of
@@ -102,9 +103,9 @@ def plain(value: Any, kind: Any) -> Any:
 
 
 @at_work()
-def quietly(work: Callable[[], T]) -> tuple[T, dict[str, Any]]:
-    """The result of a command's function, and the rows that it would print."""
-    with kept_rows() as rows:
+def quietly(work: Callable[[], T], progress: Listener | None = None) -> tuple[T, dict[str, Any]]:
+    """The result of a command's function, and the rows that it would print. progress: see `heard_by`"""
+    with kept_rows() as rows, heard_by(progress):
         return work(), rows
 
 

@@ -5,21 +5,22 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..files.ranges import Count, between
+from ..sfm.options import MotionOptions
 from .common import finding_rows, lines, say, scene_name, show, typed
 from .options import needed, option
+from .results import Output
 
 MAX_NAMED_GAPS = 2  # gaps around the subject that are named
 GENERIC_FOLDERS = "images", "photos", "photographs", "pictures", "input", "frames"  # named after their contents
 
 
-@dataclass(frozen=True)
-class CaptureCommand:
+@dataclass(frozen=True, kw_only=True)
+class CaptureCommand(MotionOptions, Output):
     """Find the camera poses of photographs: a folder, a list of files, or a video.
 
     The result is a folder that this and other programs open: images, sparse/0 (COLMAP), transforms.json, and two
@@ -30,41 +31,25 @@ class CaptureCommand:
     """A folder of photographs, several image files, or one video."""
     output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
     """Folder for the scene."""
-    frames: Annotated[Count | None, option("N", "by the video's length")] = None
-    """Number of frames to take from a video; more cover it better and take longer."""
-    mapper: Literal["incremental", "global"] = "incremental"
-    """Structure from motion: incremental, one photograph after the other, or global, quicker for hundreds."""
-    matching: Literal["auto", "sequential", "exhaustive", "retrieval"] = "auto"
-    """Pairs to match: neighbours in order, all, or those that look alike; auto decides by kind and number."""
-    camera: Literal["auto", "single", "per-device", "per-image", "spherical"] = "auto"
-    """Photographs that share a lens model: all, those of one device, or none; auto decides by the metadata. spherical:
-    a 360-degree film or panoramas, twice as wide as high; the scene gets flat views of them."""
-    max_size: Annotated[int, between(200, 65_536), option("PIXELS")] = 1600
-    """Longer side of photographs for feature detection; larger finds more features and is slower."""
-
-    moving: bool = False
-    """Things move: leave them out of matching, and give each photograph its time, so that methods of moving scenes
-    train on it. A folder of videos is a rig: one standing camera each, filmed at once."""
     mask_object: bool = False
     """Mask one object in front of a backdrop, so that training learns it alone. Writes object_masks/ and object.png
     into the scene; check that picture before you train."""
 
     def run(self) -> int:
-        from ..sfm import MotionOptions, capture_rig, is_rig
+        from ..sfm.rig import capture_rig, is_rig
         from ..system.progress import track
 
         if not self.what:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
-        options = MotionOptions(self.frames, self.mapper, self.matching, self.camera, self.max_size, self.moving)
         folder = self.output or scene_folder(self.what)
         if self.moving and len(self.what) == 1 and is_rig(self.what[0].expanduser()):
-            rows, said = capture_rig(self.what[0].expanduser(), folder, options, track)
+            rows, said = capture_rig(self.what[0].expanduser(), folder, self, track)
             show(rows | {"scene": str(folder), "next": typed("train", "deformable-splatting", folder)})
             for sentence in said:
                 say(f"warning: {sentence}")
             return 0
         onward = typed("train", "deformable-splatting" if self.moving else "gaussian-splatting", folder)
-        show_result(folder, find_cameras(self.what, folder, options), None if self.mask_object else onward)
+        show_result(folder, find_cameras(self.what, folder, self), None if self.mask_object else onward)
         if self.mask_object:
             show_masks(folder, onward)
         return 0
@@ -116,7 +101,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
 
 def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
     """reconstruct(), with bars; a message after Ctrl-C names the command to continue."""
-    from ..sfm import reconstruct
+    from ..sfm.reconstruction import reconstruct
     from ..system.progress import track
 
     try:

@@ -33,35 +33,9 @@ from ..files.options import option_name
 from ..files.ranges import coherent, domain, groups_of, is_surprising, members, outside, shown
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
-from .app import AppCommand
-from .bench import Bench
-from .canonicalise import Canonicalise
-from .capture import CaptureCommand
-from .clean import Clean
 from .common import say, value_of
-from .compose import Compose
-from .compress import Compress
-from .convert import Convert
-from .demo import Demo
-from .depth import Depth
-from .draw import Draw
-from .eval import Eval
-from .explain import Explain
-from .export import Export
-from .gallery import Gallery
-from .infer import Infer
-from .info import Info
-from .jump import Jump
 from .main_options import HELP_ALL, hidden_options
-from .methods import Methods
-from .photo3d import Photo3DCommand
-from .render import Render
-from .report import Report
-from .resume import Resume
-from .segment import Segment
-from .track import Track
-from .train import Train, with_options_of
-from .view import ViewCommand
+from .train import with_options_of
 
 RULES = ConstructorRegistry()
 beneath = False  # True while tyro applies its own rules only
@@ -126,35 +100,21 @@ def held(command: Any) -> Any:
     return command
 
 
-COMMANDS: dict[str, type] = {
-    "app": AppCommand,
-    "demo": Demo,
-    "capture": CaptureCommand,
-    "depth": Depth,
-    "photo3d": Photo3DCommand,
-    "jump": Jump,
-    "train": Train,
-    "track": Track,
-    "resume": Resume,
-    "infer": Infer,
-    "draw": Draw,
-    "eval": Eval,
-    "render": Render,
-    "view": ViewCommand,
-    "clean": Clean,
-    "segment": Segment,
-    "compose": Compose,
-    "canonicalise": Canonicalise,
-    "compress": Compress,
-    "convert": Convert,
-    "export": Export,
-    "report": Report,
-    "explain": Explain,
-    "info": Info,
-    "methods": Methods,
-    "bench": Bench,
-    "gallery": Gallery,
+NAMES = (
+    "app demo capture depth photo3d jump train track resume infer draw eval render view clean segment georeference "
+    "compose canonicalise compress convert export report explain info methods bench gallery"
+).split()
+OTHER_KINDS = {
+    "app": "AppCommand",
+    "capture": "CaptureCommand",
+    "georeference": "GeoreferenceCommand",
+    "photo3d": "Photo3DCommand",
+    "view": "ViewCommand",
 }
+COMMANDS: dict[str, type] = {
+    name: getattr(importlib.import_module(f".{name}", __package__), OTHER_KINDS.get(name, name.capitalize()))
+    for name in NAMES
+}  # each in the module of its name
 DECISIVE = {"device": "auto", "preset": "auto", "field": ""}  # options on which defaults of others depend
 DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 

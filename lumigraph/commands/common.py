@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from pathlib import Path
 from typing import Any
 
 from .. import methods
-from ..budget import MEANS, Budget, Quality
+from ..budget import Budget, Quality, about_quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
+from ..files.names import next_free as next_free
 from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
 
@@ -72,33 +71,21 @@ def value_of(name: str, arguments: Sequence[str], default: str) -> str:
     return default
 
 
-def given_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
-    """The Budget of --steps or --seconds; `None` without them. Raises LumigraphError, before anything is opened, for an
-    impossible value, and for more than one of these options."""
-    if sum(given is not None for given in (steps, seconds, quality)) > 1:
-        raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
-    return None if steps is None and seconds is None else Budget(steps, seconds)
-
-
 def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
     """The steps of --quality for a method on its data."""
     return Budget(method.steps_for(quality, data), quality=quality)
 
 
-def about_quality(kind: Any = None) -> str:
-    """Help text of --quality; with the numbers of a kind of method, if given."""
-    about = "Choose the steps by method, number of photographs and their size. "
-    return about + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
-
-
-def numbers(kind: Any, quality: Quality) -> str:
-    """The epochs and the least steps of a quality, for a kind of method."""
-    if kind is None:
-        return ""
+def quality_of(kind: Any) -> str:
+    """Help text of --quality, with the epochs and the least steps of a kind of method."""
     from ..method import RayMethod
 
-    effort, unit = kind.efforts[quality], "pixel" if issubclass(kind, RayMethod) else "photograph"
-    return f": {effort.passes:g} epochs over all {unit}s, at least {effort.at_least:,} steps"
+    unit = "pixel" if issubclass(kind, RayMethod) else "photograph"
+    efforts = {
+        name: f": {effort.passes:g} epochs over all {unit}s, at least {effort.at_least:,} steps"
+        for name, effort in kind.efforts.items()
+    }
+    return about_quality(efforts)
 
 
 def say(text: str) -> None:
@@ -151,8 +138,3 @@ def finding_rows(found: Sequence[Any], more: str) -> dict[str, str]:
 def typed(*words: object) -> str:
     """A command to type next, quoted for a shell."""
     return shlex.join(["lumigraph", *map(str, words)])
-
-
-def next_free(prefix: str) -> Path:
-    """The first of prefix-1, prefix-2, ... that does not exist yet."""
-    return next(path for n in itertools.count(1) if not (path := Path(f"{prefix}-{n}")).exists())

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from ..budget import Quality
-from ..errors import LumigraphError
-from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
-from .common import choose_device, say, show, show_table, typed
-from .options import DeviceOption, PhotographsOption, needed, option
+from ..derive.options import CompressOptions
+from .common import choose_device, say, show_table, typed
+from .options import DeviceOption, needed
+from .results import Output, Reports, Result
 
-LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
-DEFAULT: Quality = "good"
-DEFAULT_SECONDS = 60.0
 INVISIBLE_LOSS, VISIBLE_LOSS = 0.3, 1.0  # dB
-UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
-SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmg]?i?)b?\s*", re.IGNORECASE)
-ABOUT = "PSNR that may be lost: " + ", ".join(f"{name} {dB:g} dB" for name, dB in LOSSES.items()) + "."
 
 
-@dataclass(frozen=True)
-class Compress:
+@dataclass(frozen=True, kw_only=True)
+class Compress(Reports, CompressOptions, Output):
     """Compress a trained run to a size, or to a loss of PSNR.
 
     Unimportant rows are pruned, features become rows of a codebook, numbers get 8 or 16 bits; the rest is tuned on the
@@ -38,36 +29,20 @@ class Compress:
     """Folder of the run, which does not change."""
     output: Annotated[Path, needed("NEW")]
     """New folder for the smaller run."""
-    to: Annotated[str | None, option("SIZE", "as --quality")] = None
-    """Upper limit of the model's size: 5MB, 800kB, 2MiB. A smaller one loses more PSNR."""
-    quality: Annotated[Quality | None, option("draft|good|best", DEFAULT, ABOUT)] = None
-    max_loss: Annotated[Decibels | None, option("DB", "as --quality")] = None
-    """Largest loss of PSNR on training photographs, in dB; the model becomes as small as it allows."""
-    codebook: Annotated[Codes | None, option("N", "up to 4096, fewer for a larger loss")] = None
-    """Rows of the codebook; more lose less PSNR and take more bytes."""
-    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
-    """Total tuning time in seconds; longer recovers more PSNR."""
-    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Tune for this number of steps instead."""
-    views: Annotated[Count | None, option("N", "all")] = None
-    """Compare only this number of held-out views, evenly spread."""
-    scene: PhotographsOption = None
     device: DeviceOption = "auto"
 
-    def run(self) -> int:
-        from ..derive.compression import CompressionTarget, compress
+    def of(self, opened: Any) -> Result:
+        from ..derive.compression import compress
         from ..run import Run
 
-        if sum(given is not None for given in (self.to, self.quality, self.max_loss)) > 1:
-            raise LumigraphError("--to, --quality and --max-loss are ways to say how small; give one of them")
-        if self.steps is not None and self.seconds is not None:
-            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
-        size = None if self.to is None else bytes_in(self.to)
-        loss = None if size is not None else LOSSES[self.quality or DEFAULT] if self.max_loss is None else self.max_loss
-        seconds = None if self.steps is not None else self.seconds or DEFAULT_SECONDS
-        aim = CompressionTarget(size, loss, self.codebook, self.steps, seconds, self.views)
         try:
-            made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device), show=True)
+            made = compress(
+                opened if isinstance(opened, Run) else Run(self.run_folder),
+                self.output,
+                self,
+                choose_device(self.device),
+                show=True,
+            )
         except KeyboardInterrupt:
             say(f"Stopped; {self.run_folder} is as it was and nothing else is kept, so the same command begins anew")
             raise
@@ -76,8 +51,8 @@ class Compress:
         if made.psnr_before is None:
             against += ", for its photographs cannot be opened; --scene says where they are"
         rows = {"compared with": f"{made.views} held-out {against}", "saved": str(self.output)}
-        show(rows | {"verdict": verdict(made, self.run_folder), "next": typed("view", self.output)})
-        return 0
+        rows |= {"verdict": verdict(made, self.run_folder), "next": typed("view", self.output)}
+        return Result(self.output, rows=rows)
 
 
 def verdict(made: Any, run: Path) -> str:
@@ -95,15 +70,6 @@ def verdict(made: Any, run: Path) -> str:
     if lost <= VISIBLE_LOSS:
         return f"{smaller}, with a loss that a comparison side by side shows"
     return f"{smaller}, with a visible loss; for a smaller one give --quality best, a larger --to or more --seconds"
-
-
-def bytes_in(text: str) -> int:
-    """A size as people write it, 5MB or 800 kB. Raises LumigraphError for what is none."""
-    found = SIZE.fullmatch(text)
-    size = float(found[1][:20]) * UNITS[found[2].lower()] if found and found[2].lower() in UNITS else 0.0
-    if not 1 <= size <= 1e15:
-        raise LumigraphError(f"--to cannot be {text[:60]!r}; give it a size such as 5MB or 800kB")
-    return int(size)
 
 
 def table(made: Any) -> Any:

@@ -10,21 +10,32 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional
 
-from ..budget import Quality
+from ..derive.options import ConvertOptions
 from ..errors import LumigraphError
-from ..files.ranges import Count, Seconds
-from .common import about_quality, choose_device, given_budget, method_config, say, show, show_table, typed
+from .common import choose_device, method_config, say, show_table, typed
 from .compress import size
-from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, needed, option
+from .options import DeviceOption, needed
+from .results import Reports, Result
 
-DEFAULT_SECONDS = 30.0
 LIST_WIDTH, INDENT = 80, 12  # letters
-ABOUT = about_quality() + " A conversion from a field trains for half of these steps."
-QUALITY = option("draft|good|best", "as long as --seconds", ABOUT)
 
 
 @dataclass(frozen=True)
-class Convert:
+class ConvertFiles:
+    """Source and output of a conversion."""
+
+    source: Annotated[Positional[Path | None], needed("RUN_OR_FILE")] = None
+    """Folder of a run, which does not change, or a splat file."""
+    method: Annotated[Positional[str | None], needed("METHOD")] = None
+    """Method to convert to, for example plenoxels."""
+    output: Annotated[Path | None, needed("NEW")] = None
+    """New folder for the run."""
+    list: bool = False
+    """Print the table of possible conversions, and exit."""
+
+
+@dataclass(frozen=True)
+class Convert(Reports, ConvertOptions, ConvertFiles):
     """Turn a trained run, or a splat file, into a run of another method.
 
     The new method is initialised from the old one: grids and networks from its density and colour at points, Gaussians
@@ -35,54 +46,26 @@ class Convert:
 
     taught: ClassVar[bool] = True  # the method's defaults are those that follow another method
 
-    source: Annotated[Positional[Path | None], needed("RUN_OR_FILE")] = None
-    """Folder of a run, which does not change, or a splat file."""
-    method: Annotated[Positional[str | None], needed("METHOD")] = None
-    """Method to convert to, for example plenoxels."""
-    output: Annotated[Path | None, needed("NEW")] = None
-    """New folder for the run."""
-    list: bool = False
-    """Print the table of possible conversions, and exit."""
-    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}, or the steps of the method")] = None
-    """Training time in seconds after initialisation; longer improves the new method."""
-    steps: StepsOption = None
-    quality: Annotated[Quality | None, QUALITY] = None
-    distil: bool = False
-    """Train on renderings of the old method, even if photographs are available."""
-    scene: PhotographsOption = None
-    views: Annotated[Count, option("N")] = 8
-    """Compare at most this number of held-out views, evenly spread."""
-    seed: SeedOption = 0
     device: DeviceOption = "auto"
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
 
     def run(self) -> int:
-        from .. import methods
-        from ..derive.conversion import ConversionTarget, convert
-        from ..large import open_any
-
         if self.list:
             print(listed())
             return 0
         if self.source is None or self.method is None or self.output is None:
             raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")
-        named = given_budget(self.steps, self.seconds, self.quality) or self.quality
+        return super().run()
+
+    def of(self, opened: Any) -> Result:
+        from .. import methods
+        from ..derive.conversion import convert
+
+        assert self.source and self.method and self.output  # by `run`
         name, device = methods.check(self.method), choose_device(self.device)
-        steps = self.steps if named else methods.find(name).taught_steps
-        counted = steps is not None or self.quality is not None
-        aim = ConversionTarget(
-            config=method_config(self, name),
-            steps=steps,
-            seconds=None if counted else self.seconds or DEFAULT_SECONDS,
-            quality=self.quality,
-            distil=self.distil,
-            source=self.scene,
-            views=self.views,
-            seed=self.seed,
-        )
         try:
-            made = convert(open_any(self.source), name, self.output, aim, device, show=True)
+            made = convert(opened, name, self.output, self, device, True, method_config(self, name))
         except KeyboardInterrupt:
             say(kept(self.output))
             raise
@@ -90,8 +73,8 @@ class Convert:
         took = f"{made.taking_over:.1f} s to take over, {made.steps} steps in {made.seconds:.1f} s to learn on"
         rows = {"alike": f"{made.psnr:.2f} dB, the mean of {made.views} held-out views", "by": f"{made.how}; {took}"}
         rows |= {"cost": cost(made), "learnt from": made.learnt_from, "saved": str(self.output)}
-        show(rows | {"verdict": verdict(made, self.source, self.output), "next": typed("view", self.output)})
-        return 0
+        rows |= {"verdict": verdict(made, self.source, self.output), "next": typed("view", self.output)}
+        return Result(self.output, rows=rows)
 
 
 def kept(output: Path) -> str:

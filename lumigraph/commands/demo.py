@@ -36,9 +36,10 @@ class Demo:
 
     def run(self) -> int:
         from .. import methods
-        from ..evaluation import evaluate_run
         from ..evaluation.report import write_report
+        from ..evaluation.run import evaluate_run
         from ..export.film import film
+        from ..export.options import FilmOptions
         from ..metrics import scores_of
         from ..opening import open_dataset
         from ..paths import film_cameras
@@ -60,7 +61,7 @@ class Demo:
             return exit_code(outcome.signal)
         result = evaluate_run(run, method, data)
         orbit = run.folder / "renders" / "orbit.mp4"
-        film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit, depth=True)
+        film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit, FilmOptions(depth=True))
         report = write_report(run)
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
         rows = {

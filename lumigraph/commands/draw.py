@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from ..files.ranges import Count, FramesPerSecond, Pixels, between
 from .common import choose_device, show
-from .options import DeviceOption, Overwrite, Set, controlled, needed, option
+from .options import DeviceOption, Overwrite, Set, needed, option
 
 MAX_SEED, MAX_SEEDS = 9999, 256
 FRAMES_PER_SEED = 30
@@ -65,6 +65,7 @@ class Draw:
         from ..method.capabilities import CanDraw, HasViewpoint, can, needs
         from ..metrics.distribution import FeatureNetwork, RandomFeatures, load_inception
         from ..run import Run
+        from ..run.opened import controlled
         from ..system.progress import track
 
         seeds = numbers(self.seeds)
@@ -80,7 +81,7 @@ class Draw:
             claim(sheet.with_suffix(".json"), "scores of drawings", self.overwrite)
         if self.film:
             kind_of(self.film, self.fps)
-            claim_film(self.film, self.overwrite)
+            claim_film(self.film, overwrite=self.overwrite)
         method = controlled(run, run.method(choose_device(self.device)), self.settings).eval()
         drawing = needs(method, CanDraw)
         if run.kind != Collection.kind:
@@ -113,6 +114,7 @@ class Draw:
     def _film(self, method: Any, seeds: list[int], camera: Any) -> str:
         """The film, as a row to print."""
         from ..export.film import animated, film
+        from ..export.options import FilmOptions
 
         count = self.frames * len(seeds)
         if any(control.name == "seed" for control in method.controls):
@@ -122,7 +124,7 @@ class Draw:
             shown = [drawn[i // self.frames] for i in range(count)]
         assert self.film is not None
         cameras = turned(camera, count, max(1, len(seeds) // 4))
-        about = film(shown, cameras, self.film, self.fps)
+        about = film(shown, cameras, self.film, FilmOptions(fps=self.fps))
         return f"{self.film}, {about['frames']} frames, {about['seconds_per_frame']:.3f} s each"
 
 

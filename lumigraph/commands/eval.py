@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from ..files.ranges import Count
+from ..evaluation.options import EvaluationOptions
 from ..system.console import bold
 from .common import choose_device
-from .options import DeviceOption, Overwrite, RunOption, Set, controlled, option
+from .options import DeviceOption, Overwrite, RunOption, Set, option
 from .results import Evaluation, Reports
 
 
-@dataclass(frozen=True)
-class Eval(Reports):
+@dataclass(frozen=True, kw_only=True)
+class Eval(Reports, EvaluationOptions):
     """Compare a run with held-out photographs, or its surface with the training shapes.
 
     Writes RUN/eval.json (per view and mean PSNR, SSIM and fine detail, also by resolution where there are several, the
@@ -25,44 +24,26 @@ class Eval(Reports):
     """
 
     run_folder: RunOption
-    split: Literal["test", "val", "train"] = "test"
-    """Split of photographs, shapes or members of a collection to compare with."""
-    views: Annotated[Count | None, option("N", "all")] = None
-    """Compare only this number of views or shapes, evenly spread."""
-    lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
-    """Files with the weights of LPIPS, .pth or .safetensors; adds LPIPS to the scores."""
-    save_images: bool = False
-    """Save every rendering as RUN/eval/NAME.png."""
-    right_halves: bool = False
-    """Compare only the right halves of photographs, as for methods that fit a code on the left halves."""
     overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
     """Path of the training data, if it was moved since training."""
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def made(self) -> Evaluation:
-        from ..evaluation import claim_evaluation, evaluate_run, stem
-        from ..large import BlockRun, open_run
+    def of(self, opened: Any) -> Evaluation:
+        from ..evaluation.run import claim_evaluation, evaluate_run, stem
+        from ..large import open_run
         from ..metrics import scores_of
         from ..metrics.detail import FineDetail
-        from ..metrics.lpips import load_lpips, named_files
         from ..metrics.rows import last_psnr
+        from ..run import Trained
         from ..run.records import read_evaluation
         from .outcome import beside_training, next_commands
 
-        run = open_run(self.run_folder)
-        claim_evaluation(run, self.split, self.save_images, self.overwrite)
-        weights = named_files(self.lpips)
-        lpips = load_lpips(weights) if weights else None
-        device = choose_device(self.device)
-        if isinstance(run, BlockRun):  # by the exposures of the photographs that it will be given
-            data: Any = run.dataset(self.scene, self.split)
-            method = controlled(run, run.method(device, data.about.get("exposure")), self.settings)
-        else:
-            method = controlled(run, run.ready(device), self.settings)
-            data = run.dataset(self.scene)
-        result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
+        run = opened if isinstance(opened, Trained) else open_run(self.run_folder)
+        claim_evaluation(run, self, self.overwrite)
+        method, data = run.method_and_data(choose_device(self.device), self.settings, self.scene, self.split)
+        result = evaluate_run(run, method, data, self)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         if "detail" in result:
             rows["detail"] = str(FineDetail(**result["detail"]))

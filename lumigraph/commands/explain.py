@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subco
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Seconds, Steps, between
 from .common import choose_device, say, scene_name, show
-from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, controlled, needed, option
+from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option
 
 Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 OCTAVES = tuple(2.0**octave for octave in range(8))  # scales of encodings, 1 to 128
@@ -158,12 +158,13 @@ class ExplainLightField:
         from ..files import claim
         from ..lab.explain.light_field import draw, measure, seen_along
         from ..run import Run
+        from ..run.opened import controlled
 
         run = Run(self.run_folder)
         folder = self.output or run.folder / "lightfield"
         for file in ("lightfield.png", "lightfield.svg", "lightfield.json"):
             claim(folder / file, "figure", self.overwrite)
-        name, camera = find_view(run, "test", self.view)
+        name, camera = view_of(run, "test", self.view)
         method = controlled(run, run.method(choose_device(self.device)), self.settings)
         camera = camera.resized(self.size / int(camera.size.max())).to(method.device)
         focus = focal_distance(method, camera)
@@ -204,16 +205,17 @@ class ExplainRay:
     def run(self) -> int:
         if self.output and self.output.suffix != ".svg":
             raise LumigraphError(f"{self.output} has no ending of a figure; give --output a name ending in .svg")
-        from ..evaluation import file_name
+        from ..evaluation.views import file_name
         from ..figures.charts import standalone
         from ..files import claim, write_bytes, write_json
         from ..lab.explain.ray import along_ray
         from ..lab.explain.ray_figure import ray_figure
         from ..run import Run
+        from ..run.opened import controlled
         from ..system.progress import counting
 
         run = Run(self.run_folder)
-        name, camera = find_view(run, self.split, self.view)
+        name, camera = view_of(run, self.split, self.view)
         x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         for file in (output, output.with_suffix(".json")):
@@ -225,7 +227,7 @@ class ExplainRay:
         sight = sight.beside(self._photograph(run, name))
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
         write_bytes(output, standalone(ray_figure(sight, title)), "figure")
-        about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
+        about: dict[str, Any] = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
         about |= {"controls": method.settings} if method.settings else {}
         write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
@@ -318,18 +320,10 @@ class ExplainTemplate:
         return 0
 
 
-def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:
-    """Name and Camera of a photograph, by its name or number in a split of a Run. LumigraphError if there is none."""
-    names = run.view_names().get(split, [])
-    if not names:
-        raise LumigraphError(f"{run.folder} has no views in the split {split!r}; choose another --split")
-    number = names.index(view) if view in names else int(view) if view.isdecimal() else len(names)
-    if number >= len(names):
-        raise LumigraphError(
-            f"There is no view {view!r} in the split {split!r} of {run.folder}; give --view a number from 0 to "
-            f"{len(names) - 1}, or a name such as {names[0]}"
-        )
-    return names[number], run.cameras()[split][number]
+def view_of(run: Any, split: str, view: str) -> tuple[str, Any]:
+    """Name and Camera of a photograph, by its name or number in a split of a Run."""
+    number = run.find_view(split, view)
+    return run.view_names()[split][number], run.cameras()[split][number]
 
 
 What = (

@@ -27,7 +27,7 @@ class Info:
 
     def run(self) -> int:
         from ..datasets.scene import Scene
-        from ..exchange import is_splat_file, read_gaussians, snerg
+        from ..exchange import is_moving, is_splat_file, read_gaussians, read_moving, snerg
         from ..large import BlockRun
         from ..opening import open_dataset, read_capture
         from ..run import is_block_run
@@ -40,6 +40,8 @@ class Info:
             from ..run import Run
 
             tree = info_tree.run_tree(Run(self.what))
+        elif is_moving(self.what):
+            tree = info_tree.moving_tree(self.what, read_moving(self.what))
         elif is_splat_file(self.what):
             tree = info_tree.cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and Path(self.what).is_file():

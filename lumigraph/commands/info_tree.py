@@ -19,6 +19,7 @@ from ..evaluation.photographs import examined
 from ..exchange import size_of
 from ..files.names import natural
 from ..gaussians import Gaussians
+from ..gaussians.moving import MovingGaussians
 from ..geometry import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
@@ -187,6 +188,15 @@ def cloud_tree(name: str, cloud: Gaussians) -> Tree:
         rows["deviation"] = f"{cloud.log_scales.mean(-1).median().exp().item():.4g}, in the middle"
         rows["opacity"] = f"{cloud.opacities.sigmoid().median().item():.3g}, in the middle"
     branch(tree, "cloud", rows)
+    return tree
+
+
+def moving_tree(name: str, moving: MovingGaussians) -> Tree:
+    """Tree of a moving cloud."""
+    tree = cloud_tree(name, moving.cloud)
+    tree.label = bold(name) + f"  a moving cloud of {len(moving):,} spans of Gaussians"
+    rows = {"duration": f"{moving.duration:.4g} s", "moving": f"{moving.moving:,} spans of those that move"}
+    branch(tree, "motion", rows)
     return tree
 
 

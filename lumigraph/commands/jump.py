@@ -9,13 +9,13 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from ..files.ranges import Downscale, Positive, between
+from ..export.options import JumpOptions
 from .common import show
-from .options import Overwrite, ReaderOption, needed, option
+from .options import Overwrite, needed
 
 
-@dataclass(frozen=True)
-class Jump:
+@dataclass(frozen=True, kw_only=True)
+class Jump(JumpOptions):
     """Stitch the photographs of a ring of cameras to an omnidirectional stereo pair, the left eye on top.
 
     The cameras look outward from one level circle, six or more, and their poses are known (transforms.json, or
@@ -26,13 +26,6 @@ class Jump:
     """Folder of photographs with poses, or procedural:ring,views=12."""
     output: Annotated[Positional[Path], needed("FILE.jpg|.png")]
     """The pair, a square picture for headsets."""
-    size: Annotated[int, between(128, 8192), option("PIXELS")] = 2048
-    """Width of a panorama in pixels; the photographs should be about as sharp."""
-    interpupillary: Annotated[Positive | None, option("LENGTH", "a quarter of the rig's diameter")] = None
-    """Distance between the eyes, in units of the photographs' frame; smaller than the rig."""
-    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
-    """Reduce the photographs by this whole number before reading."""
-    reader: ReaderOption = None
     overwrite: Overwrite = False
 
     def run(self) -> int:
@@ -47,8 +40,7 @@ class Jump:
         claim(self.output, "panorama", self.overwrite)
         scene = open_scene(self.scene, self.downscale, self.reader, whole=True)
         unit = scene.frame.to_export.scale
-        eyes = None if self.interpupillary is None else self.interpupillary / unit
-        found, _ = stereo_panorama(scene, self.size // 2 * 2, eyes)
+        found, _ = stereo_panorama(scene, self)
         save_sphere(self.output, torch.cat([found.left, found.right]), whole=False)
         reliable = f"{found.nearest * unit:.4g} on; what is nearer may tear"
         if math.isinf(found.nearest):

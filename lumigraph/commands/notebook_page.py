@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LumigraphError
-from ..large import held_open
 from ..method.capabilities import HasGaussians, can
 from ..run import Opened
 from .calls import quietly
-from .export_web import ExportWeb
+from .export import ExportWeb
 
 MAX_PAGE_BYTES = 8e6  # of a page in a notebook's file
 MAX_SECONDS = 6.0  # that rendering the pictures of a page may take
@@ -54,7 +53,7 @@ def small_page(opened: Opened) -> str | None:
             return None
         longest = int(opened.cameras()["train"].size.max())
         options = {"kind": "views", "views": views, "size": min(VIEW_PIXELS, longest)}
-    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder, held_open(opened):
+    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:
         page = Path(folder) / "page.html"
-        quietly(ExportWeb(opened.path, page, title=opened.title, **options).made)
+        quietly(lambda: ExportWeb(opened.path, page, title=opened.title, **options).of(opened))
         return page.read_text("utf-8") if page.stat().st_size <= MAX_PAGE_BYTES else None

@@ -9,16 +9,15 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..files.ranges import Downscale, between
+from ..export.options import Photo3DOptions
 from .capture import posed
 from .common import show, typed
-from .options import OriginOption, Overwrite, ReaderOption, needed, option, told_origin
+from .export import place_row, size_text
+from .options import Overwrite, needed
 
-Views = Annotated[int, between(2, 100)]
 
-
-@dataclass(frozen=True)
-class Photo3DCommand:
+@dataclass(frozen=True, kw_only=True)
+class Photo3DCommand(Photo3DOptions):
     """Make a 3-D photograph of a burst: a page that follows the mouse or a phone's tilt, or a textured mesh.
 
     Photographs without poses are captured first. Depth is that of a sensor, if the photographs have it, else multi-view
@@ -29,21 +28,10 @@ class Photo3DCommand:
     """Folder of neighbouring photographs, with or without poses."""
     output: Annotated[Positional[Path], needed("FILE.html|.glb")]
     """The page, or the mesh."""
-    size: Annotated[int, between(80, 1600), option("PIXELS")] = 320
-    """Longer side of the depth maps, about; the texture has twice as many. Twice as large takes four times as long."""
-    views: Annotated[Views, option("N")] = 8
-    """Number of photographs at most, spread evenly."""
-    title: Annotated[str | None, option("TEXT", "the folder's name")] = None
-    """Title of the page."""
-    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
-    """Reduce the photographs by this whole number before reading."""
-    reader: ReaderOption = None
-    origin: OriginOption = True
     overwrite: Overwrite = False
 
     def run(self) -> int:
-        from ..export.mesh_file import write_mesh
-        from ..export.photo3d import photo3d, write_page
+        from ..export.photo3d import export_photo3d
         from ..files import claim
         from ..opening import open_scene
 
@@ -53,23 +41,12 @@ class Photo3DCommand:
         claim(self.output, "page" if page else "mesh", self.overwrite)
         source = posed(self.scene)
         scene = open_scene(source, self.downscale, self.reader, whole=True)
-        found = photo3d(scene, self.size, self.views)
-        origin, place = told_origin(scene.frame, self.origin and not page)
-        if page:
-            write_page(self.output, found, self.title or Path(self.scene).stem)
-        else:
-            up = scene.frame.to_source.rotation[:, 2].numpy()
-            write_mesh(self.output, found.mesh.in_source(scene.frame), up, origin=origin)
+        found = export_photo3d(scene, self.output, Path(self.scene).stem, self)
         trusted = f"{100 * found.trusted:.0f} % of the photographs' pixels"
         if found.flat:
             trusted = "none: the photographs were taken from one place, without parallax; this is a panorama instead"
-        show(
-            {
-                "trusted depth": trusted,
-                "triangles": f"{len(found.mesh.faces):,}",
-                "page" if page else "mesh": f"{self.output} ({self.output.stat().st_size / 1e6:.1f} MB)",
-                **place,
-                "next": typed("depth", source, "--output", "FOLDER"),
-            }
-        )
+        rows = {"trusted depth": trusted, "triangles": f"{len(found.mesh.faces):,}"}
+        rows |= {"page" if page else "mesh": f"{self.output} ({size_text(self.output)})"}
+        rows |= place_row(scene.frame, self.origin and not page)
+        show(rows | {"next": typed("depth", source, "--output", "FOLDER")})
         return 0

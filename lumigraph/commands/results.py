@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .common import show
+from .common import choose_device, show
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,32 @@ class Evaluation(Result, Mapping[str, Any]):
         return "\n".join(f"{name}  {value}" for name, value in self.rows.items())
 
 
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """Output of a command, ahead of its options; the command says what it is."""
+
+    output: Any
+
+
 class Reports(ABC):
-    """A command with a result: `made` works and returns it, `run` prints its rows."""
+    """A command on something that opens: `of` works on it and returns a result, `made` opens it, `run` prints."""
 
     @abstractmethod
-    def made(self) -> Result:
-        """Do the work, and return the result."""
+    def of(self, opened: Any) -> Any:
+        """Do the work on what was opened, and return a Result."""
+
+    def made(self) -> Any:
+        """Open the source, do the work, and return a Result."""
+        from ..large import open_any
+
+        return self.of(open_any(getattr(self, "source", None) or self.run_folder))  # type: ignore[attr-defined]
+
+    def loaded(self, opened: Any) -> Any:
+        """Opened source with its method, as the options of the command have it."""
+        from ..export.loaded import Loaded
+
+        options = {name: getattr(self, name) for name in ("settings", "part", "scaling") if hasattr(self, name)}
+        return Loaded.of(opened, choose_device(getattr(self, "device", "cpu")), **options)
 
     def run(self) -> int:
         """Do the work, and print the result. Returns the exit code."""

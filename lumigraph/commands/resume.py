@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from ..budget import Budget, Quality
+from ..budget import Budget, given_budget
 from ..errors import LumigraphError
-from ..files.ranges import Port, Seconds, Steps
-from .common import choose_device, exit_code, given_budget, quality_budget, typed
-from .options import RunOption, ViewerToken, option
+from ..training.options import ResumeOptions
+from .common import choose_device, exit_code, quality_budget, typed
+from .options import RunOption, ViewerOptions
 
 
-@dataclass(frozen=True)
-class Resume:
+@dataclass(frozen=True, kw_only=True)
+class Resume(ViewerOptions, ResumeOptions):
     """Continue an interrupted run as if it had not been interrupted, or extend a run with a larger budget.
 
     A finished run may get a larger budget too. Its schedules then follow the new total: learning rates rise again and
@@ -23,27 +23,6 @@ class Resume:
     """
 
     run_folder: RunOption
-    seconds: Annotated[Seconds | None, option("S", "unchanged")] = None
-    """New total training time in seconds, including the time already trained."""
-    steps: Annotated[Steps | None, option("N", "unchanged")] = None
-    """New total of steps, including the steps already done."""
-    quality: Annotated[Quality | None, option("draft|good|best", "unchanged")] = None
-    """New total of steps, as for `lumigraph train`."""
-    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
-    """Path of the training data, if it was moved since training."""
-    device: Annotated[str, option("NAME", "the one of its training")] = "same"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
-    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
-    """Stop at this step as if interrupted. The schedule still follows the whole budget."""
-    view: bool = False
-    """Show the scene in the browser during training, and afterwards until Ctrl-C."""
-    stay: bool = True
-    """With --view, show the scene after training too, until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
-    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
-    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
-    """Port that --view listens at."""
-    token: ViewerToken = ""
 
     def run(self) -> int:
         from ..run import Run, is_block_run

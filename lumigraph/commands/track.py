@@ -6,22 +6,21 @@ import dataclasses
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
 from .. import methods
 from ..budget import Budget
 from ..errors import LumigraphError
-from ..files.ranges import Count, Downscale, Port, Positive, Steps
+from ..training.options import TRACKED_SIDE, TrackOptions
 from .common import choose_device, exit_code, method_config, next_free, scene_name
-from .options import DeviceOption, ReaderOption, SeedOption, ViewerToken, needed, option
+from .options import ViewerOptions, needed, option
+from .results import Output
 
-TRACKED_SIDE = 320  # pixels along the longer side of a frame, about, where the user says nothing
 
-
-@dataclass(frozen=True)
-class Track:
+@dataclass(frozen=True, kw_only=True)
+class Track(ViewerOptions, TrackOptions, Output):
     """Find the poses of a depth camera's frames in order, and map what it sees.
 
     RECORDING is a folder of colour and depth, or procedural:room,depth. Poses in it are used for errors alone. RUN is
@@ -36,28 +35,6 @@ class Track:
     """Frames with depth: a folder, or procedural:room,depth."""
     output: Annotated[Path | None, option("RUN", "runs/RECORDING-METHOD-N")] = None
     """New folder for the run."""
-    frames: Annotated[Count | None, option("N", "all")] = None
-    """Track only the first frames."""
-    downscale: Annotated[Downscale | None, option("N", f"to about {TRACKED_SIDE} pixels")] = None
-    """Reduce frames by this whole number; a larger one is faster, and maps less detail."""
-    extent: Annotated[Positive | None, option("M", "1.5 times the farthest depth of the first frame")] = None
-    """Half-size of the mapped box around the first camera, in metres; larger holds more, and less detail."""
-    steps_after: Annotated[Steps | None, option("N", "none")] = None
-    """Steps of mapping after the last frame; more give a better map."""
-    reader: ReaderOption = None
-    seed: SeedOption = 0
-    device: DeviceOption = "auto"
-    preset: Literal["auto", "laptop", "paper"] = "auto"
-    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
-    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
-    """Stop after this number of frames as if interrupted."""
-    view: bool = False
-    """Show the map in the browser meanwhile, and afterwards until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
-    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
-    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
-    """Port that --view listens at."""
-    token: ViewerToken = ""
 
     def run(self) -> int:
         from ..opening import confirm, open_scene
@@ -90,7 +67,7 @@ class Track:
             with run.kept_if_learnt():
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
             show_tracking(run, outcome, method, data, time.process_time() - begin)
-            keep_showing(watch, outcome.signal)
+            keep_showing(watch if self.stay else None, outcome.signal)
         return exit_code(outcome.signal)
 
 

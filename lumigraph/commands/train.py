@@ -3,130 +3,60 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, arg
 
 from .. import methods
-from ..budget import Budget, Quality
+from ..budget import Quality, given_budget
 from ..errors import LumigraphError
 from ..files.names import counted
-from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Steps
+from ..training.options import BlockOptions, TrainOptions
 from .capture import posed
 from .common import (
-    about_quality,
     choose_device,
     default_config,
     exit_code,
-    given_budget,
     method_config,
-    next_free,
     option_group,
     preset_device,
-    quality_budget,
+    quality_of,
     say,
-    scene_name,
     show,
     typed,
 )
 from .main_options import hidden_options, option_names
-from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, ViewerToken, needed, option
-
-MEMORY_BYTES = 2 << 30  # bytes reserved for a block
-OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
+from .options import ViewerOptions, needed, option
+from .results import Output
 
 
-@dataclass(frozen=True)
-class BlockOptions:
-    """A large scene is trained in blocks, each a run of its own; from few photographs one block, an ordinary run.
+def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | None:
+    """Train all blocks of a scene. Returns the run and the exit code; None for a scene that is learnt as a whole."""
+    import torch
 
-    --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After
-    Ctrl-C, a crash or a lost machine the same command continues; finished blocks are kept. RUN/blocks.png shows the
-    plan. `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting,
-    trains each block with another method; for clouds, RUN/cloud.ply joins each block's own cell.
-    """
+    from ..large.training import begin_blocks, places_in_blocks, update
 
-    blocks: Annotated[str | None, option("auto|N|FILE", "auto from 200 photographs on, else one block")] = None
-    """Positions of blocks: auto (street crossings, or evenly spread), a number of evenly spread ones, or a JSON file in
-    the frame of the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
-    workers: Annotated[Count | None, option("N", "1, in this process")] = None
-    """Number of blocks to train at a time on this machine, with Ray."""
-    address: Annotated[str | None, option("HOST:PORT", "this machine")] = None
-    """Train blocks on an existing Ray cluster; --output must be on storage that all its machines share."""
-    into: Annotated[Path | None, option("RUN", "a new run")] = None
-    """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
-    field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
-
-    def learn(self, train: Any) -> tuple[Path, int] | None:
-        """Train all blocks of a scene. Returns the run and the exit code; None for a scene that `train` learns whole.
-
-        train: the command's other options, a `Train`
-        """
-        from ..datasets.scene import Scene
-        from ..large.layout import MIN_LARGE_VIEWS
-        from ..large.planning import survey
-        from ..opening import kind_of
-
-        if self.into is not None:
-            return self._again(train, self.into)
-        source, other = posed(train.scene), bool(self.field)
-        if kind_of(source, Scene) is not Scene or Path(source).is_file() or (self.blocks == "1" and not other):
-            return None  # a file is a single picture
-        places = survey(source, train.reader)
-        few = places.splits.count("train") < MIN_LARGE_VIEWS
-        if few and not other and (self.blocks, self.workers, self.address) == (None, None, None):
-            return None
-        for name in ("view", "pause_at", "views", "depth_from"):
-            if getattr(train, name):
-                raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
-        return self._all(train, source, places)
-
-    def _all(self, train: Any, source: str, places: Any) -> tuple[Path, int]:
-        import torch
-
-        from ..large.planning import BlockRecipe, begin, make_plan
-        from ..large.training import Workers
-        from ..system.memory import free_memory
-
-        here = self.address is None
-        budget = given_budget(train.steps, train.seconds, train.quality)
-        if here or train.device == "auto":
-            device = choose_device(train.device)
-        else:  # of the cluster's machines
-            device = torch.device("cuda" if train.device == "gpu" else train.device)
-        method = methods.check(self.field or train.method)
-        config = method_config(train, method)
-        seed = getattr(config, "seed", train.seed)
-        options = {name: getattr(train, name) for name in OPTIONS}
-        recipe = BlockRecipe(method, config, options, budget, train.quality, seed, str(device), here)
-        plan = make_plan(source, places, self.blocks or "auto", recipe)
-        output = train.output or unfinished(f"runs/{scene_name(source)}-{methods.check(train.method)}", plan)
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        cpus = max(1, cores // self.workers) if self.workers else 1
-        plan = begin(output, plan, places, None if here and self.workers is None else cpus)
-        show_plan(output, plan, budget)
-        gpus = 1.0 if device.type == "cuda" else 0.0
-        memory = min(MEMORY_BYTES, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY_BYTES
-        return output, train_all(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
-
-    def _again(self, train: Any, run: Path) -> tuple[Path, int]:
-        from ..large.planning import survey
-        from ..large.training import update
-
-        if self.blocks is None or not self.blocks.isdigit():
-            raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
-        source, budget = posed(train.scene), given_budget(train.steps, train.seconds, train.quality)
-        options = {name: getattr(train, name) for name in OPTIONS}
-        ended = update(run, self.blocks, source, survey(source, train.reader), options, budget)
+    source = posed(train.scene)
+    if blocks.into is not None:
+        ended = update(blocks.into, source, train, blocks)
         if ended.done is None:
             say("Stopped and saved; the same command goes on")
-            return run, exit_code(ended.signal)
+            return blocks.into, exit_code(ended.signal)
         took = f"{ended.done.steps} steps in {ended.done.seconds:.1f} s, from {ended.done.photographs} photographs"
-        show({"run": str(run), f"block {self.blocks}": took} | onward(run, source))
-        return run, 0
+        show({"run": str(blocks.into), f"block {blocks.blocks}": took} | onward(blocks.into, source))
+        return blocks.into, 0
+    if (places := places_in_blocks(source, train, blocks)) is None:
+        return None
+    if blocks.address is None or train.device == "auto":
+        device = choose_device(train.device)
+    else:  # of the cluster's machines
+        device = torch.device("cuda" if train.device == "gpu" else train.device)
+    config = method_config(train, methods.check(blocks.field or train.method))
+    run, plan, workers = begin_blocks(source, places, train.method, config, device, train, blocks, train.output)
+    show_plan(run, plan, given_budget(train.steps, train.seconds, train.quality))
+    return run, train_all(run, plan, workers)
 
 
 def train_all(output: Path, plan: Any, workers: Any) -> int:
@@ -147,20 +77,6 @@ def train_all(output: Path, plan: Any, workers: Any) -> int:
     finish(output)
     show_done(output, found)
     return 0
-
-
-def unfinished(prefix: str, plan: Any) -> Path:
-    """The latest run of this name, if it is the same and not done; else the next name that is free."""
-    from ..large.plan import DONE_FILE, PLAN_FILE, Plan
-    from ..large.planning import difference, place_of
-
-    free = next_free(prefix)
-    number = int(free.name.rpartition("-")[2])
-    latest = free.with_name(f"{free.name.rpartition('-')[0]}-{number - 1}")
-    if (latest / PLAN_FILE).is_file() and difference(known := Plan.read(latest / PLAN_FILE), plan) is None:
-        if not all((place_of(latest, block) / DONE_FILE).exists() for block in known.blocks):
-            return latest
-    return free
 
 
 def show_plan(output: Path, plan: Any, budget: Any) -> None:
@@ -194,11 +110,8 @@ def onward(run: Path, source: str | None = None) -> dict[str, str]:
     return {NEXT["eval"]: typed("eval", run, *again), NEXT["view"]: typed("view", run)}
 
 
-DEFAULT_SECONDS = 60.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Train:
+@dataclass(frozen=True, kw_only=True)
+class Train(ViewerOptions, TrainOptions, Output):
     """Train a method on the photographs of a scene.
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
@@ -215,36 +128,6 @@ class Train:
     """Photographs, a video, or other data to train on."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
     """New folder for the run."""
-    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
-    """Training time in seconds; longer gives a higher PSNR. Compiling kernels on first use is not counted."""
-    steps: StepsOption = None
-    quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
-    downscale: Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320")] = None
-    """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
-    reader: ReaderOption = None
-    views: Annotated[Count | None, option("N", "all")] = None
-    """Train on only this number of photographs, spread evenly over the cameras."""
-    depth_from: Annotated[str | None, option("FILE", "depth beside the photographs")] = None
-    """Cloud (.las, .laz, .e57, .ply) or mesh that gives the photographs their depth, in the frame of their poses."""
-    guidance: Annotated[str | None, option("FILE", "")] = None
-    """Model that judges pictures by words:PROMPT: CLIP or a diffusion model, in a folder or file of yours."""
-    scales: Annotated[Scales, option("N")] = 1
-    """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
-    seed: SeedOption = 0
-    device: DeviceOption = "auto"
-    preset: Literal["auto", "laptop", "paper"] = "auto"
-    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
-    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
-    """Stop at this step as if interrupted. The schedule still follows the whole budget."""
-    view: bool = False
-    """Show the scene in the browser during training, and afterwards until Ctrl-C."""
-    stay: bool = True
-    """With --view, show the scene after training too, until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
-    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
-    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
-    """Port that --view listens at."""
-    token: ViewerToken = ""
 
     def run(self) -> int:
         return self.learn()[1]
@@ -254,45 +137,26 @@ class Train:
 
         watch: of `fit`, in place of the viewer of --view
         """
-        from ..datasets.dataset import check_kind
-        from ..opening import confirm, kind_of, open_dataset
-        from ..run import Run, build, check_new
+        from ..opening import open_dataset
+        from ..run import check_new
         from ..training import fit
+        from ..training.beginning import begin_run, check_source
         from .outcome import show_outcome
         from .view import end_training, keep_showing, watching
 
         blocks: BlockOptions | None = getattr(self, "blocks", None)
-        if blocks is not None and (made := blocks.learn(self)) is not None:
+        if blocks is not None and (made := learn_in_blocks(self, blocks)) is not None:
             return made
-        budget = given_budget(self.steps, self.seconds, self.quality)
-        kind, device = methods.find(self.method), choose_device(self.device)
+        device = choose_device(self.device)
         if self.output is not None:
             check_new(self.output)
-        found = kind_of(self.scene, kind.learns_from)
-        if found is not kind.learns_from:
-            confirm(self.scene)  # a missing path has no kind
-        check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from)
-        source = posed(self.scene)
-        options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
-        if self.depth_from is not None:
-            options["depth_from"] = str(Path(self.depth_from).resolve())
-        if self.guidance is not None:
-            options["guidance"] = str(Path(self.guidance).expanduser().resolve())
-        data = open_dataset(source, kind.learns_from, **options)
+        check_source(self.scene, self.method)
+        data: Any = open_dataset(posed(self.scene), methods.find(self.method).learns_from, **self.of_dataset)
         name = self.chosen(data)
-        kind = methods.find(name)
-        output = self.output or next_free(f"runs/{scene_name(source)}-{name}")
-        check_new(output)
-        config = method_config(self, name)
-        seed = getattr(config, "seed", self.seed)
-        method = build(kind, data.frame, config, device, seed, learning=True)
-        if budget is None:
-            asked = self.quality or method.default_quality
-            budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)
-        run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
+        run, method, budget = begin_run(name, data, method_config(self, name), device, self, self.output)
         with watching(self, method, data, run) as viewer:
             with run.kept_if_learnt():
-                looking = viewer or watch
+                seed, looking = run.settings.seed, viewer or watch
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=looking)
             show_outcome(run, outcome, method, data, end_training(viewer, method))
             keep_showing(viewer if self.stay else None, outcome.signal)
@@ -322,7 +186,7 @@ def with_options_of(
     if in_blocks and (learner := field.replace("_", "-")) in methods.available():
         name = learner
     kind = methods.find(name)
-    asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
+    asked = option("draft|good|best", "as long as --seconds", quality_of(kind))
     extra: dict[str, tuple[Any, Any]] = {}
     if "quality" in {x.name for x in dataclasses.fields(command)}:
         extra["quality"] = Annotated[Quality | None, asked], None

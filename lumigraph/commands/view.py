@@ -14,8 +14,8 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
-from .common import show
-from .options import DeviceOption, Set, ViewerToken, needed, open_method, option
+from .common import choose_device, show
+from .options import DeviceOption, Set, ViewerToken, needed, option
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,13 @@ class ViewCommand:
     token: ViewerToken = ""
 
     def run(self) -> int:
+        from ..export.loaded import Loaded
+        from ..large import open_any
         from ..viewer import Viewer, choose_address
         from .export_menu import export_menu
 
-        opened, method, cameras = open_method(self.source, self.device, self.settings)
+        loaded = Loaded.of(open_any(self.source), choose_device(self.device), self.settings)
+        opened, method, cameras = loaded.opened, loaded.method, loaded.cameras
         subject = replace(
             subject_of(opened, cameras, page=page_of(opened, method, cameras)),
             behind=behind_of(opened, method, cameras),
@@ -55,7 +58,7 @@ class ViewCommand:
 
 def page_of(opened: Any, method: Any, cameras: Any) -> Any:
     """A function that makes the page of a baked method; `None` for any other method, and before it is baked."""
-    from .export_web import browsable, is_baked
+    from ..export.page import browsable, is_baked
 
     if not is_baked(method):
         return None

@@ -1,3 +1,3 @@
-"""Data that methods learn from: photographs with cameras, shapes, collections of either."""
+"""Training data: photographs with cameras, shapes, collections of either."""
 
 from ..system import kernel_cache as kernel_cache

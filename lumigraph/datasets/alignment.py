@@ -1,4 +1,4 @@
-"""Alignment: two sets of cameras in one frame, and how far they are apart then."""
+"""Alignment of two sets of cameras by a similarity, and their remaining distances."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from .scene import Frame
 
 
 def aligning(source: Camera, target: Camera) -> Similarity:
-    """The similarity that brings cameras closest to others of the same order, in the least squares of where they stand
-    and how they are turned (Procrustes; Umeyama 1991, eqs. 40 to 42).
+    """Similarity that aligns cameras with others of the same order, by least squares of positions and orientations
+    (Procrustes; Umeyama 1991, eqs. 40 to 42).
 
-    Directions count beside places, so that cameras on a line, or in one place, have an answer too.
+    Directions count beside positions, so that cameras on a line, or in one place, have a solution too.
     """
     a, b = source.position.double(), target.position.double()
     turned_a, turned_b = source.pose[:, :, :3].double(), target.pose[:, :, :3].double()
@@ -33,7 +33,7 @@ def aligning(source: Camera, target: Camera) -> Similarity:
 
 
 def angles(a: Float[Tensor, "camera 3 3"], b: Float[Tensor, "camera 3 3"]) -> Float[Tensor, " camera"]:
-    """Degrees between rotations, one by one: 2 asin(|A - B| / sqrt 8), which small angles do not lose."""
+    """Angles between rotations in degrees, one by one: 2 asin(|A - B| / sqrt 8), accurate for small angles."""
     apart = torch.linalg.matrix_norm(a.double() - b.double())
     return (2 * (apart / 8**0.5).clamp(max=1).asin()).rad2deg().float()
 
@@ -66,8 +66,8 @@ class Moves:
 
 
 def moves(source: Camera, target: Camera, frame: Frame) -> Moves:
-    """Distances between two lists of cameras in the same order, after alignment: what they share is the scene's frame,
-    which photographs do not determine."""
+    """Distances between two lists of cameras in the same order, after alignment, since photographs do not determine the
+    common frame."""
     there = source.to("cpu").transformed(aligning(source.to("cpu"), target.to("cpu")).matrix)
     low, high = torch.tensor(frame.bounds)
     apart = (there.position - target.position.cpu()).norm(dim=-1)

@@ -1,4 +1,4 @@
-"""Collection: many datasets by name, split by member, to learn from what they have in common."""
+"""Collection: many datasets by name, split by member, for priors across scenes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ MAX_OPEN = 256  # members that stay open, the most recently used
 
 @dataclass(frozen=True)
 class Collection:
-    """Member i is called names[i] and is opened when it is first asked for, then kept.
+    """Datasets by name; member i is names[i], opened on first use and kept open.
 
-    A member that cannot be opened is named in a warning and passed over; the others are learnt from all the same.
+    A member that cannot be opened is skipped with a warning.
 
-    openers: what opens each, by name
-    frame:   the cube that all members fill, with the background, alpha and reach of the first one to learn from; each
+    openers: functions that open each member, by name
+    frame:   the cube that all members fill, with the background, alpha and reach of the first training member; each
              member has a frame of its own
     splits:  numbers of members by purpose
     """
@@ -57,7 +57,7 @@ class Collection:
         return len(self.openers)
 
     def __getitem__(self, name: str) -> Dataset:
-        """A member by its name. Raises LumigraphError where it cannot be opened."""
+        """Member by name. Raises LumigraphError where it cannot be opened."""
         found = self._opened.pop(name, None) or self.openers[name]()
         self._opened[name] = found  # the latest last
         while len(self._opened) > MAX_OPEN:
@@ -65,8 +65,8 @@ class Collection:
         return found
 
     def members(self, split: str = "train") -> Iterator[tuple[str, Dataset]]:
-        """Names and datasets of a split, opened one by one, but for those that cannot be. Raises LumigraphError where
-        none can."""
+        """Names and datasets of a split, opened one by one; members that cannot be opened are skipped. Raises
+        LumigraphError where none can."""
         read = 0
         for number in self._numbers(split):
             if (found := self._readable(number)) is not None:
@@ -91,7 +91,7 @@ class Collection:
         return self._first.preview()
 
     def sample_member(self, generator: torch.Generator, split: str = "train") -> tuple[int, Dataset]:
-        """A random member, for one step: its number and its dataset. Raises LumigraphError where none can be opened."""
+        """A random member for one step: its number and its dataset. Raises LumigraphError where none can be opened."""
         there = self._numbers(split)
         while not all(self.names[number] in self._faults for number in there):
             number = there[int(torch.randint(len(there), (), generator=generator))]
@@ -101,7 +101,7 @@ class Collection:
 
     @property
     def _first(self) -> Dataset:
-        """The first member to learn from that can be opened."""
+        """The first training member that can be opened."""
         return next(self.members())[1]
 
     def _numbers(self, split: str) -> list[int]:
@@ -112,7 +112,7 @@ class Collection:
         return there.tolist()
 
     def _readable(self, number: int) -> Dataset | None:
-        """A member, or None where it cannot be opened, which is told once."""
+        """A member; None, with a warning the first time, where it cannot be opened."""
         if (name := self.names[number]) in self._faults:
             return None
         try:

@@ -1,4 +1,4 @@
-"""Dataset: what a method learns from, whatever kind it is."""
+"""Dataset: the interface of training data of any kind."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Dataset(Protocol):
 
     @property
     def source(self) -> str:
-        """Path that it came from, or "procedural:<name>"."""
+        """Path of the source, or "procedural:<name>"."""
 
     @property
     def frame(self) -> Frame:
-        """Bounds, and the way back to the source's frame; all that a method must know to be built."""
+        """Bounds, and the similarity to the source's frame; sufficient to build a method."""
 
     @property
     def splits(self) -> Mapping[str, Int[Tensor, " item"]]:
@@ -43,10 +43,10 @@ class Dataset(Protocol):
 
     @property
     def warnings(self) -> Sequence[str]:
-        """Sentences that a user should know about it."""
+        """Warnings for the user, one sentence each."""
 
     def preview(self) -> Camera | None:
-        """A camera whose picture shows how far training has come; None where there is nothing to look at."""
+        """Camera of the training previews; None for data without pictures."""
 
 
 def check_kind(
@@ -56,10 +56,10 @@ def check_kind(
     source: str,
     learning_from: Callable[[type[Any]], Sequence[str]] = lambda _: (),
 ) -> None:
-    """Raise LumigraphError if a method that learns from one kind of dataset is to learn from another.
+    """Raise LumigraphError for a dataset of another kind than a method learns from.
 
     learner:       the method's name
-    learning_from: names of the methods that learn from a kind; it imports all of them, so only an error asks it
+    learning_from: names of the methods for a kind; imports all of them, so it is called only for an error
     """
     if issubclass(found, wanted):
         return
@@ -71,7 +71,7 @@ def check_kind(
 
 
 def splits_of(members: int) -> dict[str, Int[Tensor, " member"]]:
-    """Every 8th member of many is for testing; a single one is for both."""
+    """Splits: every 8th member for testing; a single one for both."""
     index = torch.arange(members)
     held_out = index % HOLD_OUT == 0
     return {"train": index, "test": index} if members == 1 else {"train": index[~held_out], "test": index[held_out]}

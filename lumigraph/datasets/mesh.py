@@ -1,4 +1,4 @@
-"""Mesh: triangles with colours, as methods learn from them and exports write them."""
+"""Mesh: triangles with colours, for training and export."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .scene import Frame
 
 @dataclass(frozen=True)
 class MeshTexture:
-    """Pictures of a surface.
+    """Textures of a surface.
 
-    uv:      place of each vertex: (0, 0) is the upper left corner of the pictures, (1, 1) the lower right one
+    uv:      texture coordinates of each vertex: (0, 0) is the upper left corner of the pictures, (1, 1) the lower right
     colours: sRGB-encoded
-    normals: 255 (n + 1) / 2 of unit normals n in the frame of tangent (growing u), bitangent (upwards in the picture)
-             and the mesh's own normal; None where there is no further detail
+    normals: normal map 255 (n + 1) / 2 in the frame of tangent (growing u), bitangent (upwards in the picture) and the
+             mesh's own normal; None without one
     """
 
     uv: Float[np.ndarray, "vertex 2"]
@@ -27,9 +27,9 @@ class MeshTexture:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with a colour at each vertex, anticlockwise seen from outside.
+    """Triangles with vertex colours, anticlockwise seen from outside.
 
-    vertices: in the frame that its maker states; split where parts of a texture end
+    vertices: in the frame of its source; split along texture seams
     colours:  sRGB-encoded
     """
 
@@ -39,7 +39,7 @@ class Mesh:
     texture: MeshTexture | None = None
 
     def transformed(self, similarity: Float[np.ndarray, "4 4"]) -> Mesh:
-        """The same mesh in another frame, x' = M x. A mirroring turns the triangles, so that outside stays outside."""
+        """The same mesh in another frame, x' = M x. A reflection also reverses the triangles."""
         matrix = np.asarray(similarity, np.float64)
         vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         faces = self.faces if np.linalg.det(matrix[:3, :3]) > 0 else self.faces[:, ::-1].copy()

@@ -1,4 +1,4 @@
-"""Scene: photographs, where they were taken from, and what is known of the space between them."""
+"""Scene: photographs, their cameras, and the geometry known of the scene."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ Size = Annotated[float, between(1e-9, 1e9)]  # scene units
 
 @dataclass(frozen=True)
 class Forward:
-    """Geometry of a forward-facing capture: the mean of its cameras, and the near plane in front of it.
+    """Geometry of a forward-facing capture: its mean camera, and the near plane in front of it.
 
     pose:  camera-to-world of the mean camera, in scene units
-    scale: of x / z and y / z in that camera, bringing all that the cameras see within [-1, 1]
-    near:  distance of that plane from the mean camera; what is to be modelled lies beyond
+    scale: factor on x / z and y / z in that camera that brings everything visible within [-1, 1]
+    near:  distance of the near plane from the mean camera
     """
 
     pose: tuple[Row, ...]
@@ -81,22 +81,21 @@ class Frame:
     """Bounds and frame of a scene, in plain numbers: sufficient to build a method, with or without photographs.
 
     bounds:      two corners of the box of interest, inside [-1, 1]^3
-    reach:       half-size of the cube around the origin that holds everything to be modelled: 1 for an object, a power
-                 of two up to 64 for a room or an unbounded capture
-    near:        distance from a camera at which its rays may begin; nothing is nearer
-    background:  colour behind everything
-    has_alpha:   whether the photographs say how opaque each pixel is
+    reach:       half-size of the cube around the origin that contains the whole model: 1 for an object, a power of two
+                 up to 64 for a room or an unbounded capture
+    near:        near distance of rays; the space in front is empty
+    background:  background colour
+    has_alpha:   whether the photographs have alpha
     image_count: photographs in the scene, held-out ones included
-    source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
-                 line up with it
-    forward:     of a capture without bounds whose cameras all look one way; None for any other
-    times:       first and last moment of a capture whose photographs say when they were taken, in its own unit; None
-                 for any other, and where all were taken at once
-    scale:       units of exports to a unit of the capture's frame, by a length that the user knows
-    origin:      of the capture's frame on Earth, where its photographs' GPS has determined it
-    train_count: photographs to learn from; 0 where that is not known
-    tracks:      boxes of rigid things that move, in the scene's frame
-    skeleton:    bones of a character at all moments, in the scene's frame
+    source_from_scene: similarity x_source = M x_scene to the capture's own frame, so that exports line up with it
+    forward:     of an unbounded forward-facing capture; None for any other
+    times:       first and last time of a capture with times, in its own unit; None for any other, and for a single time
+    scale:       units of exports per unit of the capture's frame, by a length that the user knows
+    origin:      of the capture's frame on Earth, if its photographs' GPS has determined it
+    train_count: number of training photographs; 0 if unknown
+    tracks:      boxes of moving rigid objects, in the scene's frame
+    skeleton:    bones of a character at all times, in the scene's frame
+    world_from_source: similarity from the capture's frame to that of control points, if there are any
     """
 
     bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -113,6 +112,7 @@ class Frame:
     train_count: Annotated[int, between(0, 10**6)] = 0
     tracks: tuple[BoxTrack, ...] = ()
     skeleton: Skeleton | None = None
+    world_from_source: tuple[Row, ...] | None = None
 
     @property
     def is_open(self) -> bool:
@@ -121,16 +121,17 @@ class Frame:
 
     @property
     def to_source(self) -> Similarity:
-        """The way back to the frame that the capture came in."""
+        """Similarity to the capture's own frame."""
         return Similarity.of(self.source_from_scene)
 
     @property
     def to_export(self) -> Similarity:
-        """The way to the frame of exports: that of the capture, in the unit of a length that the user knows."""
-        return Similarity.make(self.scale) @ self.to_source
+        """Similarity to the frame of exports: of control points, or of the capture in the unit of a known length."""
+        world = Similarity.make(self.scale) if self.world_from_source is None else Similarity.of(self.world_from_source)
+        return world @ self.to_source
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers and lists; `from_json` turns them back exactly."""
+        """Plain numbers and lists, the exact inverse of `from_json`."""
         return asdict(self)
 
     @staticmethod
@@ -140,7 +141,8 @@ class Frame:
         low, high = frame.bounds
         if not all(a < b for a, b in zip(low, high, strict=True)):
             raise LumigraphError(f"{where}: bounds from {low} to {high} hold nothing; correct them")
-        if not is_similarity(torch.tensor(frame.source_from_scene, dtype=torch.float64)):
+        rows = [frame.source_from_scene, *([frame.world_from_source] if frame.world_from_source else [])]
+        if not all(is_similarity(torch.tensor(one, dtype=torch.float64)) for one in rows):
             raise LumigraphError(f"{where}: source_from_scene does more than move, turn and scale; correct it")
         if frame.forward is not None and len(frame.forward.pose) != 3:
             raise LumigraphError(f"{where}: forward.pose should be 3 rows of 4 numbers; correct it")
@@ -149,11 +151,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays, and what the photographs say they saw.
+    """Rays with the photographs' colours along them.
 
-    rgb:   sRGB-encoded, not multiplied by alpha
-    alpha: opacity, where the photographs have it
-    extra: values of the layers that were asked for, by name; see `Layer.decoded`
+    rgb:   sRGB-encoded, not premultiplied
+    alpha: opacity, for photographs with alpha
+    extra: values of requested layers by name; see `Layer.decoded`
     """
 
     unit: ClassVar[str] = "rays"
@@ -167,7 +169,7 @@ class Batch:
         return len(self.rgb)
 
     def before(self, background: Float[Tensor, "#ray 3"]) -> Float[Tensor, "ray 3"]:
-        """The colours with a background behind what is not opaque."""
+        """The colours composited over a background."""
         return before(self.rgb, self.alpha, background)
 
     def to(self, device: torch.device | str) -> Batch:
@@ -178,12 +180,12 @@ class Batch:
 
 @dataclass(frozen=True)
 class Photograph:
-    """One whole photograph, and what took it.
+    """One whole photograph with its camera.
 
-    rgb:   sRGB-encoded, not multiplied by alpha
-    alpha: opacity, where the photographs have it
-    mask:  which pixels are to be trusted; None for all
-    extra: values of the layers that were asked for, by name; see `Layer.decoded`
+    rgb:   sRGB-encoded, not premultiplied
+    alpha: opacity, for photographs with alpha
+    mask:  trusted pixels; None for all
+    extra: values of requested layers by name; see `Layer.decoded`
     """
 
     unit: ClassVar[str] = "rays"  # one through each pixel
@@ -199,7 +201,7 @@ class Photograph:
         return self.rgb.shape[0] * self.rgb.shape[1]
 
     def before(self, background: Float[Tensor, " 3"] | Vector) -> Float[Tensor, "height width 3"]:
-        """The colours with a background behind what is not opaque."""
+        """The colours composited over a background."""
         return before(self.rgb, self.alpha, background)
 
     def trusted(self, picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "pixel 3"]:
@@ -222,9 +224,9 @@ class Photograph:
         return Photograph(self.camera.to(device), rgb, alpha, mask, extra)
 
     def reduced(self, factor: int) -> Photograph:
-        """A whole number of times smaller: means over squares of pixels. What does not fill a square is left out.
+        """The photograph a whole number of times smaller: means over squares of pixels; incomplete squares are cropped.
 
-        Of the layers light is averaged too; depth, labels and all else are picked (see `resized`).
+        Layers of light are averaged too; of depth, labels and all else the nearest is taken (see `resized`).
         """
         if factor == 1:
             return self
@@ -260,19 +262,19 @@ def smaller(values: Shaped[Tensor, "height width *channels"], factor: int, encod
 
 @dataclass(frozen=True)
 class Scene:
-    """Image i was taken by camera i and is called names[i].
+    """Photographs with cameras; image i is names[i], taken by camera i.
 
     cameras: in the scene's frame; image_index counts them
-    frame:   bounds, reach, background, and the way back to the source's frame
+    frame:   bounds, reach, background, and the similarity to the source's frame
     splits:  image numbers by purpose: "train", "test", maybe "val"
-    points:  sparse points in the scene's frame, where structure from motion gave some
+    points:  sparse points in the scene's frame, from structure from motion if any
     source:  the folder it came from, or "procedural:<name>"
-    warnings: what the user should know about the capture, one sentence each
-    layers:  what else is known of every pixel, by name: depth, labels ...; read when asked for
-    about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
-    full_sizes: width and height of the photographs before they were reduced, where they come from files
-    digests: size and hash of each photograph's file, "" where it comes from none
-    options: how the source was opened: downscale, reader, views, scales
+    warnings: about the capture, for the user, one sentence each
+    layers:  other per-pixel values by name: depth, labels ...; read on use
+    about:   other values per photograph by name: exposure, boxes ...; the first axis is the image
+    full_sizes: width and height of the photographs' files before downscaling
+    digests: size and hash of each photograph's file, "" without a file
+    options: of the source: downscale, reader, views, scales
     """
 
     kind: ClassVar[str] = "photographs"
@@ -295,6 +297,20 @@ class Scene:
     def __len__(self) -> int:
         return len(self.names)
 
+    def find(self, name: str) -> int:
+        """Number of a photograph by its name, with or without its folder and ending, or by that number as text.
+
+        Raises LumigraphError if there is none, or several.
+        """
+        paths = [Path(x) for x in self.names]
+        for names in (self.names, [x.name for x in paths], [x.stem for x in paths], list(map(str, range(len(self))))):
+            if names.count(name) == 1:
+                return names.index(name)
+        shown = ", ".join([*self.names[:4], "..."] if len(self) > 4 else self.names)
+        raise LumigraphError(
+            f"{self.source} has no photograph {name!r}; there are {shown}, and numbers up to {len(self) - 1}"
+        )
+
     def __repr__(self) -> str:
         """Five lines: photographs, their sizes, the frame, what else is known, the source."""
         sizes = sorted({(int(w), int(h)) for w, h in self.cameras.size.tolist()}, reverse=True)
@@ -315,7 +331,7 @@ class Scene:
         return int(self.images.trusted_pixels[self.splits[split]].sum())
 
     def layer(self, name: str) -> Layer:
-        """A layer by its name. Raises LumigraphError, naming those that there are, if there is none."""
+        """Layer by name. Raises LumigraphError, naming the existing ones, if there is none."""
         if name not in self.layers:
             there = f"only {', '.join(self.layers)}" if self.layers else "nothing else"
             raise LumigraphError(f"{self.source} has no {name} beside its photographs, {there}; add it, or do without")
@@ -329,10 +345,10 @@ class Scene:
         layers: Sequence[str] = (),
         places: bool = False,
     ) -> Batch:
-        """Random pixels of random photographs: photographs evenly, then their trusted pixels evenly.
+        """Random pixels: photographs uniformly, then their trusted pixels uniformly.
 
-        layers: names of what else to tell of these pixels, in `Batch.extra`. Raises LumigraphError if there is no such
-        places: whether to tell where on their pictures they lie, as shares of width and height, in `extra["place"]`
+        layers: names of layers to return in `Batch.extra`. Raises LumigraphError for an unknown one
+        places: also return positions in the pictures, as shares of width and height, in `extra["place"]`
         """
         chosen = self.splits[split]
         drawn = self.images.draw(count, chosen, generator, positions=bool(layers))
@@ -348,12 +364,12 @@ class Scene:
         return Batch(rays, rgb, alpha, extra)
 
     def preview(self) -> Camera:
-        """The camera of the first held-out photograph; of the first one, where none is held out."""
+        """Camera of the first held-out photograph, else of the first one."""
         held_out = self.splits.get("test")
         return self.cameras[int((held_out if held_out is not None and len(held_out) else self.splits["train"])[0])]
 
     def photograph(self, index: int, layers: Sequence[str] = ()) -> Photograph:
-        """One photograph, its camera, and of the layers those that are named. Raises LumigraphError as `layer` does."""
+        """One photograph with its camera and the named layers. Raises LumigraphError as `layer` does."""
         camera, image = self.cameras[index], self.images[index].div(255)
         alpha = image[..., 3] if image.shape[-1] == 4 else None
 

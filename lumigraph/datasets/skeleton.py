@@ -1,7 +1,7 @@
-"""Skeletons: bones of one character, its pose at rest, and its poses over time.
+"""Skeletons: bones of one character, its rest pose, and its poses over time.
 
 A bone is named after the joint that it turns about. A pose has the position and the rotation of every joint in one
-frame, so that a point x of the body at rest, which belongs to bone k alone, goes to G_k G_k(rest)^-1 x.
+frame, so that a point x of the body at rest, fully weighted to bone k, goes to G_k G_k(rest)^-1 x.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Bone = Annotated[int, between(ROOT, 4095)]
 
 @dataclass(frozen=True)
 class BonePose:
-    """Joints at one moment, in one frame.
+    """Joints at one time, in one frame.
 
     positions: of the joints
     rotations: from the axes of each joint to the frame's, quaternions (w, x, y, z)
@@ -38,7 +38,7 @@ class BonePose:
 
     @staticmethod
     def of(matrices: Float[Tensor, "bone 3 4"]) -> BonePose:
-        """Plain numbers of joint-to-frame matrices."""
+        """Pose of joint-to-frame matrices."""
         turns = to_quaternion(matrices[:, :, :3])
         turns = torch.where(turns[:, :1] < 0, -turns, turns)
         return BonePose(tuple(map(tuple, matrices[:, :, 3].tolist())), tuple(map(tuple, turns.tolist())))
@@ -54,11 +54,11 @@ class BonePose:
 class Skeleton:
     """Bones of one character and its poses over time.
 
-    names:   of the bones, each one time
+    names:   of the bones, unique
     parents: number of each bone's parent, which comes before it; -1 for a root
-    rest:    the pose to which the canonical body belongs (the bind pose)
-    times:   moments of the poses, in order, in the unit of the photographs' times; one alone holds for all time
-    poses:   at these moments; between two of them the pose is interpolated
+    rest:    rest pose of the canonical body (the bind pose)
+    times:   of the poses, in order, in the unit of the photographs' times; a single one is constant
+    poses:   at these times, with interpolation between them
     """
 
     names: tuple[Name, ...]
@@ -72,8 +72,8 @@ class Skeleton:
         return len(self.names)
 
     def check(self) -> None:
-        """Raises LumigraphError for a skeleton without bones, poses of other bones, joints all in one
-        place, and times that go back."""
+        """Raise LumigraphError for a skeleton without bones, poses of other bones, joints all in one place, and times
+        out of order."""
         count = len(self.names)
         if not count or len(self.parents) != count:
             raise LumigraphError(f"A skeleton has {count} names and {len(self.parents)} parents; give one of each bone")
@@ -117,7 +117,7 @@ class Skeleton:
 
 
 def local_of(parents: Sequence[int], poses: Float[Tensor, "*batch bone 3 4"]) -> Float[Tensor, "*batch bone 3 4"]:
-    """Joints in the frames of their parents; roots as they are."""
+    """Joints in the frames of their parents; roots unchanged."""
     known = torch.tensor([max(parent, 0) for parent in parents], device=poses.device)
     roots = torch.tensor([parent < 0 for parent in parents], device=poses.device)[:, None, None]
     return torch.where(roots, poses, rigid_product(rigid_inverse(poses[..., known, :, :]), poses))
@@ -133,13 +133,13 @@ def posed(parents: Sequence[int], local: Float[Tensor, "*batch bone 3 4"]) -> Fl
 
 
 def rigid_product(a: Float[Tensor, "*batch 3 4"], b: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]:
-    """The rigid motion b, then a."""
+    """Compose rigid motions: b, then a."""
     turn = a[..., :3] @ b[..., :3]
     return torch.cat([turn, a[..., :3] @ b[..., 3:] + a[..., 3:]], -1)
 
 
 def rigid_inverse(a: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]:
-    """The way back of a rigid motion."""
+    """Inverse of a rigid motion."""
     back = a[..., :3].mT
     return torch.cat([back, -back @ a[..., 3:]], -1)
 
@@ -147,7 +147,7 @@ def rigid_inverse(a: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]
 def between_moments(
     times: Float[Tensor, " moment"], asked: Float[Tensor, " time"]
 ) -> tuple[Int[Tensor, " time"], Int[Tensor, " time"], Float[Tensor, " time"]]:
-    """Numbers of the moments before and after each time, and its share of the way; the ends hold beyond them."""
+    """Indices of the moments before and after each time, and the interpolation weight; clamped to the ends."""
     if len(times) == 1:
         rows = torch.zeros(len(asked), dtype=torch.long, device=asked.device)
         return rows, rows, torch.zeros_like(asked)
@@ -160,7 +160,7 @@ def between_moments(
 def disturbed(
     parents: Sequence[int], pose: Float[np.ndarray, "bone 3 4"], degrees: float, random: np.random.Generator
 ) -> Float[np.ndarray, "bone 3 4"]:
-    """The pose after every joint turned by an angle about an axis of its own; lengths of bones stay."""
+    """The pose with every joint rotated by `degrees` about a random axis; lengths of bones stay."""
     axes = random.normal(size=(len(parents), 3))
     turned = torch.from_numpy(axes / np.linalg.norm(axes, axis=1, keepdims=True))
     half = 0.5 * math.radians(degrees)
@@ -171,10 +171,10 @@ def disturbed(
 
 
 def retargeted(clip: Skeleton, onto: Skeleton, where: Path | str) -> Skeleton:
-    """The motion of one skeleton on the bones of another with the same names, each from its own pose at rest.
+    """Retarget the motion of one skeleton to the bones of another with the same names, relative to each rest pose.
 
     A bone turns in its parent by as much as it does in the clip; roots also move, by lengths of the skeleton. Bones
-    that the clip lacks keep their pose at rest. Raises LumigraphError where no name is in both. where: to name
+    missing in the clip keep their rest pose. Raises LumigraphError without common names. where: named in faults
     """
     rows = {name: number for number, name in enumerate(clip.names)}
     shared = [(number, rows[name]) for number, name in enumerate(onto.names) if name in rows]
@@ -205,7 +205,7 @@ def retargeted(clip: Skeleton, onto: Skeleton, where: Path | str) -> Skeleton:
 def turned_joints(skeleton: Skeleton, angles: dict[str, Point], where: Path | str) -> Skeleton:
     """The skeleton in one pose: at rest, but for joints that turn by angles about their own x, then y, then z axis.
 
-    angles: degrees, by names of bones. Raises LumigraphError for a bone that does not exist. where: to name
+    angles: degrees, by names of bones. Raises LumigraphError for a bone that does not exist. where: named in faults
     """
     local = local_of(skeleton.parents, skeleton.rest.matrices)
     for name, degrees in angles.items():

@@ -1,4 +1,4 @@
-"""Terrain from noise: heights, ground and trees of a square of land, for block worlds and for landscapes."""
+"""Procedural terrain: heights, ground and trees of a square of land, for block worlds and for landscapes."""
 
 from __future__ import annotations
 
@@ -88,10 +88,10 @@ def terrain(width: int, seed: int, fine: int = 1) -> Terrain:
 def fractal(
     width: int, fine: int, period: float, octaves: int, gain: float, random: np.random.Generator
 ) -> Float[np.ndarray, "x y"]:
-    """Smooth noise of several octaves over a square, most of it in [-1, 1].
+    """Fractal noise of several octaves over a square, most of it in [-1, 1].
 
-    width: of the square; fine: points to a unit; period: of the first octave, units; gain: amplitude of an octave over
-    that before
+    width: of the square; fine: points to a unit; period: of the first octave, units; gain: amplitude ratio of
+    successive octaves
     """
     at, total, amplitude = (np.arange(width * fine) + 0.5) / fine, np.zeros((width * fine,) * 2), 1.0
     for octave in range(octaves):

@@ -1,4 +1,4 @@
-"""Tracks: boxes of rigid things that move, with their poses over time; edits of them, and the nodes of a scene graph.
+"""Tracks: boxes of moving rigid objects, with their poses over time; edits of them, and the nodes of a scene graph.
 
 A box has axes of its own, x forward, y to the left and z up, and its origin in its centre.
 """
@@ -25,12 +25,12 @@ MAX_TIME_ERROR = 1e-5  # of a moment, relative to its size: single precision
 
 @dataclass(frozen=True)
 class BoxTrack:
-    """One thing and where its box is.
+    """One object and its box over time.
 
-    name, category: of the thing, and of its kind
+    name, category: of the object
     size:           of its box along x, y and z
-    times:          moments of its poses, in order; between two of them the pose is interpolated, and before the first
-                    and after the last the thing is not there. With one pose alone it is always there
+    times:          of its poses, in order, with interpolation between them; the object is absent before the first and
+                    after the last. A single pose is constant
     positions:      of the box's centre
     rotations:      from the box's axes to those of the frame, quaternions (w, x, y, z)
     """
@@ -43,7 +43,7 @@ class BoxTrack:
     rotations: tuple[Row, ...]
 
     def check(self) -> None:
-        """Raises LumigraphError for lists of different length, moments that go back, and rotations of no direction."""
+        """Raise LumigraphError for lists of different length, times out of order, and zero quaternions."""
         counts = len(self.times), len(self.positions), len(self.rotations)
         if not counts[0] or len(set(counts)) > 1:
             raise LumigraphError(
@@ -73,7 +73,7 @@ class BoxTrack:
         )
 
     def pose(self, time: float | None) -> Float[Tensor, "3 4"] | None:
-        """Rotation and position at a moment, in double precision; None where the thing is not there."""
+        """Rotation and position at a time, in double precision; None where the object is absent."""
         times = torch.tensor(self.times, dtype=torch.float64)
         if len(times) == 1 or time is None:
             lower = upper = 0
@@ -93,14 +93,14 @@ class BoxTrack:
 
 @dataclass(frozen=True)
 class TrackEdit:
-    """A change of one thing of a scene graph.
+    """A change of one object of a scene graph.
 
-    node:   name of the thing, or a new one for a thing that is added
-    like:   the thing whose looks and size it has; None for its own. Its lower side stays where it was
-    remove: whether it is not shown
+    node:   name of the object, or a new one to add an object
+    like:   the object whose appearance and size it takes; None for its own. Its lower side stays
+    remove: whether to hide it
     shift:  added to its positions, in units and axes of the frame
     turn:   degrees about its box's upright axis, counterclockwise from above
-    track:  its poses, in place of its own; None for those it has, and of a new thing those of `like`
+    track:  its new poses; None for its own, and for a new object those of `like`
     """
 
     node: Name
@@ -119,7 +119,7 @@ class TrackEdit:
 
 @dataclass(frozen=True)
 class TrackEdits:
-    """Changes of a scene graph, the evidence of a method that has one. They apply to what was learnt, in order."""
+    """Edits of a scene graph, evidence for its method. They apply to the trained scene, in order."""
 
     edits: tuple[TrackEdit, ...]
 
@@ -130,11 +130,11 @@ class TrackEdits:
 
 @dataclass(frozen=True)
 class GraphNode:
-    """A thing of a scene graph, as it is shown.
+    """An object of an edited scene graph.
 
-    like:  name of the track whose looks it has
+    like:  name of the track whose appearance it has
     track: its box over time
-    own:   name of the track whose learnt corrections hold for it; "" for none
+    own:   name of the track whose learnt corrections apply to it; "" for none
     """
 
     name: str
@@ -144,7 +144,7 @@ class GraphNode:
 
 
 def nodes_of(tracks: Sequence[BoxTrack], edits: TrackEdits = TrackEdits(())) -> tuple[GraphNode, ...]:
-    """The things of a scene graph after edits. Raises LumigraphError for an edit of a thing that does not exist."""
+    """Objects of a scene graph after edits. Raises LumigraphError for an edit of a missing object."""
     known = {track.name: track for track in tracks}
     nodes = {name: GraphNode(name, name, track, name) for name, track in known.items()}
     for edit in edits.edits:
@@ -171,12 +171,12 @@ def nodes_of(tracks: Sequence[BoxTrack], edits: TrackEdits = TrackEdits(())) -> 
 
 
 def unknown(name: str, known: dict[str, BoxTrack]) -> str:
-    """One sentence about a name that no track has."""
+    """Sentence about an unknown track name."""
     return f"the scene graph has no {name!r}; there are {', '.join(known) or 'none'}"
 
 
 def turned(track: BoxTrack, degrees: float, shift: Point = (0.0, 0.0, 0.0)) -> BoxTrack:
-    """The track with its box turned about its upright axis and then shifted, at every moment."""
+    """The track with its box rotated about its upright axis and then shifted, at every time."""
     half = 0.5 * math.radians(degrees)
     turn = to_matrix(torch.tensor([[math.cos(half), 0.0, 0.0, math.sin(half)]], dtype=torch.float64))
     rotations = to_matrix(torch.tensor(track.rotations, dtype=torch.float64)) @ turn

@@ -1,4 +1,4 @@
-"""Words: a prompt, and a model that judges pictures by it, from which a scene without photographs is learnt."""
+"""Words: a prompt, and a text-and-image model as guidance, to generate a scene without photographs."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ PREVIEW_PIXELS = 256
 
 @dataclass(frozen=True)
 class Words:
-    """prompt:   caption of the scene
-    guidance: path of a model, see `components.guidance`; None where the scene is only looked at
-    """
+    """Prompt of a text-to-3D scene. guidance: path of a model, see `components.guidance`; None for rendering only"""
 
     kind: ClassVar[str] = "words"
 
@@ -33,8 +31,8 @@ class Words:
 
     @staticmethod
     def read(source: str, guidance: str | Path | None = None) -> Words:
-        """The prompt of a source "words:<prompt>". Raises LumigraphError for an empty or endless one, and for guidance
-        that does not exist."""
+        """The prompt of a source "words:<prompt>". Raises LumigraphError for an empty or too long one, and for
+        missing guidance."""
         prompt = " ".join(source.removeprefix(WORDS).split())
         if not prompt or len(prompt) > MAX_LETTERS:
             wrong = "is empty" if not prompt else f"has {len(prompt):,} letters"
@@ -50,7 +48,7 @@ class Words:
 
     @property
     def frame(self) -> Frame:
-        """A cube around the origin before white; nothing is nearer to a camera than its edge."""
+        """A cube around the origin with white background; cameras stay outside of it."""
         return Frame(background=(1.0, 1.0, 1.0), has_alpha=True)
 
     @cached_property

@@ -30,7 +30,7 @@ class BlockLabels:
 
 @dataclass(frozen=True, repr=False)
 class BlockWorld(Scene):
-    """A scene of blocks. Its pictures show the blocks in plain colours; its layer `labels` counts `LABELS`."""
+    """A block world. Its pictures show the blocks in plain colours; its layer `labels` counts `LABELS`."""
 
     kind: ClassVar[str] = "a block world"
 

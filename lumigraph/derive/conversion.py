@@ -6,8 +6,8 @@ The way from one to the other follows from their capabilities, so that a new met
 from __future__ import annotations
 
 import math
+import tempfile
 import time
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from .. import files, methods
-from ..budget import Budget, Quality
+from ..budget import Budget
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..datasets.dataset import check_kind
 from ..datasets.images import ImageStore
 from ..datasets.scene import Scene
-from ..errors import LumigraphError, LumigraphWarning
-from ..evaluation import evaluate
-from ..evaluation.views import warm_up
+from ..errors import LumigraphError
+from ..evaluation.options import EvaluationOptions
+from ..evaluation.views import evaluate, warm_up
 from ..geometry import evenly, look_at
 from ..method import Method
 from ..method.capabilities import FromField, HasDensity, HasField, HasGaussians, HasLooks, RefinesPoses, can, needs
@@ -36,12 +36,12 @@ from ..system.signals import go_on_unless
 from ..system.work import at_work
 from ..training import fit
 from .compression.compress import bytes_of
+from .options import ConvertOptions
 
 INHERITED_PROGRESS = 0.5  # training progress at which schedules go on after a field was taken over
 RENDERING_SHARE = 0.5  # of the training time that rendering of training views may take in addition
 PHOTOGRAPHS: LearntFrom = "photographs"
 RENDERINGS: LearntFrom = "renderings of the source"
-COMPARED_VIEWS = 8  # held-out views that are compared
 INITIALISATION_SECONDS = 60.0  # seconds that initialisation and comparison rarely exceed, on two cores
 Way = Literal["field", "gaussians", "depth", "pictures"]
 SPATIAL_CAPABILITIES = FromField, HasField, HasDensity, HasLooks, HasGaussians  # one of them is needed
@@ -51,51 +51,33 @@ MAX_SIDE = 400  # pixels of their longer side
 NEIGHBOUR_SHARE = 1 / 3  # position of an additional camera, as a share of the way to the nearest neighbour
 
 
-@dataclass(frozen=True)
-class ConversionTarget:
-    """Target of a conversion and its limit; exactly one of steps, seconds and quality.
-
-    config:  the student's numbers; None takes its defaults for the device
-    steps, seconds: of learning on, once the teacher is taken over
-    quality: that share of the steps a whole training takes which is left then
-    distil:  learn from what the teacher renders, even where photographs are at hand
-    source:  where the photographs are now, if they have moved
-    views:   held-out views to compare at most
-    """
-
-    config: Any = None
-    steps: int | None = None
-    seconds: float | None = None
-    quality: Quality | None = None
-    distil: bool = False
-    source: str | None = None
-    views: int = COMPARED_VIEWS
-    seed: int = 0
-
-
 @at_work()
 def convert(
     source: Opened,
     name: str,
     output: Path,
-    aim: ConversionTarget,
+    aim: ConvertOptions = ConvertOptions(),
     device: torch.device | str = "cpu",
     show: bool = False,
+    config: Any = None,
 ) -> Converted:
     """A run of the method of that name in a new folder, made of whatever was opened; gives what its convert.json says.
 
     output: a new or empty folder, or one in which the same conversion was interrupted, which continues
     show:   whether stages and training are shown
+    config: the student's numbers; None for its defaults on the device
     Raises LumigraphError for what cannot be converted, and Stopped after Ctrl-C, with the state saved.
     """
     if (going_on := unfinished(source, name, output)) is None:
         check_new(output)
     kind, device = methods.find(name), torch.device(device)
+    aim = aim.limited(kind.taught_steps)
     check(source, kind)
-    scene, cameras, teacher = photographs(source, aim.source), source.cameras(), source.method(device)
+    scene = source.photographs(aim.scene, "It learns from renderings instead")
+    cameras, teacher = source.cameras(), source.method(device)
     how = way(type(teacher), kind)
     assert how is not None  # for `check` has asked
-    student = going_on[0].new_method(device) if going_on else new_student(kind, teacher, aim, device)
+    student = going_on[0].new_method(device) if going_on else new_student(kind, teacher, device, config, aim.seed)
     around = teacher.refined(source.survey(cameras["train"]))
     distil = scene is None or (going_on[1].learnt_from == RENDERINGS if going_on else aim.distil)
     stages = NumberedStages(stage_names(distil, going_on is not None), about_time(aim, distil), show)
@@ -144,7 +126,7 @@ def stage_names(distil: bool, going_on: bool) -> list[str]:
     return [*["render views to learn from"] * distil, *["initialise"] * (not going_on), "train", "compare"]
 
 
-def about_time(aim: ConversionTarget, distil: bool) -> str:
+def about_time(aim: ConvertOptions, distil: bool) -> str:
     """Duration of a conversion as text; empty if steps limit it."""
     if aim.seconds is None:
         return ""
@@ -152,10 +134,10 @@ def about_time(aim: ConversionTarget, distil: bool) -> str:
     return f", {clock(least)} to {clock(least + INITIALISATION_SECONDS)} in all"
 
 
-def new_student(kind: type[Method], teacher: Method, aim: ConversionTarget, device: torch.device) -> Method:
+def new_student(kind: type[Method], teacher: Method, device: torch.device, config: Any = None, seed: int = 0) -> Method:
     """A method in the teacher's frame, before it has learnt anything."""
-    config = kind.taught_preset(device) if aim.config is None else aim.config
-    return build(kind, teacher.frame, config, device, getattr(config, "seed", aim.seed), learning=True)
+    config = kind.taught_preset(device) if config is None else config
+    return build(kind, teacher.frame, config, device, getattr(config, "seed", seed), learning=True)
 
 
 def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as_taken: bool) -> float:
@@ -175,7 +157,7 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
     return time.perf_counter() - begin
 
 
-def budget_of(student: Method, data: Scene, aim: ConversionTarget) -> Budget:
+def budget_of(student: Method, data: Scene, aim: ConvertOptions) -> Budget:
     """Budget of further training. Schedules of a converted field begin at INHERITED_PROGRESS."""
     share, steps = INHERITED_PROGRESS if can(student, FromField) else 0.0, aim.steps
     if aim.quality is not None:
@@ -218,19 +200,6 @@ def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, Conversion
     return (run, begun) if Converted.read(output) is None else None
 
 
-def photographs(source: Opened, where: str | None) -> Scene | None:
-    """The photographs again; None where they are not at hand, and no other place is named."""
-    if source.open_scene is None:
-        return None
-    try:
-        return source.open_scene(where)
-    except LumigraphError as error:
-        if where is not None:
-            raise
-        warnings.warn(f"It learns from renderings instead, for {error}", LumigraphWarning, stacklevel=2)
-        return None
-
-
 def way(teacher: type[Method], student: type[Method]) -> Way | None:
     """Conversion of a teacher to a student: by the teacher's field at points, by its Gaussians as they are, by the
     depth of what it renders, or by learning from its pictures alone; None if not at all."""
@@ -248,6 +217,27 @@ def ways() -> dict[str, dict[str, Way | None]]:
     """By the name of each installed method as teacher, the way into each as student."""
     kinds = {name: methods.find(name) for name in methods.available()}
     return {name: {other: way(teacher, student) for other, student in kinds.items()} for name, teacher in kinds.items()}
+
+
+OCTREE = "plenoctrees"
+
+
+def becomes_octree(opened: Opened, method: Method) -> bool:
+    """True if a method's field can be converted to an octree, which supports objects only."""
+    try:
+        check(opened, methods.find(OCTREE))
+    except LumigraphError:
+        return False
+    return not opened.frame.is_open and way(type(method), methods.find(OCTREE)) == "field"
+
+
+def octree_of(opened: Opened, seconds: float, device: torch.device | str) -> tuple[Method, str]:
+    """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:
+        made = convert(opened, OCTREE, Path(folder) / OCTREE, ConvertOptions(seconds=seconds), device, show=True)
+        method = Run(Path(folder) / OCTREE).method(device)
+    return method, f"{time.monotonic() - begin:.0f} s, {made.psnr:.1f} dB to {made.teacher.method}"
 
 
 def check(source: Opened, student: type[Method]) -> None:
@@ -281,8 +271,8 @@ def shown(method: Method, scene: Scene | None, held_out: Camera, most: int) -> S
         views[name] = seen.rgb.clamp(0, 1).cpu()
 
     if scene is not None:
-        split = "test" if len(scene.splits.get("test", ())) else "train"
-        found = evaluate(method, scene, split, keep, min(most, len(scene.splits[split])))
+        split: Literal["test", "train"] = "test" if len(scene.splits.get("test", ())) else "train"
+        found = evaluate(method, scene, EvaluationOptions(split, min(most, len(scene.splits[split]))), keep)
         return Shown(views, found.seconds_per_view, found.psnr)
     chosen = evenly(range(len(held_out)), most)
     warm_up(method, held_out[chosen[0]])

@@ -21,9 +21,10 @@ from ..figures import save_picture
 from ..files import claim, refuse_link, scene_name, write_json
 from ..method import Method
 from ..metrics import Score
-from ..metrics.lpips import Lpips
+from ..metrics.lpips import Lpips, load_lpips, named_files
 from ..run import Trained
 from ..system.progress import counting
+from .options import EvaluationOptions
 from .shapes import ShapesEvaluation, evaluate_shapes
 from .views import ViewsEvaluation, evaluate, file_name, reveal
 from .walks import evaluate_walk
@@ -54,48 +55,40 @@ class Evaluated(Protocol):
 def evaluate_on(
     method: Method,
     data: Dataset,
-    split: str = "test",
+    options: EvaluationOptions = EvaluationOptions(),
     keep: Keep = lambda name, rendering: None,
-    most: int | None = None,
     lpips: Lpips | None = None,
-    right_halves: bool = False,
 ) -> Evaluated:
     """A method on a dataset, under the protocol for its kind.
 
     keep: receives each view's name and rendering, where views are compared
-    most: so many views or shapes at most, evenly spread; None means all
-    right_halves: of photographs, compare those alone, whatever the method
+    lpips: the network of the options' files
     """
     if isinstance(data, Shapes):
-        return evaluate_shapes(method, data, split, most)
+        return evaluate_shapes(method, data, options)
     if isinstance(data, Words):
-        return evaluate_words(method, data, most)
+        return evaluate_words(method, data, options.views)
     if isinstance(data, Collection):
-        return evaluate_collection(method, data, split, keep, most, lpips, right_halves)
+        return evaluate_collection(method, data, options, keep, lpips)
     if isinstance(data, BlockWorld) and issubclass(method.learns_from, BlockWorld):
-        return evaluate_walk(method, data, split, keep, most)
+        return evaluate_walk(method, data, options, keep)
     assert isinstance(data, Scene)
-    return evaluate(method, data, split, keep, most, lpips, right_halves)
+    return evaluate(method, data, options, keep, lpips)
 
 
 def evaluate_run(
-    run: Trained,
-    method: Method,
-    data: Dataset,
-    split: str = "test",
-    save_images: bool = False,
-    most: int | None = None,
-    lpips: Lpips | None = None,
-    right_halves: bool = False,
+    run: Trained, method: Method, data: Dataset, options: EvaluationOptions = EvaluationOptions()
 ) -> dict[str, Any]:
     """Evaluate a Run's Method on its dataset and write the files. Returns what eval.json says."""
-    claim_evaluation(run, split, save_images)
+    claim_evaluation(run, options)
+    split, weights = options.split, named_files(options.lpips)
 
     def keep(name: str, rendering: Rendering) -> None:
-        if save_images:
+        if options.save_images:
             save_picture(image_of(run, name), rendering.rgb, "rendering")
 
-    found, state = evaluate_on(method, data, split, keep, most, lpips, right_halves), run.state
+    found = evaluate_on(method, data, options, keep, load_lpips(weights) if weights else None)
+    state = run.state
     result = found.to_json() | {
         "training_seconds": state.seconds,
         "compile_seconds": state.compile_seconds,
@@ -115,12 +108,12 @@ def evaluate_run(
     return result
 
 
-def claim_evaluation(run: Trained, split: str, save_images: bool, overwrite: bool | None = None) -> None:
+def claim_evaluation(run: Trained, options: EvaluationOptions, overwrite: bool | None = None) -> None:
     """Raise LumigraphError unless what an evaluation writes may be written into its run; see `files.claim`."""
     refuse_link(run.folder / "eval")
     for ending in (".json", ".png"):
-        claim(run.folder / f"{stem(split)}{ending}", "evaluation", overwrite)
-    for name in run.view_names().get(split, []) if save_images else []:
+        claim(run.folder / f"{stem(options.split)}{ending}", "evaluation", overwrite)
+    for name in run.view_names().get(options.split, []) if options.save_images else []:
         claim(image_of(run, name), "rendering", overwrite)
 
 
@@ -137,17 +130,16 @@ def stem(split: str) -> str:
 def evaluate_collection(
     method: Method,
     data: Collection,
-    split: str = "test",
+    options: EvaluationOptions = EvaluationOptions(),
     keep: Keep = lambda name, rendering: None,
-    views: int | None = None,
     lpips: Lpips | None = None,
-    right_halves: bool = False,
 ) -> ViewsEvaluation | ShapesEvaluation:
     """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
 
     keep:  receives each view's name and rendering; names begin with the member's
-    views: of each member at most
+    options: of which the views are those of each member
     """
+    split, own = options.split, replace(options, split="test")
     scenes: dict[str, ViewsEvaluation] = {}
     shapes: dict[str, ShapesEvaluation] = {}
     for name, member in data.members(split):
@@ -157,9 +149,9 @@ def evaluate_collection(
             def keep_of(view: str, seen: Rendering, name: str = name) -> object:
                 return keep(f"{name}/{view}", seen)
 
-            scenes[name] = evaluate(told, member, "test", keep_of, views, lpips, right_halves)
+            scenes[name] = evaluate(told, member, own, keep_of, lpips)
         elif isinstance(member, Shapes):
-            shapes[name] = evaluate_shapes(told, member, "test", views)
+            shapes[name] = evaluate_shapes(told, member, own)
     if scenes and shapes:
         raise LumigraphError(f"{data.source} holds scenes and shapes, whose scores have no mean; name one kind")
     members = {"split": split, "members": len(scenes or shapes)}

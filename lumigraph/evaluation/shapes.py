@@ -26,6 +26,7 @@ from ..method.capabilities import HasDistance, HasMesh, can, needs
 from ..metrics import Score, chamfer_distance, intersection_over_union, normal_consistency
 from ..system.progress import track
 from ..system.work import at_work
+from .options import EvaluationOptions
 from .views import reveal
 
 POINTS = 100_000  # in the volume, and on each surface (Mescheder 2019)
@@ -102,21 +103,20 @@ class ShapesEvaluation:
 def evaluate_shapes(
     method: Method,
     shapes: Shapes,
-    split: str = "test",
-    most: int | None = None,
+    options: EvaluationOptions = EvaluationOptions(),
     points: int = POINTS,
     cells: int = CELLS,
     size: int = PICTURE_SIZE,
 ) -> ShapesEvaluation:
     """Compare a method's surface with the shapes of a split, each in its own scene units.
 
-    most:   so many shapes at most, evenly spread over the split; None means all
     points: in the volume, and on each surface
     cells:  along the longest side of the box in which the surface is looked for
     size:   pixels of the pictures
     Of several shapes each is told to the method first, if it accepts Shapes. Raises LumigraphError for a split without
     shapes, and for a method in which there is no surface.
     """
+    split, most = options.split, options.views
     chosen = shapes.splits.get(split)
     if chosen is None or not len(chosen):
         raise LumigraphError(f"{shapes.source} has no shapes in the split {split!r}; choose one of: train, test")

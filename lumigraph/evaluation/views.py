@@ -36,6 +36,7 @@ from ..system.work import at_work
 from .halves import LEFT_HALVES, RIGHT_HALVES, judged_by_halves, left_half, right_half
 from .held_out import held_out_kinds
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
+from .options import EvaluationOptions
 
 SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
 MOVING_LAYER, MOVING = "moving", 1  # the layer that marks what moves, and its mark
@@ -213,21 +214,19 @@ class ViewsEvaluation:
 def evaluate(
     method: Method,
     scene: Scene,
-    split: str = "test",
+    options: EvaluationOptions = EvaluationOptions(),
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
-    views: int | None = None,
     lpips: Lpips | None = None,
-    right_halves: bool = False,
 ) -> ViewsEvaluation:
     """Render the views of a split and compare them with their photographs.
 
     keep:  receives each view's name and rendering
-    views: so many of them at most, evenly spread over the split; None means all
-    right_halves: compare those alone also where a method is given nothing of left ones
+    lpips: the network of the options' files
     Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says, and codes from
     there. Pixels that the photograph's mask rules out do not count, nor does a photograph that it rules out altogether.
     A method that photographs can be given to is judged by halves. Raises LumigraphError if the split has no view.
     """
+    split, views, right_halves = options.split, options.views, options.right_halves
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
         there = ", ".join(f"{name} ({len(index)} views)" for name, index in scene.splits.items() if len(index))

@@ -25,6 +25,7 @@ from ..method import Method
 from ..metrics import Score
 from ..system.progress import track
 from ..system.work import at_work
+from .options import EvaluationOptions
 
 SHEET_FRAMES = 8  # frames of the contact sheet
 FAR = 1e4  # distance at which the sky lies, scene units
@@ -97,17 +98,17 @@ class WalkEvaluation:
 def evaluate_walk(
     method: Method,
     world: BlockWorld,
-    split: str = "test",
+    options: EvaluationOptions = EvaluationOptions(),
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
-    most: int | None = None,
 ) -> WalkEvaluation:
     """Render the cameras of a split, which lie along a walk, and compare each frame with the one before.
 
     keep: receives each frame's name and rendering
-    most: so many frames at most, the first ones; None means all
+    options: of which the views are the first frames
     Raises LumigraphError for a split without cameras.
     """
-    chosen = world.splits.get(split, torch.empty(0, dtype=torch.int64)).tolist()[:most]
+    split = options.split
+    chosen = world.splits.get(split, torch.empty(0, dtype=torch.int64)).tolist()[: options.views]
     if not chosen:
         raise LumigraphError(f"{world.source} has no frames in the split {split!r}; choose one of: train, test")
     method.eval()

@@ -1,21 +1,29 @@
-"""File formats of other programs: clouds of Gaussians, octrees, atlases; tensors in few bytes."""
+"""File formats of other programs: clouds of Gaussians, octrees, atlases; and packing, compressed tensors."""
 
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ..errors import LumigraphError
-from ..files import claim, claim_folder, exists, expanded
+import torch
+
+from ..errors import LumigraphError, LumigraphWarning
+from ..files import claim, claim_folder, exists, expanded, is_file, read_json, write_json
+from ..files.marks import is_ours
+from ..files.partials import remove
 from ..files.ply import read_header
-from ..files.reading import reading
+from ..files.reading import reading, reads
 from ..gaussians import Gaussians
+from ..gaussians.cloud import as_precise_as_needed
+from ..gaussians.moving import MovingGaussians
 from ..system.memory import free_memory
 from ..system.progress import counting
-from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
-from .checks import checked
+from . import compressed_ply, fourdgs, glb, moving_ply, ply, sog, splat, spz, streamed_sog
+from .checks import checked, without_unsound
 
 WRITERS = {
     ".compressed.ply": compressed_ply.write,
@@ -28,15 +36,17 @@ WRITERS = {
 READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
 SUFFIXES = tuple(WRITERS)
 FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
+OFFSET = "offset.json"  # beside a file, or in a folder
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """The Gaussians in a file of one of SUFFIXES, or in one of FOLDERS, on the CPU, in the axes that PLY files keep; of
-    a streamed SOG the finest level.
+    """Read the Gaussians in a file of one of SUFFIXES, or a folder of FOLDERS, on the CPU, in the axes of PLY files;
+    for a streamed SOG the finest level.
 
-    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20, rotations of
-    length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
+    The header of a PLY file determines which of two layouts it has. Infinite logits of opacity become ±20. Gaussians
+    with other numbers that are not finite, or without a rotation, are left out with a warning. Raises LumigraphError
+    for what is no cloud.
     """
     path = place_of(expanded(path))
     layout = layout_of(path)
@@ -52,30 +62,84 @@ def read_gaussians(path: Path | str) -> Gaussians:
             else:
                 header = read_header(path)
                 gaussians = (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
-    return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
+    gaussians = without_unsound(gaussians, path)[0]
+    if is_file(beside := offset_file(path)):
+        offset = torch.tensor(read_json(beside, Offset).offset, dtype=torch.float64)
+        means = as_precise_as_needed(gaussians.means.double() + offset, gaussians.log_scales)
+        gaussians = replace(gaussians, means=means)
+    return gaussians
+
+
+def is_moving(path: Path | str) -> bool:
+    """True if `read_moving` accepts a path: .4dgs, existing or not; Spacetime Gaussians; numbered clouds."""
+    path = expanded(path)
+    return fourdgs.is_moving_file(path) or moving_ply.has_motion(path) or moving_ply.is_sequence(path)
+
+
+@reads()
+def read_moving(path: Path | str) -> MovingGaussians:
+    """The moving cloud of a file or a folder. Raises LumigraphError for what it does not hold whole."""
+    path = expanded(path)
+    if fourdgs.is_moving_file(path):
+        return fourdgs.read_moving(path)
+    with counting(f"Reading {path.name}"):
+        return moving_ply.read_sequence(path) if path.is_dir() else moving_ply.read_spacetime(path)
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
-    """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG; to
+    """Write a cloud in the format of the suffix, atomically; to FOLDER/meta.json, a folder of SOG; to
     FOLDER/lod-meta.json, a streamed one, with the levels of `detail`.
 
-    `.ply` keeps every number as it is; docstrings of the others give their rounding. Those of REORDERED keep the set of
-    Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
-    LumigraphError where the ending is none of SUFFIXES, the cloud is not sound or the disk refuses.
+    `.ply` is lossless; docstrings of the others give their rounding. REORDERED formats keep the set of Gaussians and
+    not their order, `.splat` neither harmonics beyond degree 0 nor `antialiased`. Raises LumigraphError for a suffix
+    not in SUFFIXES, an invalid cloud, and a file that cannot be written.
     """
     path = expanded(path)
     ending = check_ending(path)
     claim_splats(path)
     sound = checked(gaussians, f"what is to be written to {path}", "remove them first")
-    if path.name == streamed_sog.META:
-        streamed_sog.write(path, sound, detail)
-        return
+    offset = None
+    if sound.means.dtype == torch.float64 and ending != ".ply":
+        offset = sound.means.median(0).values.round()
+        sound = replace(sound, means=(sound.means - offset).float())
     with counting(f"Writing {path.name}"):
-        WRITERS[ending](path, sound)
+        if path.name == streamed_sog.META:
+            streamed_sog.write(path, sound, detail)
+        elif ending == ".glb":
+            glb.write(path, sound, None if offset is None else offset.numpy())
+        else:
+            WRITERS[ending](path, sound)
+    write_offset(path, None if offset is None or ending == ".glb" else offset.tolist())
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Offset to add to the centres of a file, whose numbers are too coarse for them, in its units."""
+
+    offset: tuple[float, float, float]
+
+
+def offset_file(path: Path) -> Path:
+    """The file that holds the offset of a file of Gaussians, or of a folder of them."""
+    folder = path.parent if path.name in FOLDERS else path
+    return folder / OFFSET if folder.is_dir() else path.with_name(f"{path.name}.{OFFSET}")
+
+
+def write_offset(path: Path, offset: list[float] | None) -> None:
+    """Write the offset of a new file beside it, or remove that of the file before it. Warns of what is beside."""
+    beside = offset_file(path)
+    if offset is not None:
+        write_json(beside, {"offset": offset}, "splats")
+        text = (
+            f"{path} holds centres relative to {', '.join(f'{x:.0f}' for x in offset)}, for its numbers are too coarse "
+        )
+        warnings.warn(f"{text}so far from the origin; {beside.name} has that offset", LumigraphWarning, stacklevel=3)
+    elif is_file(beside) and is_ours(beside, "splats"):
+        remove(beside)
 
 
 def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """`files.claim` for a file of Gaussians, or for the whole folder that a path to one of FOLDERS lies in."""
+    """`files.claim` for a file of Gaussians, or for the whole folder of a path in one of FOLDERS."""
     if path.name not in FOLDERS:
         claim(path, "splats", overwrite, reads)
     elif any(exists(one) and exists(path) and place_of(one).samefile(path.parent) for one in reads):
@@ -93,7 +157,7 @@ def is_splat_file(path: Path | str) -> bool:
     if path.name.lower().endswith(".glb") and path.is_file():
         with reading(path):
             return glb.recognises(path)
-    return path.name.lower().endswith(SUFFIXES)
+    return path.name.lower().endswith(SUFFIXES) and not moving_ply.has_motion(path)
 
 
 def names_splats(path: Path | str) -> bool:
@@ -103,18 +167,18 @@ def names_splats(path: Path | str) -> bool:
 
 
 def place_of(path: Path) -> Path:
-    """The folder of SOG where its meta.json or lod-meta.json is named, or a new one; otherwise the path itself."""
+    """Folder of SOG for a path to its meta.json or lod-meta.json; any other path unchanged."""
     layout = FOLDERS.get(path.name)
     return path.parent if layout and (layout.recognises(path.parent) or not exists(path)) else path
 
 
 def layout_of(folder: Path) -> str | None:
-    """The entry of FOLDERS that a folder matches; `None` for any other, and for a file."""
+    """Entry of FOLDERS that a folder matches; `None` for any other, and for a file."""
     return next((name for name, layout in FOLDERS.items() if folder.is_dir() and layout.recognises(folder)), None)
 
 
 def size_of(path: Path | str) -> int:
-    """Bytes of a file of Gaussians, or of all files of a folder, such as one of SOG, even while some come and go."""
+    """Bytes of a file of Gaussians, or of all files of a folder such as SOG, which may change meanwhile."""
     place, total = place_of(expanded(path)), 0
     inner = (Path(folder, name) for folder, _, names in os.walk(place) for name in names)
     for file in [place] if place.is_file() else inner:
@@ -124,7 +188,7 @@ def size_of(path: Path | str) -> int:
 
 
 def check_ending(path: Path) -> str:
-    """The one of SUFFIXES that a name has. Raises LumigraphError if it has none."""
+    """Suffix of a name, one of SUFFIXES. Raises LumigraphError for any other."""
     if path.name in FOLDERS:
         return ".sog"
     for suffix in SUFFIXES:

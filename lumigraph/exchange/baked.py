@@ -1,6 +1,6 @@
 """Baked fields: Octree, harmonics in cells of several sizes; Atlas, a sparse grid of diffuse colours and features; and
-both for a browser's graphics, as a few numbers and bytes that web/src/volumes.js reads. `write_octree` writes the file
-of the viewers of PlenOctrees, one .npz (Yu 2021; volrend, svox)."""
+the binary data of both for web/src/volumes.js. `write_octree` writes the .npz format of PlenOctrees' viewers (Yu 2021;
+volrend, svox)."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ class ViewNetwork:
 
 @dataclass(frozen=True)
 class Atlas:
-    """Voxels in blocks (Hedman 2021, arXiv 2103.14645): `index` has the place of each block of the whole grid in the
-    atlas, −1 where nothing is.
+    """Voxels in blocks (Hedman 2021, arXiv 2103.14645): `index` has the position of each block of the whole grid in the
+    atlas, −1 for empty ones.
 
     index:    block's number in the atlas, for each block of the grid (x, y, z)
-    values:   of each voxel of each block with one voxel of apron around: red, green, blue, alpha, four features, all in
+    values:   of each voxel of each block with an apron of one voxel: red, green, blue, alpha, four features, all in
               256 steps. Colours and features are premultiplied by alpha = 1 − exp(−density · voxel)
     low:      corner of the grid, in the scene's frame
     voxel:    side of a voxel, in scene units
     block:    voxels along a block's side, without the apron
-    network:  None where the diffuse colour is all there is
-    contracted: whether the grid is the cube of [-2, 2]^3 and holds an open capture: places x beyond the unit ball lie
-              at (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there, and alpha is that of
-              a ray straight out
+    network:  None for an atlas of diffuse colours alone
+    contracted: whether the grid is the cube of [-2, 2]^3 of an open capture: points x beyond the unit ball lie at
+              (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there, and alpha is that of a
+              radial ray
     """
 
     index: Int[Tensor, "x y z"]
@@ -62,7 +62,7 @@ class Atlas:
     contracted: bool = False
 
     def voxels(self) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, "voxel 8"]]:
-        """Positions in the grid of the occupied voxels, and their values."""
+        """Grid coordinates of the occupied voxels, and their values."""
         inner = self.values[:, 1:-1, 1:-1, 1:-1]
         number, *inside = inner.any(-1).nonzero().unbind(-1)
         there = (self.index >= 0).nonzero()
@@ -73,10 +73,9 @@ class Atlas:
 
 @dataclass(frozen=True)
 class Octree:
-    """A cube divided by two along each axis, and each of the eight cells again where the scene needs it (Yu 2021, arXiv
-    2103.14024, section 4). Values are constant inside a cell.
+    """An octree (Yu 2021, arXiv 2103.14024, section 4). Values are constant inside a cell.
 
-    child:     for each of a node's eight cells (x, y, z), 0 for a leaf, else how many nodes further on it is divided
+    child:     for each of a node's eight cells (x, y, z), 0 for a leaf, else the offset to its node
     density:   per scene unit, of each cell
     harmonics: coefficients of each cell; the colour along a direction is sigmoid(Σ coefficient · basis), sRGB-encoded
     low, size: the cube's corner and side, in the scene's frame
@@ -98,11 +97,11 @@ FLOAT16_MAX = 65504.0  # the largest number that half precision has
 
 @dataclass(frozen=True)
 class Browsable:
-    """Data of a page.
+    """Binary data of a web page.
 
-    settings: what JSON can hold
+    settings: JSON
     data:     little-endian, not compressed
-    degree:   of harmonics, of which fewer would take less
+    degree:   of harmonics; fewer take less
     """
 
     settings: dict[str, Any]
@@ -111,12 +110,12 @@ class Browsable:
 
 
 def octree_for_browser(octree: Octree, degree: int = 3) -> Browsable:
-    """An octree without what is empty: density in 16 bits, harmonics in 8 bits times one 16-bit scale for each leaf.
+    """An octree without empty cells: density in 16 bits, harmonics in 8 bits times one 16-bit scale for each leaf.
 
-    degree: highest of the harmonics that is kept
-    The data: density and scale of every leaf (16 bits each), the kind of every cell, how far from every cell of the
-    entry level the nearest that is not empty lies, and each coefficient's bytes of all leaves after another's. Nodes
-    come level by level, and so do leaves, so that where a cell leads to is how many of its kind came before.
+    degree: highest degree of harmonics to keep
+    The data: density and scale of every leaf (16 bits each), the kind of every cell, the distance of every cell of the
+    entry level to the nearest occupied one, and the bytes of all leaves, coefficient by coefficient. Nodes come level
+    by level, and so do leaves, so that a cell's child is the number of cells of its kind before it.
     """
     kinds, cells, levels = breadth_first(octree)
     level = min(ENTRY_LEVEL, levels)
@@ -141,7 +140,7 @@ def octree_for_browser(octree: Octree, degree: int = 3) -> Browsable:
 
 
 def breadth_first(octree: Octree) -> tuple[UInt8[Tensor, " cell"], Tensor, int]:
-    """The kind of each cell, its place among all cells of the octree, and how many levels there are; level by level."""
+    """Kind of each cell, its index among the octree's cells, and the number of levels; level by level."""
     child, solid = octree.child.cpu().long().flatten(1), octree.density.detach().cpu().flatten(1) > 0
     nodes, kinds, cells = torch.zeros(1, dtype=torch.long), [], []
     while len(nodes):
@@ -170,11 +169,11 @@ def filled(octree: Octree, level: int) -> Bool[Tensor, "x y z"]:
 
 
 def atlas_for_browser(atlas: Atlas) -> Browsable:
-    """An atlas, and how far its empty space reaches.
+    """An atlas with the distances of its empty space.
 
-    The data: the number of the block at each place of the grid (32 bits), how far from each cell of some voxels the
-    nearest that is not empty lies, and each channel's bytes of all blocks after another's: three colours, alpha, and
-    with a network the features.
+    The data: the number of the block at each position of the grid (32 bits), the distance of each cell of some voxels
+    to the nearest occupied one, and the bytes of all blocks, channel by channel: three colours, alpha, and with a
+    network the features.
     """
     cell = max(MIN_VOXELS, -(-atlas.block * max(atlas.index.shape) // MAX_CELLS))
     far = clearance(touched(atlas, cell))
@@ -197,7 +196,7 @@ def atlas_for_browser(atlas: Atlas) -> Browsable:
 
 
 def touched(atlas: Atlas, cell: int) -> Bool[Tensor, "x y z"]:
-    """Mask of cells of so many voxels in which trilinear lookups find anything."""
+    """Mask of cells of `cell` voxels in which trilinear lookups are not zero."""
     block, grid = atlas.block, torch.tensor(atlas.index.shape)
     shape = (-(-block * grid // cell)).tolist()
     found = torch.zeros(shape, dtype=torch.bool)
@@ -211,7 +210,7 @@ def touched(atlas: Atlas, cell: int) -> Bool[Tensor, "x y z"]:
 
 
 def clearance(occupied: Bool[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """Chessboard distance of each cell to the nearest that is occupied, 0 there; MAX_LEAP_CELLS at most."""
+    """Chebyshev distance of each cell to the nearest occupied one, 0 there; MAX_LEAP_CELLS at most."""
     grown, far = occupied[None].float(), torch.zeros(occupied.shape, dtype=torch.uint8)
     for _ in range(MAX_LEAP_CELLS):
         if grown.all():
@@ -245,7 +244,7 @@ ROTATION_TOLERANCE = 1e-4  # of a rotation's entries, below which there is none
 
 
 def write_octree(path: Path, octree: Octree, frame: Frame) -> bool:
-    """Write the file. Returns True if it is in the frame of the photographs.
+    """Write the .npz file. Returns True if it is in the frame of the photographs.
 
     A point p is at p · invradius3 + offset in the unit cube. The format has no rotation: where the scene's frame is
     rotated against that of the photographs, the octree stays in the scene's.
@@ -258,7 +257,7 @@ def write_octree(path: Path, octree: Octree, frame: Frame) -> bool:
 
 
 def contents(octree: Octree, moved: Similarity) -> dict[str, Any]:
-    """The arrays of the file, by name. moved: to the file's frame; without rotation
+    """Arrays of the file by name. moved: similarity to the file's frame, without rotation
 
     data: of each cell, all coefficients of red, of green, of blue, then density per unit of the file's frame
     """
@@ -284,7 +283,7 @@ def contents(octree: Octree, moved: Similarity) -> dict[str, Any]:
 
 
 def parents(child: np.ndarray) -> np.ndarray:
-    """(node, 2) int32: the cell that each node divides, as 8 node + place, and how many levels lie above it."""
+    """Parent cell of each node as 8 node + place, and its depth, (node, 2) int32."""
     found = np.zeros((len(child), 2), np.int32)
     divided = np.flatnonzero(child)
     below = divided // 8 + child.reshape(-1)[divided]

@@ -32,7 +32,7 @@ SUFFIXES = (".json", ".glb")  # of files with a pose, or poses over time
 
 @dataclass(frozen=True)
 class BonesRecord(Skeleton):
-    """The file."""
+    """Contents of bones.json."""
 
     format: str = FORMAT
 
@@ -47,7 +47,7 @@ class AnglesRecord:
 
 @reads()
 def read_bones(path: Path) -> Skeleton:
-    """The skeleton in a bones.json. Raises LumigraphError for a file that holds none."""
+    """Read the skeleton in a bones.json. Raises LumigraphError for an invalid file."""
     said = _said(path)
     if "rest" not in said:
         raise LumigraphError(f"{path} has a skeleton without its bind pose; add the pose of the body at rest as `rest`")
@@ -62,9 +62,9 @@ def write_bones(path: Path, skeleton: Skeleton) -> None:
 
 @reads()
 def read_motion(path: Path, onto: Skeleton, to_scene: Similarity) -> Skeleton:
-    """Poses in a file for the bones of a skeleton: a bones.json, joint angles, or a glTF file's first animation.
+    """Read poses for the bones of a skeleton: from a bones.json, joint angles, or a glTF file's first animation.
 
-    to_scene: from the frame of the photographs' poses. Raises LumigraphError for files that hold none.
+    to_scene: from the frame of the photographs' poses. Raises LumigraphError for an invalid file.
     """
     if not path.is_file():
         raise LumigraphError(f"{path} does not exist; name a file of poses that ends in {' or '.join(SUFFIXES)}")

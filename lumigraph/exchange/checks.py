@@ -1,21 +1,25 @@
-"""Checks of clouds (all numbers are finite) and of files: sizes that a file declares are compared with its bytes and
-with free memory; a Bundle reads files of a folder or a .zip within these limits."""
+"""Checks of clouds (all numbers are finite) and of files: declared sizes against their bytes and free memory; a Bundle
+reads files of a folder or a .zip within these limits."""
 
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files.ranges import shown
 from ..files.reading import reading
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
 
+NO_ROTATION = "no rotation"
 DISPLAY_NAMES = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
 MAX_LOGIT = 20.0  # a logit whose sigmoid is 1 in float32
 BYTES_PER_NUMBER = 28  # bytes of memory for each number of a Gaussian while its file is read
@@ -23,10 +27,10 @@ MAX_RATIO, SMALL_BYTES = 100, 1 << 26  # largest compression of a cloud; unpacke
 
 
 def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = None, unpacked: int = 0) -> None:
-    """Raise LumigraphError for a cloud that the machine cannot hold, or that its file can only pretend to hold.
+    """Raise LumigraphError for a cloud that exceeds memory, or that its file is too short to contain.
 
-    count, harmonics: Gaussians that the file promises, and coefficients of each
-    packed, unpacked: bytes of a compressed file, and what they would become
+    count, harmonics: declared number of Gaussians, and coefficients of each
+    packed, unpacked: bytes of a compressed file, before and after decompression
     """
     if packed is not None and unpacked > max(SMALL_BYTES, MAX_RATIO * packed):
         raise LumigraphError(
@@ -42,34 +46,69 @@ def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = 
 
 
 def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
-    """The same cloud, with ±20 for infinite logits of opacity and no rotation for quaternions of length zero.
+    """The same cloud, with infinite logits of opacity as ±20 and quaternions of length zero as the identity.
 
-    Raises LumigraphError, which begins with `subject` and ends with `way_out`, if other numbers are not finite.
+    Raises LumigraphError, which begins with `subject` and ends with `way_out`, for numbers that are not finite.
     """
+    check_harmonics(gaussians, subject)
+    faults = unsound(gaussians)
+    nowhere = faults.pop(NO_ROTATION)[:, None]
+    if bad := int(torch.stack(list(faults.values())).any(0).sum()):
+        raise LumigraphError(f"{subject} holds {bad} of {len(gaussians)} Gaussians with {listed(faults)}; {way_out}")
+    quaternions = torch.where(nowhere, gaussians.quaternions.new_tensor([1, 0, 0, 0]), gaussians.quaternions)
+    return replace(finite_logits(gaussians), quaternions=quaternions)
+
+
+def finite_logits(gaussians: Gaussians) -> Gaussians:
+    return replace(gaussians, opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT))
+
+
+def without_unsound(gaussians: Gaussians, path: Path) -> tuple[Gaussians, Bool[Tensor, " gaussian"] | None]:
+    """The cloud of a file without Gaussians that are none, of which it warns, and a mask of the others; None for all.
+
+    Raises LumigraphError where none is left.
+    """
+    check_harmonics(gaussians, str(path))
+    faults = unsound(gaussians)
+    good = ~torch.stack(list(faults.values())).any(0)
+    if not good.all():
+        text = f"{path} holds {int((~good).sum())} of {len(gaussians)} Gaussians with {listed(faults)}"
+        if not good.any():
+            raise LumigraphError(f"{text}, and no other; write it again")
+        warnings.warn(f"{text}; they are left out", LumigraphWarning, stacklevel=2)
+        gaussians = gaussians[good]
+    return finite_logits(gaussians), None if good.all() else good
+
+
+def check_harmonics(gaussians: Gaussians, subject: str) -> None:
     if (count := gaussians.harmonics.shape[1]) not in (1, 4, 9, 16):
         raise LumigraphError(f"{subject} has {count} harmonics per Gaussian; bring them to 1, 4, 9 or 16")
-    unsound = {what: ~getattr(gaussians, name).isfinite().flatten(1).all(-1) for name, what in DISPLAY_NAMES.items()}
-    unsound["opacities"] = gaussians.opacities.isnan()
-    faults = [f"{what}: {int(bad.sum())}" for what, bad in unsound.items() if bad.any()]
-    if faults:
-        count = int(torch.stack(list(unsound.values())).any(0).sum())
-        raise LumigraphError(
-            f"{subject} holds {count} of {len(gaussians)} Gaussians with numbers that are not finite "
-            f"({', '.join(faults)}); {way_out}"
-        )
-    nowhere = (gaussians.quaternions == 0).all(-1, keepdim=True)
-    return replace(
-        gaussians,
-        quaternions=torch.where(nowhere, gaussians.quaternions.new_tensor([1, 0, 0, 0]), gaussians.quaternions),
-        opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT),
+
+
+def unsound(gaussians: Gaussians) -> dict[str, Bool[Tensor, " gaussian"]]:
+    """Masks of the Gaussians that are none, by the fault."""
+    faults = {what: ~getattr(gaussians, name).isfinite().flatten(1).all(-1) for name, what in DISPLAY_NAMES.items()}
+    return faults | {
+        "opacities": gaussians.opacities.isnan(),
+        NO_ROTATION: (gaussians.quaternions == 0).all(-1),
+    }
+
+
+def listed(faults: dict[str, Bool[Tensor, " gaussian"]]) -> str:
+    """Faults and numbers of Gaussians as text: "no rotation (a half-written file?): 3"."""
+    counts = {what: int(bad.sum()) for what, bad in faults.items() if bad.any()}
+    none = counts.pop(NO_ROTATION, 0)
+    parts = (
+        [f"numbers that are not finite ({', '.join(f'{what}: {n}' for what, n in counts.items())})"] if counts else []
     )
+    return " and ".join(parts + ([f"{NO_ROTATION}: {none} (is the file half written?)"] if none else []))
 
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the earliest of the format, constant so that equal files have equal bytes
 
 
 class Bundle:
-    """Files by name, and the bytes that they take together. Raises LumigraphError for what is no archive."""
+    """Files of a folder or .zip by name, and their total size. Raises LumigraphError for an invalid archive."""
 
     def __init__(self, path: Path):
         self.path, self._archive = path, None
@@ -82,7 +121,7 @@ class Bundle:
             self._archive = zipfile.ZipFile(io.BytesIO(data))
 
     def read(self, name: str) -> bytes:
-        """A file at the top. Raises LumigraphError if it is not there, is damaged or unpacks beyond belief."""
+        """Read a top-level file. Raises LumigraphError if it is missing, damaged or unpacks to an implausible size."""
         if self._archive is None:
             file = self.path / name
             if Path(name).name != name or file.is_symlink() or not file.is_file():
@@ -100,7 +139,7 @@ class Bundle:
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
-    """An archive of files that are packed already, the same for the same files."""
+    """A deterministic archive of compressed files."""
     held = io.BytesIO()
     with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():

@@ -1,4 +1,4 @@
-"""Common parts of the formats of Gaussians: numbers in few bits, Morton's order, axes."""
+"""Common parts of the formats of Gaussians: quantisation, Morton order, axes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from ..gaussians import Gaussians
+from ..gaussians.cloud import as_precise_as_needed
 
 # One row for each Gaussian
 Vectors = Float[np.ndarray, "gaussian 3"]
@@ -46,21 +47,23 @@ def cloud(
     harmonics: Float[np.ndarray, "gaussian coefficient 3"],
     antialiased: bool = False,
 ) -> Gaussians:
-    """Gaussians of arrays, in float32 and in memory of their own."""
+    """Gaussians of arrays, in float32 and in memory of their own; centres of float64 as they need it."""
     named = {"means": means, "quaternions": quaternions, "log_scales": log_scales}
     named |= {"opacities": opacities, "harmonics": harmonics}
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are found by `checks.checked`
         tensors = {name: torch.from_numpy(np.array(x, np.float32, order="C")) for name, x in named.items()}
+        if means.dtype == np.float64:
+            tensors["means"] = as_precise_as_needed(torch.from_numpy(np.array(means)), tensors["log_scales"])
     return Gaussians(**tensors, antialiased=antialiased)
 
 
 def to_byte(x: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """The nearest of 0 to 255."""
+    """Round to the nearest of 0 to 255."""
     return np.clip(np.rint(x), 0, 255).astype(np.uint8)
 
 
 def alpha_to_byte(logits: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
-    """255 times the sigmoid, in a form that cannot overflow."""
+    """255 times the sigmoid, without overflow."""
     return to_byte(127.5 * (1 + np.tanh(logits / 2)))
 
 
@@ -71,7 +74,7 @@ def to_scales(log_scales: Vectors) -> Vectors:
 
 
 def from_scales(scales: Vectors) -> Vectors:
-    """Their logarithms: of 0 that of the least, and of negative ones none, which is found later."""
+    """Logarithms of scales: of 0 that of the smallest, and of negative ones NaN, which later checks report."""
     with np.errstate(invalid="ignore"):
         return np.log(np.where(scales == 0, MIN_SCALE, scales.astype(np.float64)))
 
@@ -91,7 +94,7 @@ def without_largest(quaternions: Quaternions) -> tuple[Integers, Vectors]:
 
 
 def with_largest(largest: Integers, rest: Vectors) -> Quaternions:
-    """The inverse: the length of 1 gives the fourth component."""
+    """Inverse of `without_largest`: the fourth component follows from unit length."""
     quaternions = np.empty((len(rest), 4))
     np.put_along_axis(quaternions, OTHERS[largest], rest, -1)
     missing = np.sqrt(np.maximum(0, 1 - (rest**2).sum(-1)))
@@ -113,11 +116,11 @@ def morton_order(points: Float[np.ndarray, "point 3"]) -> Int[np.ndarray, " poin
 
 
 def levels(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, " level"]:
-    """256 numbers in rising order, to which `values` are to be rounded; values of fewer kinds stay what they are.
+    """256 numbers in rising order for quantising `values`; up to 256 distinct values stay exact.
 
-    The best levels lie as densely as the cube root of the values' density (Panter and Dite 1951). Between neighbours a
-    gap apart, with c occurrences, that is c / gap, so (c / gap)^(1/3) gap of a level belongs there. They begin so, and
-    each then moves to the mean of what is nearest to it (Lloyd 1982).
+    Optimal levels have the density of the values to the power 1/3 (Panter and Dite 1951). Between neighbours at
+    distance `gap` with c occurrences that is (c / gap)^(1/3) gap of a level. So initialised, levels are refined by
+    k-means (Lloyd 1982).
     """
     values = np.sort(values.astype(np.float64), axis=None)
     kinds, counts = np.unique(values, return_counts=True)

@@ -1,14 +1,12 @@
 """PlayCanvas's compressed PLY, as SuperSplat and splat-transform write it: 16 bytes per Gaussian, and 0.3 of its chunk.
 
-https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply. Each 256 Gaussians make a chunk, which
-notes the least and the greatest position, scale and colour, and a Gaussian has its place between them in a few
-bits: positions and logarithms of scales in 11, 10 and 11 bits, colours in 8 each, so that half a step is 1/4094, 1/2046
-and 1/510 of the chunk's range. Opacities are within 1/510; components of a rotation other than the largest have 10 bits
-and are within 0.0007. Harmonics take 1 byte each, within 1/64 from -3.97 to 3.97, and 0 itself becomes 1/64. Scales are
-cut to exp(±20).
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply. 256 Gaussians make a chunk with bounds of
+position, scale and colour, between which each Gaussian is quantised: positions and logarithms of scales in 11, 10 and
+11 bits, colours in 8 each, so that half a step is 1/4094, 1/2046 and 1/510 of the chunk's range. Opacities are within
+1/510; components of a rotation other than the largest have 10 bits and are within 0.0007. Harmonics take 1 byte each,
+within 1/64 from -3.97 to 3.97, and 0 itself becomes 1/64. Scales are clamped to exp(±20).
 
-Chunks are small where neighbours are together, so the Gaussians are written along Morton's curve: the set of them
-is kept, and not their order.
+Gaussians are written in Morton order, which keeps the chunks' bounds small: the set is preserved, the order is not.
 """
 
 from __future__ import annotations
@@ -57,7 +55,7 @@ def recognises(header: Header) -> bool:
 
 
 def read(path: Path, header: Header | None = None) -> Gaussians:
-    """With or without harmonics, and colours of chunks. Raises LumigraphError where the parts do not fit together."""
+    """Read with or without harmonics, and colours of chunks. Raises LumigraphError for inconsistent parts."""
     header = header or read_header(path)
     colours_span = RANGES["colour"][0][0] in header.properties["chunk"]  # in older files they are plain
     spans = [*RANGES] if colours_span else ["mean", "scale"]
@@ -83,7 +81,7 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
     if rest:
         harmonics = np.concatenate([harmonics, _from_bytes(by_coefficient(columns(rows["sh"], rest)))], 1)
     return cloud(
-        _between(_unpack(position), *ends["mean"]),
+        _between(_unpack(position), *ends["mean"]).astype(np.float32),
         _from_smallest_three(rotation),
         _between(_unpack(scale), *ends["scale"]),
         LOGITS[parts[:, 3]],
@@ -129,7 +127,7 @@ def _between(share: Vectors, low: Vectors, high: Vectors) -> Vectors:
 
 
 def _pack(share: Vectors) -> Integers:
-    """Shares of [0, 1] in 11, 10 and 11 bits."""
+    """Pack numbers of [0, 1] in 11, 10 and 11 bits."""
     return (np.rint(share * STEPS).astype(np.int64) << SHIFTS).sum(-1)
 
 
@@ -138,7 +136,7 @@ def _unpack(code: Integers) -> Vectors:
 
 
 def _smallest_three(quaternions: Quaternions) -> Integers:
-    """2 bits name the largest of w, x, y, z; the others, within ±sqrt(1/2), have 10 bits each."""
+    """Pack quaternions: 2 bits name the largest of w, x, y, z; the others, within ±sqrt(1/2), have 10 bits each."""
     largest, rest = without_largest(quaternions)
     parts = np.rint(1023 * (rest * math.sqrt(0.5) + 0.5)).clip(0, 1023).astype(np.int64)
     return largest << 30 | (parts << np.array([20, 10, 0])).sum(-1)
@@ -150,6 +148,6 @@ def _from_smallest_three(code: Integers) -> Quaternions:
 
 
 def _from_bytes(codes: Float[np.ndarray, "gaussian rest 3"]) -> Float[np.ndarray, "gaussian rest 3"]:
-    """The middle of each of 256 steps, but the very ends for the outermost."""
+    """Values of bytes: the middle of each of 256 steps, but the ends of the range for the outermost."""
     shares = np.where(codes == 0, 0, np.where(codes == 255, 1, (codes + 0.5) / 256))
     return 2 * MAX_HARMONIC * (shares - 0.5)

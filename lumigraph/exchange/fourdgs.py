@@ -1,10 +1,10 @@
 """The open format .4dgs of clouds that move, version 1 (https://4dgs.dev/docs/spec): Gaussians with spans of time.
 
-Written is the model gaussian-birth with hard spans (profile box): Gaussians that stand still once, in one chunk; those
-that move once for each span of even motion, in chunks by CHUNK_LEVEL halvings of the time, ordered by Gaussian, so that
-what stays the same costs next to nothing. Numbers lie on grids, whose steps are twice the bounds that the file states:
-positions within POSITION_SHARE of the median size, scales 0.5 %, rotations 0.0005, colours and opacities 1/510,
-harmonics beyond the plain colour 4/255, cut to [-4, 4]. Plain colours are cut to [0, 1].
+Written is the model gaussian-birth with hard spans (profile box): static Gaussians once, in one chunk; moving ones once
+for each span of linear motion, in chunks by CHUNK_LEVEL halvings of the time, ordered by Gaussian, so that constant
+attributes compress to almost nothing. Numbers are quantised with steps of twice the error bounds in the file: positions
+within POSITION_SHARE of the median size, scales 0.5 %, rotations 0.0005, colours and opacities 1/510, harmonics beyond
+degree 0 4/255, clamped to [-4, 4]. Colours of degree 0 are clamped to [0, 1].
 Read is any file of that model with deflated streams; objects, sounds and cameras in it are left out.
 """
 
@@ -60,7 +60,7 @@ def is_moving_file(path: Path | str) -> bool:
 
 
 def write_moving(path: Path | str, moving: MovingGaussians) -> None:
-    """Write a moving cloud, whole or not at all. Raises LumigraphError where its numbers are not sound."""
+    """Write a moving cloud, atomically. Raises LumigraphError for numbers that are not finite."""
     path = expanded(path)
     checked(moving.cloud, f"what is to be written to {path}", "remove them first")
     with counting(f"Writing {path.name}"):
@@ -73,7 +73,7 @@ def to_bytes(moving: MovingGaussians) -> bytes:
     spans = np.stack([array(moving.begins), array(moving.ends)], 1).astype(np.float64)
     table, window = np.unique(spans, axis=0, return_inverse=True)
     bins[WINDOW] = window.reshape(-1, 1)
-    means, degree = array(moving.cloud.means), moving.cloud.degree
+    means, degree = moving.cloud.means.detach().cpu().double().numpy(), moving.cloud.degree
     box = [*means.min(0), *means.max(0)] if len(means) else [0.0] * 6
     data = bytearray(MAGIC)
     about = {"visibility_profile": "box", "color_space": "srgb", "producer": "lumigraph"}
@@ -95,9 +95,9 @@ def to_bytes(moving: MovingGaussians) -> bytes:
 
 
 def binned(moving: MovingGaussians) -> tuple[dict[int, Int[np.ndarray, "gaussian _"]], dict[str, float], list[float]]:
-    """Whole numbers of each attribute but the window; steps of the grids; origin of positions."""
+    """Quantised attributes except for the window; quantisation steps; origin of positions."""
     c = moving.cloud
-    means, scales = array(c.means).astype(np.float64), np.exp(array(c.log_scales).astype(np.float64))
+    means, scales = c.means.detach().cpu().double().numpy(), np.exp(array(c.log_scales).astype(np.float64))
     scales = scales.clip(MIN_SCALE, MAX_SCALE)
     size = float(np.median(scales.max(1))) if len(scales) else 1.0
     steps = {name: 2 * bound for name, bound in BOUNDS.items()} | {"pos": 2 * POSITION_SHARE * size}
@@ -134,7 +134,7 @@ def own_steps(
     steps: dict[str, float],
     cutoff: float,
 ) -> tuple[Float[np.ndarray, " gaussian"], Float[np.ndarray, " gaussian"]]:
-    """Steps of velocities and of middles, which depend on how long a Gaussian is there (section 6.3)."""
+    """Steps of velocities and of middles, which depend on each Gaussian's lifetime (section 6.3)."""
     deviation = np.exp(fade * steps["sigma_rel"])
     half = np.where(forever, life, math.sqrt(-2 * math.log(cutoff)) * deviation).clip(SHORTEST, LONGEST)
     velocity = steps["motion"] * 2.0 ** -np.ceil(np.log2(half / LIFE)).clip(*CLASSES)
@@ -145,8 +145,8 @@ def own_steps(
 def chunks(
     moving: MovingGaussians, spans: Float[np.ndarray, "gaussian 2"]
 ) -> Iterator[tuple[float, float, int, Int[np.ndarray, " some"]]]:
-    """Begin, end and level of each chunk, and its Gaussians in order. A chunk is the shortest part of the halved time,
-    down to CHUNK_LEVEL, that holds the span."""
+    """Begin, end and level of each chunk, and its Gaussians in order. A chunk is the shortest dyadic interval, down to
+    CHUNK_LEVEL, that contains the span."""
     duration, left = moving.duration, np.ones(len(spans), bool)
     found = []
     for level in reversed(range(CHUNK_LEVEL + 1)):
@@ -187,7 +187,7 @@ def _chunk(
 
 
 def stream(attribute: int, values: Int[np.ndarray, "element channel"]) -> bytes:
-    """An attribute stream (section 5.6), in the mode that takes the fewest bytes."""
+    """An attribute stream (section 5.6), in the smallest encoding."""
     count, channels = values.shape
     if (values == values[:1]).all():
         return _packed(attribute, CONSTANT, values[:1], count)
@@ -221,7 +221,7 @@ def pairs(values: dict[str, str]) -> bytes:
 
 
 def read_moving(path: Path | str) -> MovingGaussians:
-    """The moving cloud of a file. Raises LumigraphError for what it does not hold whole, and for other models."""
+    """Read the moving cloud of a file. Raises LumigraphError for a truncated file, and for other models."""
     path = expanded(path)
     if exists(path) and not path.is_file():
         raise LumigraphError(f"{path} is no ordinary file; name a file that ends in {SUFFIX}")
@@ -232,7 +232,7 @@ def read_moving(path: Path | str) -> MovingGaussians:
 
 
 class Cursor:
-    """Values of a record, one after another. Raises ValueError beyond its end."""
+    """Reader of a record's values, one after another. Raises ValueError beyond its end."""
 
     def __init__(self, data: memoryview):
         self.data, self.at = data, 0
@@ -308,7 +308,7 @@ def _header(path: Path, content: Cursor, size: int) -> dict[str, Any]:
 
 
 def _streams(path: Path, content: Cursor, room: int) -> dict[int, np.ndarray]:
-    """Whole numbers of each attribute of a chunk. room: Gaussians that the header still promises"""
+    """Whole numbers of each attribute of a chunk. room: remaining number of Gaussians that the header declares"""
     _, _, _, count = content.unpack("<ddII")
     if content.text():
         raise LumigraphError(f"{path} has chunks packed as a whole, which are not read; export it without")

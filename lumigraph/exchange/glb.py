@@ -3,10 +3,10 @@
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting. A primitive of points has
 an attribute for each quantity, float32: POSITION, ROTATION (x, y, z, w), SCALE (no logarithm), OPACITY (after the
 sigmoid) and SH_DEGREE_l_COEF_n. COLOR_0, in linear light, is for programs that draw points and lack the extension.
-glTF has y up and z back, so all is turned half around x.
+glTF has y up and z back, so all is rotated by 180 degrees around x.
 
-Nothing is rounded but by float32, so opacities beyond 1 - 2^-24 become 1. `antialiased`, for which the extension has no
-word, is in the primitive's extras. A Gaussian takes 64 + 12 (K - 1) bytes.
+The only loss is float32 rounding, so opacities beyond 1 - 2^-24 become 1. `antialiased`, which the extension lacks, is
+in the primitive's extras. A Gaussian takes 64 + 12 (K - 1) bytes.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -51,9 +52,9 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """All clouds of the scene as one, where their nodes place them; meshes beside them are passed over.
+    """Read all clouds of the scene as one, with their nodes' transforms; meshes are skipped.
 
-    Raises LumigraphError for extensions, kernels and colours that are not known, and for damaged files.
+    Raises LumigraphError for unknown extensions, kernels and colours, and for damaged files.
     """
     file = gltf.File(path)
     if unknown := sorted({*file.about.extensions_required} - KNOWN_EXTENSIONS):
@@ -75,7 +76,7 @@ def read(path: Path) -> Gaussians:
 
 
 def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
-    """Meshes of the scene, and where they are. Raises LumigraphError if nodes are no trees."""
+    """Meshes of the scene, and their transforms. Raises LumigraphError if nodes are no trees."""
     about = file.about
     if about.scenes:
         roots = file.one(about.scenes, about.scene, "scene").nodes
@@ -95,7 +96,7 @@ def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
 
 
 def node_matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
-    """From a node's frame to its parent's."""
+    """Transform from a node's frame to its parent's."""
     sizes = len(node.rotation), len(node.scale), len(node.translation), len(node.matrix or range(16))
     if sizes != (4, 3, 3, 16):
         raise LumigraphError(f"{file.path} has a node whose place is no place; export it again")
@@ -140,7 +141,7 @@ def _count(file: gltf.File, primitive: gltf.Primitive) -> int:
 
 
 def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[np.ndarray, "4 4"]) -> Gaussians:
-    """A primitive in this house's axes, with zeros for bands that only others have."""
+    """A primitive in this package's axes, with zeros for missing bands."""
     at, bands = primitive.attributes, _bands(file, primitive)
     harmonics = np.stack([file.numbers(at[name], (3,)) for name in HARMONICS[: bands**2]], 1)
     with np.errstate(divide="ignore"):  # 0 and 1 have logits that are infinite, and get others later
@@ -161,7 +162,7 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
             raise LumigraphError(f"{file.path} stretches or mirrors its Gaussians by a node; apply its place to them")
         found = found.transformed(place)
     return cloud(
-        array(found.means) * TURN_MEAN,
+        found.means.numpy() * TURN_MEAN,
         array(found.quaternions) * TURN_ROTATION,
         array(found.log_scales),
         array(found.opacities),
@@ -170,8 +171,11 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
     )
 
 
-def write(path: Path, gaussians: Gaussians) -> None:
-    """Raises LumigraphError for a cloud of none, for glTF has no arrays of nothing."""
+def write(path: Path, gaussians: Gaussians, offset: Float[np.ndarray, " 3"] | None = None) -> None:
+    """Write a GLB file. Raises LumigraphError for an empty cloud, since glTF has no empty arrays.
+
+    offset: of the node, which is added to the centres
+    """
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     harmonics = array(gaussians.harmonics)
@@ -195,12 +199,15 @@ def write(path: Path, gaussians: Gaussians) -> None:
     }
     if gaussians.antialiased:
         primitive["extras"] = {ANTIALIASED: True}
+    node: dict[str, Any] = {"mesh": 0}
+    if offset is not None:
+        node["translation"] = (offset * TURN_MEAN).tolist()
     about = {
         "asset": {"version": "2.0", "generator": "Lumigraph"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
     }
     write_bytes(path, gltf.encoded(about, [*columns.values()]), "splats")

@@ -72,7 +72,7 @@ class GltfMesh(msgspec.Struct, rename="camel"):
 
 
 class Node(msgspec.Struct, rename="camel"):
-    """A place in the scene: a matrix, or a scale, a rotation (x, y, z, w) and a translation, in this order."""
+    """A node's transform: a matrix, or a scale, a rotation (x, y, z, w) and a translation, in this order."""
 
     name: str = ""
     mesh: Index | None = None
@@ -92,7 +92,7 @@ class Skin(msgspec.Struct, rename="camel"):
 
 
 class Target(msgspec.Struct, rename="camel"):
-    """Node, and its property, that a channel moves."""
+    """Target of a channel: a node and its property."""
 
     path: str
     node: Index | None = None
@@ -104,7 +104,7 @@ class Channel(msgspec.Struct, rename="camel"):
 
 
 class KeyframeSampler(msgspec.Struct, rename="camel"):
-    """Keyframes: accessors of their moments and of their values."""
+    """Keyframes: accessors of their times and of their values."""
 
     input: Index
     output: Index
@@ -168,10 +168,10 @@ class About(msgspec.Struct, rename="camel"):
 
 @dataclass(frozen=True)
 class Column:
-    """Numbers to be written, [row] or [row, component].
+    """Array to write, [row] or [row, component].
 
-    normalised: whether whole numbers stand for [0, 1] or [-1, 1]
-    bounded:    whether the least and the greatest are fields, as positions need
+    normalised: whether integers represent [0, 1] or [-1, 1]
+    bounded:    whether to write minimum and maximum, as positions need
     """
 
     numbers: np.ndarray
@@ -181,8 +181,8 @@ class Column:
 
 
 def encoded(about: dict[str, Any], columns: list[Column], pictures: Sequence[tuple[str, bytes]] = ()) -> bytes:
-    """A .glb file: `about`, an accessor for each column and an image for each picture, in their order. Each begins at a
-    multiple of 4 bytes.
+    """A .glb file: `about`, an accessor for each column and an image for each picture, in their order, aligned to 4
+                 bytes.
 
     pictures: media type and file of each
     """
@@ -217,9 +217,9 @@ def _accessor(view: int, column: Column) -> dict[str, Any]:
 
 
 class File:
-    """A .glb file that was opened: `about` it, and the numbers of its accessors.
+    """An opened .glb file: its JSON `about`, and the numbers of its accessors.
 
-    Raises LumigraphError if it is none, is cut, or leads to other files.
+    Raises LumigraphError for an invalid or truncated file, and for references to other files.
     """
 
     about: About
@@ -251,7 +251,7 @@ class File:
         return self.one(self.about.accessors, index, "accessor")
 
     def one(self, things: list[Any], index: int, what: str) -> Any:
-        """The thing of a number. Raises LumigraphError if there is none."""
+        """Item by index. Raises LumigraphError if there is none."""
         if index >= len(things):
             raise LumigraphError(f"{self.path} names {what} {index}, and has {len(things)}; export it again")
         return things[index]
@@ -288,7 +288,7 @@ class File:
         return found
 
     def picture(self, index: int) -> bytes:
-        """Bytes of an image in the file. Raises LumigraphError if it lies in another one."""
+        """Bytes of an embedded image. Raises LumigraphError for an external one."""
         image = self.one(self.about.images, index, "image")
         if image.buffer_view is None:
             raise LumigraphError(f"{self.path} leads to other files for its pictures; export it as one .glb")

@@ -1,19 +1,21 @@
-"""The layout in which the first release of 3-D Gaussian splatting wrote its clouds (Kerbl 2023), known to all programs.
+"""The original PLY layout of 3-D Gaussian splatting (Kerbl 2023), which all programs read.
 
 One row of float32 per Gaussian: x y z, an unused normal (zeros), f_dc_0..2, f_rest_* with all of red's
-coefficients before green's and blue's, opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Nothing is
-lost. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. Two comments state that it is antialiased (ANTIALIASED).
+coefficients before green's and blue's, opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). It is
+lossless. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. Two comments state that it is antialiased (ANTIALIASED).
 """
 
 from __future__ import annotations
 
+import math
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files.ply import Header, columns, read_header, read_rows, write_rows
 from ..gaussians import Gaussians
 from .checks import check_room
@@ -35,14 +37,23 @@ NORMAL = ["nx", "ny", "nz"]
 COLOUR = ["f_dc_0", "f_dc_1", "f_dc_2"]
 OPACITY = ["opacity"]
 SCALE = ["scale_0", "scale_1", "scale_2"]
+FLAT, FLATNESS = "scale_2", 0.01  # the axis that 2DGS (Huang 2024) has none of; its share of the smaller other one
+FILTER = "filter_3D"  # of Mip-Splatting
+MOTION = re.compile(r"trbf_(center|scale)|motion_\d+|omega_\d+")  # of Spacetime Gaussians
+KNOWN_ELEMENTS = ("face", "chunk", "sh")
 ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
 
 
-def read(path: Path, header: Header | None = None) -> Gaussians:
-    """Text and both binary orders, and any plain types. Raises LumigraphError if it holds points, or too little."""
+def read(path: Path, header: Header | None = None, moving: bool = False) -> Gaussians:
+    """Text and both binary orders, and any plain types. Raises LumigraphError if it holds points, or too little.
+
+    moving: whether the caller reads the motion of Spacetime Gaussians, which is refused otherwise
+    """
     header = header or read_header(path)
     here = header.properties.get("vertex", [])
-    missing = [name for name in [*MEAN, *COLOUR, *OPACITY, *SCALE, *ROTATION] if name not in here]
+    flat = FLAT not in here and {*SCALE} - {FLAT} <= {*here}
+    scales = SCALE[:2] if flat else SCALE
+    missing = [name for name in [*MEAN, *COLOUR, *OPACITY, *scales, *ROTATION] if name not in here]
     if not {*COLOUR, *OPACITY, *SCALE, *ROTATION} & {*here}:
         raise LumigraphError(
             f"{path} holds {header.counts.get('vertex', 0)} points and no Gaussians, for it has neither scales nor "
@@ -50,24 +61,61 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
         )
     if missing:
         raise LumigraphError(f"{path} lacks {', '.join(missing)} and so is no cloud of Gaussians; export it again")
+    if not moving and any(MOTION.match(name) for name in here):
+        raise LumigraphError(
+            f"{path} holds Gaussians that move; make a file of all moments of it (lumigraph export splats {path} "
+            "moving.4dgs), or of one (--set time=0.5 and another ending)"
+        )
     rest = rest_names(path, here)
+    told(path, header, here, flat)
     check_room(path, header.counts["vertex"], 1 + len(rest) // 3)
     rows = read_rows(path, ["vertex"], header)["vertex"]
+    doubles = all(rows.dtype[name].itemsize == 8 for name in MEAN)
+    log_scales, logits = columns(rows, scales), columns(rows, OPACITY)[:, 0]
+    if flat:
+        log_scales = np.concatenate([log_scales, log_scales.min(1, keepdims=True) + np.float32(math.log(FLATNESS))], 1)
+    if FILTER in here:
+        log_scales, logits = with_filter(log_scales, logits, columns(rows, [FILTER]))
     return cloud(
-        columns(rows, MEAN),
+        columns(rows, MEAN, np.float64 if doubles else np.float32),
         columns(rows, ROTATION),
-        columns(rows, SCALE),
-        columns(rows, OPACITY)[:, 0],
+        log_scales,
+        logits,
         np.concatenate([columns(rows, COLOUR)[:, None], by_coefficient(columns(rows, rest))], 1),
         is_antialiased(header),
     )
+
+
+def told(path: Path, header: Header, here: list[str], flat: bool) -> None:
+    """Warn of what a file's properties mean beside those of the first release, and of those that are not used."""
+    known = {*MEAN, *NORMAL, *COLOUR, *OPACITY, *SCALE, *ROTATION, FILTER}
+    unused = [x for x in here if x not in known and not x.startswith("f_rest_") and not MOTION.match(x)]
+    found = [f"passed over: {', '.join(unused)}"] if unused else []
+    found += [f"Gaussians without {FLAT} are flat, as 2DGS has them; they get a thin third axis"] if flat else []
+    if others := [name for name in header.elements if name not in ("vertex", *KNOWN_ELEMENTS)]:
+        found.append(f"elements passed over: {', '.join(others)}")
+    for text in found:
+        warnings.warn(f"{path}: {text}", LumigraphWarning, stacklevel=3)
+
+
+def with_filter(
+    log_scales: Float[np.ndarray, "gaussian 3"], logits: Float[np.ndarray, " gaussian"], size: np.ndarray
+) -> tuple[Float[np.ndarray, "gaussian 3"], Float[np.ndarray, " gaussian"]]:
+    """Scales and opacities with the 3-D smoothing filter of Mip-Splatting (Yu 2024, equation 7): variances add, and the
+    opacity falls by the root of the ratio of determinants."""
+    variances = np.exp(2 * log_scales.astype(np.float64))
+    wider = variances + np.square(size.astype(np.float64))
+    share = np.sqrt((variances / wider).prod(1))
+    with np.errstate(divide="ignore"):
+        alpha = share / (1 + np.exp(-logits.astype(np.float64)))
+        return 0.5 * np.log(wider), np.log(alpha) - np.log1p(-alpha)
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
     rest = by_channel(array(gaussians.harmonics[:, 1:]))
     names = [*MEAN, *NORMAL, *COLOUR, *(f"f_rest_{i}" for i in range(rest.shape[1])), *OPACITY, *SCALE, *ROTATION]
     parts = [
-        array(gaussians.means),
+        gaussians.means.detach().cpu().numpy(),
         np.zeros((len(gaussians), 3), np.float32),
         array(gaussians.harmonics[:, 0]),
         rest,
@@ -75,7 +123,10 @@ def write(path: Path, gaussians: Gaussians) -> None:
         array(gaussians.log_scales),
         array(gaussians.quaternions),
     ]
-    rows = np.concatenate(parts, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
+    values = [column for part in parts for column in part.T]
+    rows = np.empty(len(gaussians), [(name, x.dtype.newbyteorder("<")) for name, x in zip(names, values, strict=True)])
+    for name, column in zip(names, values, strict=True):
+        rows[name] = column
     save(path, {"vertex": rows}, gaussians.antialiased)
 
 
@@ -84,7 +135,7 @@ def save(path: Path, elements: dict[str, np.ndarray], antialiased: bool) -> None
 
 
 def rest_names(path: Path, properties: list[str]) -> list[str]:
-    """f_rest_0, f_rest_1, ... as far as they go. Raises LumigraphError if that is no whole degree from 0 to 3."""
+    """f_rest_0, f_rest_1, ..., all in the file. Raises LumigraphError unless they make a whole degree from 0 to 3."""
     count = sum(name.startswith("f_rest_") for name in properties)
     names = [f"f_rest_{i}" for i in range(count)]
     if count not in (0, 9, 24, 45) or not {*names} <= {*properties}:
@@ -96,7 +147,7 @@ def rest_names(path: Path, properties: list[str]) -> list[str]:
 
 
 def by_channel(rest: Float[np.ndarray, "gaussian coefficient 3"]) -> Float[np.ndarray, "gaussian rest"]:
-    """All of red's coefficients, then green's, then blue's."""
+    """Coefficients ordered by channel: all of red's, then green's, then blue's."""
     return rest.transpose(0, 2, 1).reshape(len(rest), rest.shape[1] * 3)
 
 

@@ -1,6 +1,6 @@
 """Skinned characters as glTF, one .glb file: a mesh, the bones that move it, their animations (sections 3.7.3, 3.11).
 
-Vertices and bones are turned to +z up and placed as the root joint is at the first moment of the first animation. A
+Vertices and bones are converted to +z up and placed by the root joint's pose at the start of the first animation. A
 skeleton here is rigid, so bones whose scale is animated are refused.
 """
 
@@ -43,12 +43,12 @@ class AnimationClip:
 
 @dataclass(frozen=True)
 class SkinnedCharacter:
-    """A character that bones move.
+    """A skinned character.
 
     vertices: at rest
-    weights:  of bones in the motion of each vertex; they sum to 1
+    weights:  skinning weights of each vertex; they sum to 1
     colours:  of the triangles, sRGB-encoded
-    skeleton: with the pose at rest alone
+    skeleton: with the rest pose alone
     clips:    animations
     """
 
@@ -61,7 +61,7 @@ class SkinnedCharacter:
     nodes: _Nodes
 
     def pose(self, clip: int, seconds: float) -> Float[np.ndarray, "bone 3 4"]:
-        """Joints at a moment of an animation, which repeats; at rest without one."""
+        """Joints at a time of an animation, which repeats; the rest pose without one."""
         if not self.clips:
             return self.skeleton.rest.matrices.numpy()
         chosen = self.clips[clip]
@@ -159,7 +159,7 @@ def read_character(path: Path) -> SkinnedCharacter:
 
 
 def tree(file: gltf.File, joints: list[int]) -> tuple[list[int], tuple[int, ...]]:
-    """Joints sorted from the root on, as numbers in the skin, and the number of each one's parent among the sorted."""
+    """Joints sorted from the root on, as numbers in the skin, and each one's parent in this order."""
     above = {child: number for number, node in enumerate(file.about.nodes) for child in node.children}
     for joint in joints:
         file.one(file.about.nodes, joint, "node")
@@ -177,7 +177,7 @@ def tree(file: gltf.File, joints: list[int]) -> tuple[list[int], tuple[int, ...]
 
 
 def mesh_of(file: gltf.File, mesh: int, place: Int[np.ndarray, " bone"]) -> tuple[np.ndarray, ...]:
-    """Vertices, faces, weights and colours of faces of all triangles of a mesh. place: of each joint among the bones"""
+    """Vertices, faces, weights and colours of faces of all triangles of a mesh. place: bone number of each joint"""
     vertices, faces, weights, colours, begin = [], [], [], [], 0
     for primitive in file.one(file.about.meshes, mesh, "mesh").primitives:
         if primitive.mode != TRIANGLES or (lacking := [x for x in LISTED if x not in primitive.attributes]):
@@ -224,7 +224,7 @@ def colours_of(file: gltf.File, primitive: gltf.Primitive, corners: Int[np.ndarr
 
 
 def clip_of(file: gltf.File, animation: gltf.Animation) -> AnimationClip:
-    """Keyframes of an animation's nodes; of cubic splines the values at keyframes alone."""
+    """Keyframes of an animation's nodes; of cubic splines only the values at keyframes."""
     keys = {}
     for channel in animation.channels:
         node, path = channel.target.node, channel.target.path
@@ -248,7 +248,7 @@ def sampled(
     seconds: float,
     rotation: bool,
 ) -> Float[np.ndarray, " _"]:
-    """Value at a moment between keyframes: evenly, for rotations along the great circle (appendix C)."""
+    """Interpolated value at a time between keyframes: linear, for rotations spherical (appendix C)."""
     after = int(np.searchsorted(moments, seconds, side="right").clip(1, max(len(moments) - 1, 1)))
     if len(moments) == 1:
         return values[0].astype(float)
@@ -275,7 +275,7 @@ def rigid(matrices: Float[np.ndarray, "bone 4 4"]) -> Float[np.ndarray, "bone 3 
 def check_scales(
     path: Path, nodes: _Nodes, clips: tuple[AnimationClip, ...], bind: Float[np.ndarray, "bone 4 4"]
 ) -> None:
-    """Raise LumigraphError where an animation scales bones, or by different amounts along their axes."""
+    """Raise LumigraphError for animated and for anisotropic scales of bones."""
     for clip in clips or (None,):
         for seconds in np.linspace(0, clip.seconds if clip else 0.0, 4):
             sizes = np.linalg.svd((nodes.worlds(clip, seconds) @ bind)[:, :3, :3], compute_uv=False)
@@ -284,7 +284,7 @@ def check_scales(
 
 
 def unique(names: list[str]) -> tuple[str, ...]:
-    """The names, later ones of the same name numbered."""
+    """The names, duplicates numbered."""
     seen: dict[str, int] = {}
     found = []
     for name in names:
@@ -294,7 +294,7 @@ def unique(names: list[str]) -> tuple[str, ...]:
 
 
 def subdivided(character: SkinnedCharacter, least: int) -> SkinnedCharacter:
-    """The character with triangles cut into four until there are so many; colours stay those of the whole ones."""
+    """The character with triangles subdivided into four until there are at least so many; colours are inherited."""
     while len(character.faces) < least:
         character = _cut(character)
     return character

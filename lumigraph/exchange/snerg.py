@@ -1,17 +1,17 @@
-"""The folder that SNeRG's viewer opens: scene_params.json, slices of the atlas as PNG, and where its blocks are.
+"""Folder of SNeRG's viewer: scene_params.json, slices of the atlas as PNG, and the positions of its blocks.
 
-https://github.com/google-research/google-research/tree/master/snerg. Four layers of the atlas lie in a picture, one
-below another: rgba_000.png holds colours and alpha, feature_000.png the features. atlas_indices.png has the place in
+https://github.com/google-research/google-research/tree/master/snerg. Four layers of the atlas are in a picture, one
+below another: rgba_000.png has colours and alpha, feature_000.png the features. atlas_indices.png has the position in
 the atlas of each block of the grid, 255 for empty ones. Without a network there are neither features nor weights.
 
-An open capture's atlas lies in contracted coordinates, which the format does not have: "contracted" in
+An open capture's atlas is in contracted coordinates, which the format does not have: "contracted" in
 scene_params.json is our extension, and other viewers show such an atlas distorted.
 
-The viewer's world has +y up, so x, y, z of the scene are -x, z, y there, and worldspace_T_opengl leads back.
+The viewer's world has +y up, so x, y, z of the scene are -x, z, y there; worldspace_T_opengl is the inverse.
 
-Pixels differ in one point: the viewer adds the network's output wherever a ray met anything, before white, and its
-input is the colours with that white behind; ours adds it by opacity, and its input is the colours alone. They agree
-where a ray ends at something, which is all but the outermost pixels of an object.
+Pixels differ in one point: the viewer adds the network's output wherever a ray met anything, before compositing over
+white, and its input is the colours over that white; ours adds it by opacity, and its input is the premultiplied
+colours. They agree on opaque pixels, which are all but an object's outermost.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Params:
     bias_2: Bias | None = None
 
     def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other, and for what is not read."""
+        """Raise LumigraphError for inconsistent or unsupported numbers."""
         side = self.block_size + 2
         sizes = self.atlas_width, self.atlas_height, self.atlas_depth
         if sizes != tuple(side * n for n in self.atlas_blocks) or LAYERS * self.num_slices != self.atlas_depth:
@@ -123,7 +123,7 @@ class Params:
 
     @property
     def network(self) -> ViewNetwork | None:
-        """Raises LumigraphError for layers that do not fit."""
+        """Network of the parameters. Raises LumigraphError for layers that do not fit."""
         if self.bias_0 is None:
             return None
         layers = (self.weights_0, self.bias_0), (self.weights_1, self.bias_1), (self.weights_2, self.bias_2)
@@ -147,8 +147,8 @@ def recognises(folder: Path) -> bool:
 
 
 def write(folder: Path, atlas: Atlas) -> None:
-    """Write an atlas as such a folder, whole or not at all. Raises LumigraphError where it has more blocks than the
-    format counts, and as `files.claim_folder` does."""
+    """Write an atlas as a SNeRG folder, atomically. Raises LumigraphError for more blocks than the format allows, and
+    as `files.claim_folder` does."""
     claim_folder(folder, "atlas")
     atlas = turned(atlas, np.array(AXES)[:3, :3])
     side = atlas.block + 2
@@ -173,7 +173,7 @@ def write(folder: Path, atlas: Atlas) -> None:
 def arranged(
     values: UInt8[np.ndarray, "block side side side 8"],
 ) -> tuple[UInt8[np.ndarray, "depth height width 8"], tuple[int, int, int]]:
-    """Blocks side by side in about a cube, whole pictures of layers high; and how many there are along x, y, z."""
+    """Blocks arranged in about a cube, padded to whole pictures of layers; and their number along x, y, z."""
     count, side = values.shape[:2]
     x = max(1, math.ceil(count ** (1 / 3) - 1e-9))
     y = max(1, math.ceil(math.sqrt(count / x) - 1e-9))
@@ -194,7 +194,7 @@ def indices(index: np.ndarray, blocks: tuple[int, int, int]) -> UInt8[np.ndarray
 
 
 def params(atlas: Atlas, blocks: tuple[int, int, int]) -> dict[str, Any]:
-    """scene_params.json of an atlas that is turned already."""
+    """scene_params.json of an atlas in the viewer's axes."""
     side = atlas.block + 2
     fields: dict[str, Any] = {"voxel_size": atlas.voxel, "block_size": atlas.block}
     names = "width", "height", "depth"
@@ -218,8 +218,8 @@ def params(atlas: Atlas, blocks: tuple[int, int, int]) -> dict[str, Any]:
 
 @reads("is damaged", "copy the whole folder again")
 def read(folder: Path) -> Atlas:
-    """The atlas that such a folder holds, its axes those of the scene. Raises LumigraphError, in one sentence, where a
-    slice is missing, cut or of another size, and for numbers that contradict each other."""
+    """Read the atlas of a SNeRG folder, in the scene's axes. Raises LumigraphError, in one sentence, for a slice that
+    is missing, truncated or of another size, and for inconsistent numbers."""
     bundle = Bundle(folder)
     fields = from_json(bundle.read(META), f"{META} of {folder}")
     if isinstance(fields, dict):
@@ -262,7 +262,7 @@ def read(folder: Path) -> Atlas:
 
 
 def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
-    """Each block's number in the atlas, -1 where nothing is."""
+    """Each block's number in the atlas, -1 for empty ones."""
     gx, gy, gz = about.grid_blocks
     places = picture(bundle, INDICES, (gx, gz * gy), "RGB").reshape(gz, gy, gx, 3)
     places = places.transpose(2, 1, 0, 3).astype(np.int64)
@@ -274,7 +274,7 @@ def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
 
 
 def picture(bundle: Bundle, name: str, size: tuple[int, int], mode: str) -> UInt8[np.ndarray, "row column channel"]:
-    """Pixels of a PNG of a size. Raises LumigraphError where it is missing, cut, or something else."""
+    """Pixels of a PNG of a size. Raises LumigraphError if it is missing, truncated, or of another format."""
     data = bundle.read(name)
     remedy = "copy the whole folder again"
     with (
@@ -290,8 +290,8 @@ def picture(bundle: Bundle, name: str, size: tuple[int, int], mode: str) -> UInt
 
 
 def turned(atlas: Atlas, turn: np.ndarray) -> Atlas:
-    """An atlas whose place x is at `turn` x: axes change places, and those that point the other way are flipped. What
-    depends on direction stays as it was, for the scene's own directions."""
+    """An atlas with its axes permuted and flipped: position x moves to `turn` x. View dependence is not rotated; it
+    stays in the scene's directions."""
     axes = np.abs(turn).argmax(1).tolist()  # which axis of before each new one is
     flipped = [axis for axis in range(3) if turn[axis].sum() < 0]
     index, values = atlas.index.permute(axes), atlas.values.permute(0, *(1 + axis for axis in axes), 4)

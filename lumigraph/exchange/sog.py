@@ -2,16 +2,15 @@
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. One .sog file (a .zip archive), or a folder
 with the same files. Version 2 is written; 1, which had ranges where 2 has codebooks, is read too. Pixels of the same
-place belong to the same Gaussian; the pictures are lossless WebP.
+position belong to the same Gaussian; the pictures are lossless WebP.
 
-What is lost: each axis of log(1 + |x|), with the sign of x, has 16 bits between its ends, so positions are within
-(1 + |x|) / 131070 of that range. Logarithms of scales, and plain colours, are the nearest of 256 levels that suit the
-cloud (`levels`). Components of a rotation other than the largest are within 0.0028, opacities within 1/510. Harmonics
-beyond the plain colour are one of at most 65536 palette entries, found by k-means, whose numbers are of 256 levels:
-what they lose depends on the cloud; up to 1024 Gaussians each has an entry of its own.
+Losses: each axis of sign(x) log(1 + |x|) has 16 bits between its bounds, so positions are within
+(1 + |x|) / 131070 of that range. Logarithms of scales, and colours of degree 0, are quantised to 256 levels fitted to
+the cloud (`levels`). Components of a rotation other than the largest are within 0.0028, opacities within 1/510.
+Harmonics beyond degree 0 are vector-quantised to at most 65536 palette entries, found by k-means, with numbers of 256
+levels: their loss depends on the cloud; up to 1024 Gaussians each has an entry of its own.
 
-Gaussians are written along Morton's curve, for neighbours are alike and pack well: the set of them is kept, and not
-their order.
+Gaussians are written in Morton order, since similar neighbours compress well: the set is preserved, the order is not.
 """
 
 from __future__ import annotations
@@ -70,7 +69,7 @@ Two = tuple[Name, Name]
 
 @dataclass(frozen=True)
 class QuantizedMeans:
-    """Ends of log(1 + |x|), with the sign of x, and the pictures of low and high bytes."""
+    """Bounds of sign(x) log(1 + |x|), and the pictures of low and high bytes."""
 
     mins: Ends
     maxs: Ends
@@ -90,7 +89,7 @@ class CodebookImage:
 
 @dataclass(frozen=True)
 class Palette:
-    """Harmonics beyond the plain colour: the pictures of entries and of labels."""
+    """Harmonics beyond degree 0: the pictures of entries and of labels."""
 
     count: Annotated[int, between(1, MAX_ENTRIES)]
     bands: Annotated[int, between(1, 3)]
@@ -126,7 +125,7 @@ class OldScales:
 
 @dataclass(frozen=True)
 class OldColours:
-    """Ends of plain colours and of the logit of opacity."""
+    """Bounds of colours of degree 0 and of the logit of opacity."""
 
     mins: FourEnds
     maxs: FourEnds
@@ -152,7 +151,7 @@ class OldMeta:
 
 
 def recognises(folder: Path) -> bool:
-    """True if a folder has a meta.json with pictures of means; a run's folder has none."""
+    """True if a folder has a meta.json with pictures of means; False for a run's folder."""
     try:
         return b'"means"' in read_bytes(folder / META)
     except LumigraphError:
@@ -160,7 +159,9 @@ def recognises(folder: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """A .sog file or a folder. Raises LumigraphError where pictures are missing, cut, too small or too large."""
+    """Read a .sog file or a folder. Raises LumigraphError for pictures that are missing, truncated, too small or too
+    large.
+    """
     bundle = Bundle(path)
     fields = from_json(bundle.read(META), f"{META} of {path}")
     version = fields.get("version", 1) if isinstance(fields, dict) else None
@@ -191,7 +192,7 @@ def _read(bundle: Bundle, fields: Any) -> Gaussians:
 
 
 def _read_old(bundle: Bundle, fields: Any) -> Gaussians:
-    """Version 1, where a byte is a share of a range, and opacities are logits."""
+    """Read version 1, whose bytes are linear between bounds, and whose opacities are logits."""
     meta = typed(OldMeta, fields, f"{META} of {bundle.path}")
     count, palette = meta.means.shape[0] if meta.means.shape else 0, meta.shN
     pictures = _Pictures(bundle, count, 16 if palette else 1)
@@ -214,7 +215,7 @@ def _between(codes: UInt8[np.ndarray, "*shape"], low: Any, high: Any) -> Float[n
 
 
 class _Pictures:
-    """Pixels of a bundle for `count` Gaussians. What they take is held against what the bundle has, and memory."""
+    """Pixels of a bundle for `count` Gaussians, checked against the bundle's bytes and memory."""
 
     def __init__(self, bundle: Bundle, count: int, harmonics: int):
         if not count:
@@ -227,7 +228,7 @@ class _Pictures:
         return self.whole(name, self.count).reshape(-1, 4)[: self.count]
 
     def whole(self, name: str, least: int) -> UInt8[np.ndarray, "row column 4"]:
-        """A picture of at least so many pixels. Raises LumigraphError if it is none, or smaller, or absurdly large."""
+        """A picture of at least so many pixels. Raises LumigraphError if it is invalid, smaller, or too large."""
         path, data = self.bundle.path, self.bundle.read(name)
         with (
             reading(f"{path}: {shown(name)}", "cannot be read as a picture", "get it again"),
@@ -257,7 +258,7 @@ class _Pictures:
     def palette(
         self, files: tuple[str, str], count: int | None = None, width: int | None = None
     ) -> tuple[UInt8[np.ndarray, "entry coefficient 3"], np.ndarray]:
-        """Codes of each entry, and the entry of each Gaussian. count, width: of entries; None for what there is."""
+        """Codes of each entry, and the entry of each Gaussian. count, width: of entries; None for those in the file"""
         image, pixels = self.whole(files[0], 1), self.of(files[1]).astype(np.int64)
         labels = pixels[:, 1] << 8 | pixels[:, 0]
         widths = [PALETTE_ROW * coefficients for coefficients in ([width] if width else WIDTHS)]
@@ -271,7 +272,7 @@ class _Pictures:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """A .sog file, or the folder that a path to meta.json lies in. Raises LumigraphError for a cloud of none."""
+    """Write a .sog file, or the folder of a path to meta.json. Raises LumigraphError for an empty cloud."""
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     files = encode(gaussians)
@@ -291,7 +292,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
     count, files = len(gaussians), dict[str, bytes]()
 
     def picture(name: str, *channels: np.ndarray, width: int = 4 * math.ceil(math.sqrt(count) / 4)) -> str:
-        """Note a lossless WebP of pixels in a multiple of four rows; other values are 255."""
+        """Add a lossless WebP of pixels, padded with 255 to a multiple of four rows."""
         pixels = np.concatenate([part.reshape(len(part), -1) for part in channels], 1)
         rgba = np.full((4 * math.ceil(len(pixels) / width / 4) * width, 4), 255, np.uint8)
         rgba[: len(pixels), : pixels.shape[1]] = pixels
@@ -347,7 +348,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
 
 
 def _palette(harmonics: Float[np.ndarray, "gaussian rest"]) -> tuple[Float[np.ndarray, "entry rest"], np.ndarray]:
-    """Entries, and which of them each Gaussian has: all that there are if they are few, else of k-means."""
+    """Palette entries, and the entry of each Gaussian: the harmonics themselves if few, else by k-means."""
     size = max(MIN_ENTRIES, min(MAX_ENTRIES, 2 ** int(math.log2(max(len(harmonics) / GAUSSIANS_PER_ENTRY, 1)))))
     kinds, labels = np.unique(harmonics, axis=0, return_inverse=True)
     if len(kinds) <= size:

@@ -1,10 +1,10 @@
-"""The format of the first viewer in a browser, https://github.com/antimatter15/splat: no header, 32 bytes per Gaussian.
+"""Format of the first browser viewer, https://github.com/antimatter15/splat: no header, 32 bytes per Gaussian.
 
 Three float32 of position and three of scale (no logarithms), red, green, blue and opacity as bytes, and w, x, y, z of
 the rotation as bytes round(128 q + 128). Positions and scales are exact, colours and opacities within 1/510 where they
-lie in [0, 1], each component of a rotation within 1/128. Harmonics beyond the plain colour have no place, nor has
-`antialiased`. The order stays: the viewer's own converter puts the most visible Gaussians first, so that they load
-first, but all viewers sort by depth anyway.
+lie in [0, 1], each component of a rotation within 1/128. Harmonics beyond degree 0 and `antialiased` are lost. The
+order is preserved: the viewer's own converter puts the most visible Gaussians first, so that they load first, but all
+viewers sort by depth anyway.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ RECORD = np.dtype(FIELDS)
 
 
 def read(path: Path) -> Gaussians:
-    """Raises LumigraphError for what is no whole number of records, and for text. A cut between two goes unnoticed."""
+    """Read a .splat file. Raises LumigraphError for a partial last record, and for text. A file truncated between
+    records goes unnoticed.
+    """
     check_room(path, path.stat().st_size // RECORD.itemsize)
     data = path.read_bytes()
     if not data[:1024].strip(string.printable.encode()):
@@ -47,7 +49,7 @@ def read(path: Path) -> Gaussians:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Raises LumigraphError for a cloud of none, whose file would be empty."""
+    """Write a .splat file. Raises LumigraphError for an empty cloud, whose file would be empty."""
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     records = np.empty(len(gaussians), RECORD)

@@ -62,7 +62,7 @@ ZSTD_LEVEL = 12
 
 
 def read(path: Path) -> Gaussians:
-    """Versions 1 to 4. Extensions are passed over. Raises LumigraphError for others and for damaged files."""
+    """Read versions 1 to 4. Extensions are skipped. Raises LumigraphError for others and for damaged files."""
     data = path.read_bytes()
     stream: io.BufferedIOBase
     if data[:8] == MAGIC + struct.pack("<I", NEWEST_VERSION):
@@ -77,7 +77,7 @@ def read(path: Path) -> Gaussians:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Version 4. Raises LumigraphError if the cloud is too wide for 24 bits."""
+    """Write version 4. Raises LumigraphError if the cloud is too wide for 24 bits."""
     (bits, flags), streams = _streams(gaussians, str(path), HARMONICS_STEPS)
     raw = [stream.tobytes() for stream in streams if stream.shape[1]]
     packed = [zstandard.ZstdCompressor(ZSTD_LEVEL).compress(stream) for stream in raw]
@@ -87,7 +87,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
 
 
 def gzipped(gaussians: Gaussians, steps: tuple[int, int] = HARMONICS_STEPS) -> bytes:
-    """Version 3. steps: of 1/128, to which harmonics of degree 1 and beyond are rounded; 1 is the finest."""
+    """Bytes of version 3. steps: of 1/128, to which harmonics of degree 1 and beyond are rounded; 1 is the finest"""
     (bits, flags), streams = _streams(gaussians, "a .spz file", steps)
     header = HEADER.pack(MAGIC, GZIP_VERSION, len(gaussians), gaussians.degree, bits, flags, 0)
     return gzip.compress(b"".join([header, *(stream.tobytes() for stream in streams)]), GZIP_LEVEL, mtime=0)
@@ -96,7 +96,7 @@ def gzipped(gaussians: Gaussians, steps: tuple[int, int] = HARMONICS_STEPS) -> b
 def _streams(
     gaussians: Gaussians, name: str, steps: tuple[int, int]
 ) -> tuple[tuple[int, int], list[UInt8[np.ndarray, "gaussian width"]]]:
-    """Bits behind the point and flags, and the bytes of each quantity."""
+    """Number of fraction bits and flags, and the bytes of each quantity."""
     extent = float(np.abs(array(gaussians.means)).max()) if len(gaussians) else 0.0
     if extent > MAX_FIXED:
         raise LumigraphError(f"{name} cannot hold positions beyond {MAX_FIXED}; scale the cloud down or write a .ply")
@@ -115,7 +115,7 @@ def _streams(
 
 
 def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
-    """The Gaussians of an opened stream that cannot hold more than `limit` bytes."""
+    """The Gaussians of a decompressed stream of at most `limit` bytes."""
     magic, version = struct.unpack("<4sI", take(stream, 8))
     if magic != MAGIC:
         raise LumigraphError(f"{path} is no .spz file, for inside it does not begin with NGSP; name another one")
@@ -137,7 +137,7 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
 
 
 def _decode_tabled(path: Path, data: bytes) -> Gaussians:
-    """Version 4. Only as much is unpacked as the header's count makes of each stream."""
+    """Read version 4. Each stream is unpacked to at most the size that follows from the header's count."""
     if len(data) < HEADER_V4.size:
         raise EOFError("it ends early")
     _, version, count, degree, bits, flags, streams, table = HEADER_V4.unpack_from(data)
@@ -162,7 +162,7 @@ def _decode_tabled(path: Path, data: bytes) -> Gaussians:
 
 
 def _widths(path: Path, version: int, degree: int) -> list[int]:
-    """Bytes of one Gaussian in each stream: position, opacity, colour, scale, rotation, harmonics beyond the first."""
+    """Bytes of one Gaussian in each stream: position, opacity, colour, scale, rotation, harmonics beyond degree 0."""
     if degree > 3:
         raise LumigraphError(f"{path} has harmonics of degree {degree}; save it with degree 0 to 3")
     return [6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
@@ -196,7 +196,9 @@ def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Vectors:
 
 
 def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Quaternions:
-    """Version 3: 2 bits name the largest of x, y, z, w; each of the others has a sign and 9 bits of sqrt(1/2)."""
+    """Quaternions of version 3: 2 bits name the largest of x, y, z, w; the others have a sign and 9 bits of
+    sqrt(1/2).
+    """
     code = rotations.view("<u4").astype(np.int64)
     parts = code >> np.array([20, 10, 0])
     rest = np.where(parts & 512, -1, 1) * (parts & 511) * (math.sqrt(0.5) / 511)

@@ -1,13 +1,13 @@
-"""PlayCanvas's streamed SOG: a scene at several levels of detail, of which viewers fetch what a camera needs.
+"""PlayCanvas's streamed SOG: a scene at several levels of detail, which viewers load by camera.
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog, version 1. A folder with
-lod-meta.json, which holds a tree of boxes, and folders of SOG (`sog`). Each leaf of the tree is a part of the scene;
-for each level, 0 the finest, it names a file and the row of Gaussians in it that are the leaf at that level.
+lod-meta.json, which has a tree of boxes, and folders of SOG (`sog`). Each leaf of the tree is a part of the scene;
+for each level, 0 the finest, it names a file and the range of its Gaussians in it.
 
-Ours: leaves are made by halving the finest level across its longest side until few enough Gaussians are left, so that
-they are small where much is. Each leaf is then simplified by itself (`gaussians.simplified`), and so drawn at whatever
-level beside neighbours of another. A file holds neighbouring leaves of one level. What is lost of the finest level is
-what SOG loses. Boxes hold each Gaussian up to one standard deviation, as PlayCanvas's own writer has them.
+We split the finest level at the median of its longest side until leaves are small, so that they are small in dense
+regions. Each leaf is simplified by itself (`gaussians.simplified`), and can be drawn at any level beside neighbours of
+another. A file has neighbouring leaves of one level. The finest level loses as much as SOG does. Boxes contain each
+Gaussian up to one standard deviation, as PlayCanvas's own writer has them.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, level: int = 0) -> Gaussians:
-    """A level, 0 the finest, and the environment where there is one. Raises LumigraphError where a file is missing, or
-    holds less than lod-meta.json says."""
+    """Read a level, 0 the finest, with the environment if there is one. Raises LumigraphError for a file that is
+    missing, or smaller than lod-meta.json states."""
     path = folder / META
     meta: LodMeta = typed(LodMeta, read_json(path), path)
     if meta.version != VERSION:
@@ -126,7 +126,7 @@ def read(folder: Path, level: int = 0) -> Gaussians:
 
 
 def rows_of(meta: LodMeta, level: int, path: Path) -> Iterator[LodRow]:
-    """The rows of all leaves at a level. Raises LumigraphError for one in no file that is named."""
+    """The rows of all leaves at a level. Raises LumigraphError for one in an undeclared file."""
     nodes = [meta.tree]
     while nodes:
         node = nodes.pop()
@@ -138,8 +138,8 @@ def rows_of(meta: LodMeta, level: int, path: Path) -> Iterator[LodRow]:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The folder of SOG, or the .sog, that lod-meta.json names. Raises LumigraphError for one that is not there, or
-    lies elsewhere."""
+    """The folder of SOG, or the .sog, that lod-meta.json names. Raises LumigraphError if it is missing or outside
+    the folder."""
     there = folder / name
     if not there.resolve().is_relative_to(folder.resolve()):
         raise LumigraphError(f"{folder / META} names {shown(name)}, which lies outside its folder; export it again")
@@ -152,7 +152,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def write(path: Path, gaussians: Gaussians, detail: Detail | None = None) -> None:
-    """The folder that a path to lod-meta.json lies in. Raises LumigraphError for a cloud of none."""
+    """Write the folder of a path to lod-meta.json. Raises LumigraphError for an empty cloud."""
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     detail, gaussians = detail or Detail(), gaussians.to("cpu")
@@ -182,8 +182,8 @@ def write(path: Path, gaussians: Gaussians, detail: Detail | None = None) -> Non
 
 
 def leaves(points: Float[np.ndarray, "point 3"], most: int) -> list[Int[np.ndarray, " some"]]:
-    """Points in parts of equal size, at most so many in each, a power of two of them: halved across the longest side
-    again and again. Parts 2i and 2i + 1 are neighbours, as are the pairs of them, and so on."""
+    """Points in 2^n parts of equal size, at most `most` in each, by repeated median splits of the longest side. Parts
+    2i and 2i + 1 are neighbours, as are the pairs of them, and so on."""
     parts = [np.arange(len(points))]
     while len(parts[0]) > most:
         parts = [half for part in parts for half in halves(points, part)]
@@ -191,14 +191,14 @@ def leaves(points: Float[np.ndarray, "point 3"], most: int) -> list[Int[np.ndarr
 
 
 def halves(points: Float[np.ndarray, "point 3"], part: Int[np.ndarray, " some"]) -> list[Int[np.ndarray, " half"]]:
-    """The nearer and the farther half along the axis in which the middle of them is longest, the first the larger."""
+    """Median split along the axis of the largest central extent; the first half is the larger."""
     low, high = np.quantile(points[part], [0.5 - EXTENT_QUANTILE / 2, 0.5 + EXTENT_QUANTILE / 2], axis=0)
     order = np.argsort(points[part, (high - low).argmax()], kind="stable")
     return np.array_split(part[order], 2)
 
 
 def coarser(gaussians: Gaussians, detail: Detail) -> list[Gaussians]:
-    """A leaf at all levels, the finest first, each from the one before."""
+    """A leaf at all levels, the finest first, each simplified from the previous one."""
     levels = [gaussians]
     for level in range(1, detail.levels):
         levels.append(simplified(levels[-1], max(1, round(len(gaussians) / detail.ratio**level))))
@@ -208,7 +208,7 @@ def coarser(gaussians: Gaussians, detail: Detail) -> list[Gaussians]:
 def packed(counts: list[list[int]], most: int) -> tuple[list[dict[str, LodRow]], list[tuple[str, int, list[int]]]]:
     """The rows of each leaf by level, and files as (name, level, leaves in it).
 
-    counts: Gaussians of each leaf at each level. most: of a file; neighbours share one as long as there is room
+    counts: Gaussians of each leaf at each level. most: of a file; neighbours share one if they fit
     """
     rows: list[dict[str, LodRow]] = [{} for _ in counts]
     files: list[tuple[str, int, list[int]]] = []
@@ -225,7 +225,7 @@ def packed(counts: list[list[int]], most: int) -> tuple[list[dict[str, LodRow]],
 
 
 def tree(bounds: list[Bounds], rows: list[dict[str, LodRow]]) -> dict[str, Any]:
-    """The tree above leaves, whose boxes hold those below."""
+    """Tree of bounding boxes above the leaves."""
     low, high = np.min([low for low, _ in bounds], 0), np.max([high for _, high in bounds], 0)
     node: dict[str, Any] = {"bound": {"min": [plain(x) for x in low], "max": [plain(x) for x in high]}}
     if len(rows) == 1:
@@ -235,7 +235,7 @@ def tree(bounds: list[Bounds], rows: list[dict[str, LodRow]]) -> dict[str, Any]:
 
 
 def bound(clouds: list[Gaussians]) -> Bounds:
-    """The box around all levels of a leaf: each Gaussian up to one standard deviation along its own axes."""
+    """Box around all levels of a leaf: each Gaussian up to one standard deviation along its own axes."""
     lows, highs = [], []
     for cloud in clouds:
         reach = (to_matrix(cloud.quaternions).abs() @ cloud.log_scales.exp()[..., None])[..., 0]

@@ -7,17 +7,17 @@ import numpy as np
 from ..datasets.mesh import Mesh
 from ..errors import LumigraphError
 from ..system.progress import counting
+from .options import CollisionOptions
 from .surface import Triangles, simplified
 
+NAMES = {"unreal": "UCX_{name}_{number:02}", "godot": "{name}_{number:02}-convcolonly"}  # of pieces, by engine
 MAX_FACES = 20_000  # of the mesh that is cut into pieces; pieces are coarser than that
 MAX_PIECE_VERTICES = 255  # of one piece, as engines allow
 
 
-def convex_pieces(mesh: Mesh, concavity: float, count: int | None = None) -> list[Triangles]:
-    """Vertices and faces of convex pieces that cover a mesh (CoACD: Wei 2022).
+def convex_pieces(mesh: Mesh, options: CollisionOptions = CollisionOptions()) -> dict[str, Triangles]:
+    """Vertices and faces of convex pieces that cover a mesh (CoACD: Wei 2022), by the names that an engine expects.
 
-    concavity: largest distance between a piece and its part of the mesh, as a share of the mesh's size
-    count:     of pieces at most
     Raises LumigraphError where CoACD is missing.
     """
     try:
@@ -32,10 +32,11 @@ def convex_pieces(mesh: Mesh, concavity: float, count: int | None = None) -> lis
     with counting("Cutting into convex pieces"):
         found = coacd.run_coacd(
             coacd.Mesh(vertices, faces),
-            threshold=concavity,
-            max_convex_hull=-1 if count is None else count,
+            threshold=options.concavity,
+            max_convex_hull=-1 if options.pieces is None else options.pieces,
             max_ch_vertex=MAX_PIECE_VERTICES,
             decimate=True,
             seed=0,
         )
-    return [(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)) for vertices, faces in found]
+    pieces = [(np.asarray(vertices, np.float64), np.asarray(faces, np.int64)) for vertices, faces in found]
+    return {NAMES[options.engine].format(name="source", number=i): piece for i, piece in enumerate(pieces)}

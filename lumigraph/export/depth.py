@@ -13,14 +13,40 @@ from PIL import Image
 from ..camera import Camera
 from ..datasets.scene import Scene
 from ..depth_maps import DepthMap
+from ..depth_maps.multi_view import multi_view_depth, pair_depth
 from ..depth_maps.stereo import Disparity, RectifiedPair
 from ..errors import LumigraphError
 from ..figures import Row, colour_depth, contact_sheet, depth_range, save_picture, to_image
 from ..files import replacing_folder, write_json
 from ..readers.transforms import OPENCV_FROM_OPENGL
+from .options import DepthOptions
 
 MAX_LEVEL = 65534  # of 16 bits; 0 and 65535 stand for unknown depth
 SHEET = "depth.png"
+
+
+def export_depth(scene: Scene, folder: Path, options: DepthOptions = DepthOptions()) -> list[DepthMap]:
+    """Write depth maps of the photographs by multi-view stereo, and return them."""
+    maps = multi_view_depth(scene, options.size, views=options.views or len(scene))
+    write_depth(folder, scene, maps)
+    return maps
+
+
+def export_pair(
+    scene: Scene, folder: Path, names: tuple[str, str], options: DepthOptions
+) -> tuple[str, float, tuple[int, int], float]:
+    """Write the depth of the left one of two photographs, by name or number, by rectification and matching.
+
+    Returns the left one's name, the baseline in units of the capture, the disparities and the share of sure pixels.
+    """
+    first, second = (scene.find(name) for name in names)
+    pair, found = pair_depth(scene, first, second, options.size)
+    left = first if bool((pair.left.pose[:, 3] == scene.cameras.position[first]).all()) else second
+    seen = pair.depth_map(found, left)
+    sure = float(seen.solid[pair.left.trust > 0.5].float().mean())
+    write_depth(folder, scene, [seen], pair_sheet(scene.source, names, pair, found))
+    begin, count = pair.disparities
+    return scene.names[left], pair.baseline * scene.frame.to_source.scale, (begin, begin + count - 1), sure
 
 
 def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap], sheet: Image.Image | None = None) -> None:

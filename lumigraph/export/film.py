@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import av
 import numpy as np
@@ -19,42 +20,82 @@ from torch import Tensor
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..components.fields.development import decoded
+from ..errors import LumigraphError
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json
 from ..geometry import evenly
 from ..method import Method
+from ..method.capabilities import HasGaussians, can
 from ..method.controls import Value
+from ..paths import film_cameras, fitting
+from ..paths.keyframes import CameraPath
+from ..run.opened import stations_of
 from ..system.memory import ask_for_picture
 from ..system.progress import track
 from ..system.work import at_work
-from .video import open_video
+from .loaded import Loaded
+from .options import AUTO, MAX_FILM_SIZE, MAX_RAYS_SIZE, PATH_KINDS, FilmOptions
+from .video import kind_of, open_video
 
+DEFAULT_FPS = 30.0  # frames per second
 PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, for the range of depth
 
 
-Pictures = Literal["png", "exr"]
+def render_film(
+    loaded: Loaded,
+    file: Path | None = None,
+    options: FilmOptions = FilmOptions(),
+    animations: Iterable[str] = (),
+    overwrite: bool | None = None,
+) -> tuple[Path, str, dict[str, Any]]:
+    """Render a film of what is loaded. Returns its file, the name of its path, and the contents of its JSON file.
+
+    file: None for one that is called after the path, in the opened run's folder of films
+    animations: controls that change over the film, NAME=A:B
+    """
+    flight = read_path(options)
+    fps = options.fps or (flight.fps if flight else DEFAULT_FPS)
+    train, opened = loaded.cameras["train"], loaded.opened
+    path = fitting(train, loaded.frame) if options.path == AUTO else options.path
+    file = file or opened.renders / f"{Path(path).stem}.mp4"
+    kind_of(file, fps)
+    claim_film(file, options, overwrite, [opened.path, *([Path(path)] if flight else [])])
+    most = MAX_FILM_SIZE if can(loaded.method, HasGaussians) else MAX_RAYS_SIZE
+    size = options.size or min(most, int(train.size.max()))
+    cameras = film_cameras(loaded.cameras, loaded.frame, flight or path, options.frames, size)
+    stations = stations_of(opened, loaded.method, animations)
+    shown = animated(loaded.method, stations, len(cameras)) if stations else loaded.method
+    return file, path, film(shown, cameras, file, replace(options, fps=fps))
+
+
+def read_path(options: FilmOptions) -> CameraPath | None:
+    """The camera path of a file; None for a path by name. Raises LumigraphError for neither."""
+    if options.path in (AUTO, *PATH_KINDS):
+        return None
+    file = Path(options.path)
+    if not file.exists() and not file.suffix:
+        raise LumigraphError(
+            f"There is no path called {options.path!r}; choose {', '.join(PATH_KINDS)}, or a JSON file"
+        )
+    flight = CameraPath.load(file)
+    return replace(flight, fps=options.fps or flight.fps)
 
 
 @at_work()
 def film(
-    method: Method | Sequence[Method],
-    cameras: Camera,
-    path: Path,
-    fps: float = 30.0,
-    depth: bool = False,
-    pictures: Pictures | None = None,
+    method: Method | Sequence[Method], cameras: Camera, path: Path, options: FilmOptions = FilmOptions()
 ) -> dict[str, Any]:
     """Render every camera of one size. Returns what is written to the JSON file.
 
     method: one for all frames, or one for each, such as what `animated` makes
-    depth:  write depth as well, path/orbit-depth.mp4
-    pictures: write the frames as well, path/orbit/0000.png and, with depth, 0000-depth.png; exr adds 0000.exr, their
-            linear light
+    options: of which frames per second, depth (path/orbit-depth.mp4) and pictures (path/orbit/0000.png and, with depth,
+            0000-depth.png; exr adds 0000.exr, their linear light) are used
     Beside path/orbit.mp4 writes path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads
     back to the capture's) and the controls of the method. Raises LumigraphError, before anything is rendered, if
     something else lies there.
     """
-    claim_film(path, depth=depth, pictures=pictures)
+    depth, pictures, fps = options.depth, options.pictures, options.fps or DEFAULT_FPS
+    claim_film(path, options)
     shown = [method] * len(cameras) if isinstance(method, Method) else list(method)
     assert len(shown) == len(cameras), f"{len(shown)} methods for {len(cameras)} frames"
     for one in shown:
@@ -100,18 +141,14 @@ def film(
 
 
 def claim_film(
-    path: Path,
-    overwrite: bool | None = None,
-    reads: Collection[Path] = (),
-    depth: bool = False,
-    pictures: Pictures | None = None,
+    path: Path, options: FilmOptions = FilmOptions(), overwrite: bool | None = None, reads: Collection[Path] = ()
 ) -> None:
     """Raise LumigraphError unless a film, and all that goes beside it, may be written there; see `files.claim`."""
     claim(path, "film", overwrite, reads)
     claim(path.with_suffix(".json"), "cameras of a film", overwrite, reads)
-    if depth:
+    if options.depth:
         claim(depth_beside(path), "film of depth", overwrite, reads)
-    if pictures:
+    if options.pictures:
         claim_folder(path.with_suffix(""), "pictures of a film")
 
 

@@ -21,6 +21,7 @@ from ..datasets.scene import Photograph, Scene
 from ..depth_maps import stereo
 from ..errors import LumigraphError
 from ..system.progress import track
+from .options import JumpOptions
 from .photo3d.layers import push_pull
 from .photo3d.stitching import grid_faces
 
@@ -106,16 +107,15 @@ def rig_of(scene: Scene) -> CameraCircle:
 
 @torch.no_grad()
 def stereo_panorama(
-    scene: Scene, width: int, interpupillary: float | None = None, before: list[Tensor] | None = None
+    scene: Scene, options: JumpOptions = JumpOptions(), before: list[Tensor] | None = None
 ) -> tuple[StereoPanorama, list[Tensor]]:
     """Stitch a rig's photographs of one moment.
 
-    width:  of a panorama, pixels
-    interpupillary: distance between the eyes, scene units
     before: what this function returned beside the panorama for the moment before, which keeps a film steady
     """
     rig = rig_of(scene)
-    radius = EYE_SHARE * rig.radius if interpupillary is None else interpupillary / 2
+    apart, width = options.interpupillary, options.size // 2 * 2
+    radius = EYE_SHARE * rig.radius if apart is None else apart / scene.frame.to_export.scale / 2
     if radius >= rig.radius:
         raise LumigraphError("The eyes are farther apart than the cameras' circle is wide; give a smaller distance")
     photographs = [scene.photograph(int(k)) for k in rig.order]

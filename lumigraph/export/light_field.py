@@ -11,14 +11,39 @@ from ..camera import Camera
 from ..camera.lens import OpenCV, Pinhole
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..figures import to_image
-from ..files import replacing_folder, write_json
+from ..figures import save_picture, to_image
+from ..files import claim, replacing_folder, write_json
 from ..method import Method
 from ..system.progress import track
 from .depth import about
+from .loaded import Loaded
+from .options import LightFieldOptions
 
 SPAN = 0.1  # width of the grid, in distances of the focal plane, where none is given
 ABOUT = "lightfield.json"
+
+
+def export_light_field(
+    loaded: Loaded, path: Path, options: LightFieldOptions = LightFieldOptions(), overwrite: bool | None = None
+) -> tuple[Path, float, float]:
+    """Write a folder of pictures; or a quilt for a path that ends in .png, to whose name its layout is added.
+
+    Returns what was written, and in the unit of exports the distance of the focal plane and the width of the grid.
+    """
+    method, unit = loaded.method, loaded.frame.to_export.scale
+    camera = loaded.camera(options.view)
+    camera = camera.resized(options.size / int(camera.size.max())).to(method.device)
+    focus = options.focus / unit if options.focus else focal_distance(method, camera)
+    span = options.span / unit if options.span else SPAN * focus
+    if path.suffix.lower() != ".png":
+        write_light_field(path, method, camera, options.grid, span / (options.grid - 1), focus, loaded.frame)
+        return path, focus * unit, span * unit
+    columns, rows = options.quilt
+    width, height = camera.size[0].tolist()
+    path = path.with_name(f"{path.stem}_qs{columns}x{rows}a{width / height:.2f}.png")
+    claim(path, "quilt", overwrite, [loaded.opened.path])
+    save_picture(path, quilt(method, camera, columns, rows, span / (columns * rows - 1), focus), "quilt")
+    return path, focus * unit, span * unit
 
 
 def focal_distance(method: Method, camera: Camera) -> float:

@@ -25,6 +25,7 @@ from ..method import Method
 from ..method.capabilities import HasDensity, HasDistance, HasMesh, can, needs
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .loaded import Loaded
 from .options import TEXTURED_FACES, MeshOptions
 from .surface import (
     BLOCK,
@@ -56,6 +57,17 @@ ONSET_SHARE = 0.2  # share of a ray's light that is spent in front of the surfac
 POINTS_PER_CHUNK = 1 << 18  # points
 
 Way = Literal["distance", "density", "own", "depth"]
+
+
+def export_mesh(loaded: Loaded, options: MeshOptions = MeshOptions()) -> tuple[Mesh, str]:
+    """The mesh of what is loaded, in the frame of exports, and the source of its surface as text."""
+    loaded = loaded.still
+    why = best_way(loaded.method)[1] if options.way == "auto" else f"{options.way}, as --from says"
+    opened, gone = loaded.opened, "The texture is made of renderings" if options.texture else None
+    cameras = opened.survey(loaded.cameras["train"])
+    photographs = opened.photographs(options.scene, gone) if options.texture or opened.masked else None
+    mesh = extract_mesh(loaded.without_floaters(), cameras, options, loaded.crop, photographs)
+    return mesh.in_source(loaded.frame), why
 
 
 @torch.no_grad()

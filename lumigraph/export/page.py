@@ -13,7 +13,9 @@ import gzip
 import io
 import json
 import math
-from dataclasses import asdict
+import re
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -27,21 +29,24 @@ from torch import Tensor
 from .. import __version__
 from ..camera import Camera
 from ..datasets.mesh import Mesh
-from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..exchange import spz
-from ..exchange.baked import Browsable
+from ..exchange.baked import Browsable, atlas_for_browser, octree_for_browser
 from ..exchange.codes import TURN_MEAN
-from ..figures import to_bytes
+from ..figures import hex_colour, to_bytes
 from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..gaussians.moving import MovingGaussians
-from ..geometry import evenly
+from ..geometry import Vector, evenly
 from ..method import Method
+from ..method.capabilities import HasAtlas, HasGaussians, HasOctree, can, needs
 from ..paths import Surroundings, camera_path, film_size
-from ..paths.opening import Backdrop, Opening
+from ..paths.opening import Backdrop, Opening, opening_of_scene
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .loaded import Loaded
+from .mesh import extract_mesh
+from .options import MeshOptions, PageOptions
 
 BACKDROP_VIEWS, BACKDROP_SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
 MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
@@ -179,17 +184,17 @@ def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
 
 
 @at_work()
-def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
+def views_page(
+    path: Path, method: Method, cameras: Camera, opening: Opening, options: PageOptions = PageOptions()
+) -> None:
     """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
 
     cameras: of the photographs
-    count:   pictures
-    longest: side of a picture in pixels
     """
     method.eval()
     around = Surroundings(cameras, method.frame)
     closed = around.arc[1] == math.pi
-    seen_from = views(around, count, film_size(cameras, longest))
+    seen_from = views(around, options.views, film_size(cameras, options.size))
     pictures, ends = [], [0]
     for i in track(range(len(seen_from)), f"Rendering {path.name}", len(seen_from)):
         pictures.append(webp(method.render(seen_from[i]).rgb))
@@ -247,3 +252,90 @@ def page_bytes(program: str, settings: dict[str, Any], data: bytes, help_text: t
     pieces = page.split("@@")  # text, name, text, name, ..., text
     pieces[1::2] = [parts[name] for name in pieces[1::2]]
     return "".join(pieces).encode()
+
+
+MAX_FACES = 300_000  # triangles of a mesh in a page, about 4 MB
+
+
+def export_page(
+    loaded: Loaded, path: Path, options: PageOptions = PageOptions(), octree: Callable[[], Method] | None = None
+) -> tuple[str, dict[str, int]]:
+    """Write what is loaded as one HTML file. Returns its contents in words and in numbers.
+
+    octree: makes an octree of it for a volume; None where it has none
+    Raises LumigraphError for options that it cannot have.
+    """
+    background, cameras, kind = background_of(options), loaded.cameras["train"], kind_of(loaded, options, octree)
+    if kind == "volume":
+        loaded = replace(loaded, method=baked(loaded, octree))
+    still = loaded.still
+    behind = backdrop(still.method, cameras) if kind != "views" and not loaded.part.crops else None
+    opening = opening_of_scene(options.title or loaded.opened.title, cameras, loaded.frame, background, behind)
+    if kind == "volume":
+        volume, held = browsable(still.method, options.degree)
+        volume_page(path, volume, opening)
+        return held, {name: volume.settings[name] for name in ("leaves", "blocks") if name in volume.settings}
+    if kind == "views":
+        views_page(path, still.kept_method(), cameras, opening, options)
+        return f"{options.views} views", {"views": options.views}
+    if kind == "mesh":
+        mesh = extract_mesh(still.without_floaters(), cameras, MeshOptions(faces=MAX_FACES), loaded.crop)
+        mesh_page(path, mesh, opening)
+        return f"{len(mesh.faces):,} triangles", {"triangles": len(mesh.faces)}
+    if loaded.moves:
+        moving = loaded.moving(options.duration)
+        moving_page(path, moving, opening)
+        count, spans = len(moving) - moving.moving, moving.moving
+        held = f"{count:,} Gaussians that stand still, {spans:,} spans of those that move"
+        return held, {"still": count, "moving": spans}
+    gaussians = loaded.gaussians()
+    splats_page(path, gaussians, opening)
+    return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}", {"gaussians": len(gaussians)}
+
+
+def kind_of(loaded: Loaded, options: PageOptions, octree: object) -> str:
+    """Kind of page: that of the options, or the first that what is loaded can have."""
+    if options.kind != "auto":
+        return options.kind
+    if can(loaded.method, HasGaussians):
+        return "splats"
+    if loaded.part.crops:
+        return "views"
+    return "volume" if is_baked(loaded.method) or (not loaded.method.settings and octree) else "views"
+
+
+def baked(loaded: Loaded, octree: Callable[[], Method] | None) -> Method:
+    """Method whose volume browsers show. Raises LumigraphError where there is none."""
+    if loaded.part.crops:
+        raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
+    if is_baked(loaded.method):
+        return loaded.method
+    if loaded.method.settings:
+        raise LumigraphError("A conversion has no controls; leave out --set, or give --as views")
+    if octree is None:
+        raise LumigraphError(f"{loaded.opened.path} cannot become an octree; give --as views")
+    return octree()
+
+
+def background_of(options: PageOptions) -> Vector | None:
+    """Colour of --background in [0, 1]; None where none is given. Raises LumigraphError for what is no colour."""
+    if options.background is None:
+        return None
+    if not re.fullmatch(r"#[0-9a-fA-F]{6}", options.background):
+        raise LumigraphError(f"{options.background!r} is no colour; give --background one such as '#101114'")
+    red, green, blue = hex_colour(options.background).tolist()
+    return red, green, blue
+
+
+def is_baked(method: Method) -> bool:
+    """True for methods whose volume browsers show."""
+    return can(method, HasOctree) or can(method, HasAtlas)
+
+
+def browsable(method: Method, degree: int = 3) -> tuple[Browsable, str]:
+    """A baked method's volume for browsers, and its description. degree: largest degree of an octree's harmonics"""
+    if can(method, HasOctree):
+        volume = octree_for_browser(needs(method, HasOctree).octree(), degree)
+        return volume, f"{volume.settings['leaves']:,} leaves of an octree, harmonics of degree {volume.degree}"
+    volume = atlas_for_browser(needs(method, HasAtlas).atlas())
+    return volume, f"{volume.settings['blocks']:,} blocks of {volume.settings['block']}^3 voxels"

@@ -35,6 +35,8 @@ from ..paths import Surroundings
 from ..system.memory import ask_for_picture
 from ..system.progress import track
 from ..system.work import at_work
+from .loaded import Loaded
+from .options import EyesOptions, SphereOptions
 
 PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two updates of the progress bar
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
@@ -46,6 +48,32 @@ MIN_WIDTH, MAX_WIDTH = 64, 16_384  # pixels
 
 Vector = tuple[float, float, float]
 Point = Float[Tensor, " 3"]  # or a direction, in the scene's frame
+
+
+def export_panorama(loaded: Loaded, path: Path, options: SphereOptions = SphereOptions()) -> str:
+    """Write all that is seen from one place as one picture. Returns the place in words."""
+    place, heading, words = standpoint(loaded.cameras["train"], loaded.frame, options.place)
+    save_sphere(path, panorama(loaded.kept_method(), place, heading, options.size).rgb, whole=True)
+    return words
+
+
+def export_stereo(
+    loaded: Loaded, path: Path, options: SphereOptions = SphereOptions(), eyes: EyesOptions = EyesOptions()
+) -> tuple[str, float, float]:
+    """Write a stereo pair as one picture. Returns the place in words, and in the unit of exports the distance of the
+    eyes and the median distance of what is around. Raises LumigraphError for eyes that do not fit there."""
+    place, heading, words = standpoint(loaded.cameras["train"], loaded.frame, options.place)
+    method, unit = loaded.kept_method(), loaded.frame.to_export.scale
+    near, middle = surrounding_distances(method, place, heading)
+    apart = EYE_DISTANCE_SHARE * middle if eyes.interpupillary is None else eyes.interpupillary / unit
+    if apart > near:
+        raise LumigraphError(
+            f"Eyes {apart * unit:.4g} apart do not fit where things are {near * unit:.4g} away; "
+            "give a smaller --interpupillary or another --from"
+        )
+    pair = stereo_pair(method, place, heading, options.size, apart, near)
+    save_sphere(path, top_bottom(*pair), whole=False)
+    return words, apart * unit, middle * unit
 
 
 def panorama(method: Method, place: Point, heading: Point, width: int) -> Rendering:

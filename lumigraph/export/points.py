@@ -19,6 +19,8 @@ from ..files.ply import write_rows
 from ..method import Method
 from ..system.progress import counting, track
 from ..system.work import at_work
+from .loaded import Loaded
+from .options import PointsOptions
 
 CANDIDATES_PER_POINT = 4  # pixels that are considered for each point
 MIN_COSINE = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
@@ -45,23 +47,28 @@ class PointCloud:
         return PointCloud(there.points(positions).numpy(), there.directions(normals).numpy(), self.colours)
 
 
+def export_points(loaded: Loaded, options: PointsOptions = PointsOptions()) -> PointCloud:
+    """Points of what is loaded, in the frame of exports."""
+    still, surveyors = loaded.still, loaded.opened.survey(loaded.cameras["train"])
+    points = extract_points(still.without_floaters(), surveyors, options, still.crop)
+    return points.in_source(loaded.frame)
+
+
 @torch.no_grad()
 @at_work()
 def extract_points(
-    method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64, crop: Crop | None = None
+    method: Method, cameras: Camera, options: PointsOptions = PointsOptions(), crop: Crop | None = None
 ) -> PointCloud:
-    """At most `count` points in the scene's frame, spread evenly over what the cameras see.
+    """Points in the scene's frame, spread evenly over what the cameras see.
 
-    size:  longer side of the cameras' pictures at most, pixels
-    views: cameras at most
-    crop:  what the points lie in; None for everywhere
+    crop: region of the points; None for everywhere
     A point stays if other cameras see a surface there too, and at most half as many look through it. Raises
     LumigraphError where nothing is solid.
     """
     method.eval()
-    depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
+    depth_maps = render_depth_maps(method.render, cameras, method.frame.background, options.views, options.size)
     good = [wanted(seen, crop) for seen in depth_maps]
-    share = min(1.0, CANDIDATES_PER_POINT * count / max(1, sum(int(x.sum()) for x in good)))
+    share = min(1.0, CANDIDATES_PER_POINT * options.count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []
     for seen, mask in zip(depth_maps, good, strict=True):
@@ -75,7 +82,7 @@ def extract_points(
             f"{'' if crop is None else ' inside the crop'}, so there are no points; train for longer and try again"
         )
     with counting("Thinning points"):
-        columns = thinned(kept, count)
+        columns = thinned(kept, options.count)
     normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
     return PointCloud(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -19,16 +20,18 @@ from ..composition import Placed, compose
 from ..depth_maps import DepthMap, Tolerance, hidden, render_depth_maps
 from ..errors import LumigraphError
 from ..geometry import Similarity, Vector
-from ..light.probes import FREE, MATTER, UNSEEN, ProbeGrid, lattice, octahedral, projected
+from ..light.probes import FREE, MATTER, UNSEEN, ProbeGrid, lattice, octahedral, projected, write_probes
 from ..light.probes.storage import MAX_PROBES
 from ..method import Method
 from ..method.capabilities import HasLooks, can
 from ..system.progress import track
 from ..system.work import at_work
 from .film import light_of
+from .loaded import Loaded
+from .options import ProbesOptions
+from .probes_page import probes_page
 
 LONGEST_SIDE_PROBES = 8  # probes along the longest side of the box, where no spacing is given
-FACE_SIZE = 32  # pixels along a side of a face of the cube
 MAP_SIDE = 14  # texels along a side of an octahedral map, without its border
 DEPTH_SHARPNESS = 50  # exponent of the cosine lobe that distances are averaged over (Majercik 2019)
 FAR_DIAGONALS = 1.5  # length at which distances are cut, in diagonals of a cell
@@ -73,16 +76,25 @@ def grid_of(
     return low + steps / 2, steps, counts
 
 
+def export_probes(loaded: Loaded, path: Path, options: ProbesOptions = ProbesOptions()) -> ProbeGrid:
+    """Write the probes of what is loaded, in a box or its crop, and the page of the options; returns the probes."""
+    method, crop = loaded.still.without_floaters(), loaded.crop
+    box = loaded.frame.bounds if crop is None else crop.bounds
+    grid = bake_probes(method, loaded.photographers, box, options)
+    origin = loaded.frame.origin if options.origin else None
+    write_probes(path, grid, None if origin is None else origin.to_json())
+    if options.page is not None:
+        probes_page(options.page, method, loaded.camera(options.view), grid, loaded.opened.title, options.mesh)
+    return grid
+
+
 @torch.no_grad()
 @at_work()
 def bake_probes(
     method: Method,
     cameras: Camera | None,
     box: tuple[Vector, Vector],
-    spacing: float | None = None,
-    counts: tuple[int, int, int] | None = None,
-    order: int = 3,
-    face_size: int = FACE_SIZE,
+    options: ProbesOptions = ProbesOptions(),
 ) -> ProbeGrid:
     """Probes inside a box of the scene's frame, in the frame of exports.
 
@@ -90,9 +102,10 @@ def bake_probes(
     Raises LumigraphError where no probe is free, or none sees anything.
     """
     method.eval()
-    first, steps, counts = grid_of(box, spacing, counts)
+    to_export, order, face_size = method.frame.to_export, options.order, options.resolution
+    spacing = None if options.spacing is None else options.spacing / to_export.scale
+    first, steps, counts = grid_of(box, spacing, options.counts)
     places = first + lattice(counts) * steps
-    to_export = method.frame.to_export
     far = FAR_DIAGONALS * float(steps.norm())
     around = [cube_camera(torch.zeros(3), face, face_size) for face in FACES]
     rays = [camera.rays(camera.pixels()) for camera in around]

@@ -1,4 +1,4 @@
-"""Figures: values as colours, contact sheets, charts."""
+"""Figures: colour maps, contact sheets, charts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Range = tuple[float, float]
 
 
 def to_bytes(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "height width 3"]:
-    """Colours in [0, 1] as bytes; others are clipped."""
+    """Colours in [0, 1] as bytes; values outside are clipped."""
     return rgb.detach().cpu().clamp(0, 1).mul_(255).round_().to(torch.uint8)
 
 
@@ -49,7 +49,7 @@ def save_picture(
 
 
 def depth_range(depth: Float[Tensor, "*pixels"], opacity: Float[Tensor, "*pixels"]) -> Range:
-    """Near and far for colouring: what all but the outermost two hundredths of solid pixels lie between."""
+    """Near and far limits of the depth colour map: 2 % and 98 % quantiles of solid pixels."""
     solid = depth[(opacity > 0.5) & depth.isfinite() & (depth > 0)].flatten()
     if not len(solid):
         return 1.0, 2.0
@@ -61,7 +61,7 @@ def depth_range(depth: Float[Tensor, "*pixels"], opacity: Float[Tensor, "*pixels
 def colour_depth(
     depth: Float[Tensor, "height width"], opacity: Float[Tensor, "height width"], within: Range
 ) -> Float[Tensor, "height width 3"]:
-    """Near is bright and warm, far dark and cool, on a logarithmic scale; faint where the scene is see-through."""
+    """Depth as colours on a logarithmic scale: near is bright and warm, far dark and cool; faint where transparent."""
     near, far = (torch.tensor(x).log() for x in within)
     share = (depth.clamp_min(1e-9).log() - near) / (far - near)
     colours = ramp(torch.where(share.isfinite(), share, 1.0))
@@ -71,12 +71,12 @@ def colour_depth(
 def colour_error(
     a: Float[Tensor, "height width 3"], b: Float[Tensor, "height width 3"], gain: float = ERROR_GAIN
 ) -> Float[Tensor, "height width 3"]:
-    """Mean absolute difference times a gain: dark is none, bright is 1 / gain and more."""
+    """Mean absolute difference times a gain as colours: dark is none, bright is 1 / gain and more."""
     return ramp(1 - gain * (a - b).abs().mean(-1))
 
 
 def ramp(share: Float[Tensor, "*pixels"]) -> Float[Tensor, "*pixels 3"]:
-    """The colour ramp at a share of its length in [0, 1]."""
+    """The colour map at positions in [0, 1]."""
     colours = torch.stack([hex_colour(c) for c in RAMP]).to(share)
     position = share.clamp(0, 1) * (len(RAMP) - 1)
     below = position.long().clamp(max=len(RAMP) - 2)
@@ -94,7 +94,7 @@ def fit_into(image: Image.Image, width: int, height: int) -> Image.Image:
 
 
 def fitted(width: int, height: int, most_width: int, most_height: int) -> tuple[int, int]:
-    """The size of what is shrunk to fit, never enlarged."""
+    """Size of a picture shrunk to fit, never enlarged."""
     scale = min(most_width / width, most_height / height, 1.0)
     return max(1, round(width * scale)), max(1, round(height * scale))
 
@@ -124,8 +124,8 @@ class Row:
 def contact_sheet(title: str, columns: Sequence[str], rows: Sequence[Row], cell: int = CELL) -> Image.Image:
     """Pictures in rows under named columns, each at most `cell` pixels wide and 1.25 times that high.
 
-    Where they would make a tower, as upright pictures do, rows go side by side in blocks, in order down each block, so
-    that the sheet comes near to the shape of a screen. What is larger than a screen is made of smaller pictures.
+    Tall sheets, as of upright pictures, are split into blocks side by side, in order down each block, to approach the
+    shape of a screen. Sheets larger than a screen have smaller pictures.
     """
     layouts = [Layout(columns, rows, size, count) for size in sizes(cell) for count in range(1, max(len(rows), 1) + 1)]
     fitting = [layout for layout in layouts if layout.fits]
@@ -143,7 +143,7 @@ def sizes(cell: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Layout:
-    """Rows in so many blocks side by side."""
+    """Layout of rows in a number of blocks side by side."""
 
     columns: Sequence[str]
     rows: Sequence[Row]
@@ -152,7 +152,7 @@ class Layout:
 
     @cached_property
     def shapes(self) -> list[list[tuple[int, int]]]:
-        """Width and height of each picture; nothing is made smaller before the layout is chosen."""
+        """Width and height of each picture, before shrinking."""
         most = self.cell, self.cell * 5 // 4
         return [[fitted(picture.shape[1], picture.shape[0], *most) for picture in row.pictures] for row in self.rows]
 
@@ -163,12 +163,12 @@ class Layout:
 
     @cached_property
     def column(self) -> int:
-        """From one column to the next."""
+        """Horizontal distance between columns."""
         return GAP + max(MIN_COLUMN_WIDTH, *(width for shapes in self.shapes for width, _ in shapes))
 
     @cached_property
     def block(self) -> int:
-        """From one block to the next: no label reaches into it."""
+        """Horizontal distance between blocks, wide enough for labels."""
         letters = ImageFont.load_default(SMALL_SIZE)
         longest = max((round(letters.getlength(row.labels[0])) for row in self.rows if len(row.labels) == 1), default=0)
         return max(self.across, longest) + 3 * GAP
@@ -179,7 +179,7 @@ class Layout:
 
     @cached_property
     def blocks(self) -> list[range]:
-        """Numbers of rows; equally many in each block, the last one maybe shorter."""
+        """Numbers of rows in each block; equally many, but for the last."""
         each = -(-len(self.rows) // self.count)
         return [range(start, min(start + each, len(self.rows))) for start in range(0, len(self.rows), each)]
 

@@ -1,4 +1,4 @@
-"""Charts as SVG text. Colours come from charts.css, on a page as in a file of its own, and follow light and dark."""
+"""Charts as SVG text. Colours come from charts.css, also in stand-alone files, and follow light and dark mode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ STYLE = (Path(__file__).parent / "charts.css").read_text("utf-8")
 
 @dataclass(frozen=True)
 class Series:
-    """colour: its number in charts.css, if not that of its place in the chart;  dash: 0 for an unbroken line"""
+    """Curve of a chart. colour: its number in charts.css, by default its index in the chart;  dash: 0 for an
+    unbroken line
+    """
 
     name: str
     x: Sequence[float]
@@ -43,15 +45,15 @@ def line_chart(
     note: str = "",
     x_ticks: Sequence[float] = (),
 ) -> str:
-    """Each series twice: faint as measured, bold as averaged. Empty if all of them have fewer points than two.
+    """Each series twice: faint as measured, bold as averaged. Empty if no series has two points.
 
     Two points are two marks: a line between them would suggest values that were not measured.
 
-    log, log_x: of the y and the x axis; what has no logarithm, or is not finite, is left out
+    log, log_x: of the y and the x axis; values without a logarithm, or not finite, are left out
     marks:      a dot at each point, with its numbers on hovering
     smoothed:   if not, the measured curve alone, bold
     note:       a few words below the plot
-    x_ticks:    what the x axis is marked at, in rising order, instead of round numbers
+    x_ticks:    ticks of the x axis in rising order, instead of round numbers
     """
     kept = [thinned(drawable(coloured(s, i), log_x, log)) for i, s in enumerate(series)]
     kept = [s for s in kept if len(s.x) > (0 if marks else 1)]
@@ -84,7 +86,7 @@ def line_chart(
 
 
 def standalone(chart: str) -> bytes:
-    """A chart as a complete .svg file that carries its style, at one pixel for each of its units."""
+    """A chart as a stand-alone .svg file with its style, one pixel per unit."""
     opening, _, body = chart.partition(">")
     *_, width, height = opening.split("'")[1].split()
     opening = opening.replace("<svg", f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}'", 1)
@@ -117,7 +119,7 @@ def bar_chart(names: Sequence[str], values: Sequence[float], label: str, colour:
 
 @dataclass(frozen=True)
 class Axis:
-    """Values from low to high lie between two positions; low and high are powers of ten on a logarithmic axis."""
+    """Map from values in [low, high] to positions; low and high are powers of ten on a logarithmic axis."""
 
     low: float
     high: float
@@ -143,10 +145,10 @@ def spanning(
     outliers: float = 0.0,
     from_zero: bool = False,
 ) -> Axis:
-    """An axis that holds all values, but for a share of outliers among the lowest.
+    """An axis that spans all values, except for a share of outliers among the lowest.
 
-    pad:       room beyond them, as a share of their span
-    from_zero: also where all of them are above it
+    pad:       margin beyond them, as a share of their span
+    from_zero: begin at zero also if all values are larger
     """
     heights = sorted(math.log10(value) if log else value for value in values)
     low, high = heights[int(outliers * len(heights))], heights[-1]
@@ -168,12 +170,12 @@ def axes(x_axis: Axis, y_axis: Axis, x_ticks: Sequence[float]) -> str:
 
 
 def coloured(series: Series, place: int) -> Series:
-    """With a colour of its own: that of its place, unless it has one."""
+    """The series with a default colour by index."""
     return replace(series, colour=(place if series.colour is None else series.colour) % COLOURS)
 
 
 def look(series: Series) -> str:
-    """The classes of its line in charts.css."""
+    """CSS classes of its line, as in charts.css."""
     return f"c{series.colour}" + (f" dash{series.dash % DASHES}" if series.dash else "")
 
 
@@ -183,7 +185,7 @@ def letters(series: Series) -> float:
 
 
 def legend_rows(series: Sequence[Series], label: str) -> list[list[Series]]:
-    """Names in rows: the first is right of the label, and stays empty if they do not all fit there."""
+    """Names in rows: the first row is right of the label, and empty unless all fit there."""
     room = (WIDTH - RIGHT - LEFT) / LETTER_WIDTH
     rows: list[list[Series]] = [[]]
     if len(label) + sum(letters(s) + 2 for s in series) > room:
@@ -219,7 +221,7 @@ def dots(series: Series, x_axis: Axis, y_axis: Axis) -> str:
 
 
 def svg(body: str, width: int = WIDTH, height: int = HEIGHT, above: int = 0) -> str:
-    """above: room over the picture's origin, added to its height"""
+    """SVG of a body. above: margin over the picture's origin, added to its height"""
     return f"<svg viewBox='0 {-above} {width} {height + above}' role='img'>{body}</svg>"
 
 
@@ -233,7 +235,7 @@ def ticks(low: float, high: float, about: int = 5) -> list[float]:
 
 
 def log_ticks(low: float, high: float, about: int = 8) -> list[float]:
-    """Round numbers between two powers of ten: powers of ten, not all of many, with twos and fives between few."""
+    """Round numbers between two powers of ten: powers of ten, thinned out if many, with twos and fives if few."""
     every = max(1, math.ceil((high - low) / about))
     factors = (1,) if high - low > 2 else (1, 2, 5)
     powers = range(math.floor(low), math.ceil(high) + 1)
@@ -243,7 +245,7 @@ def log_ticks(low: float, high: float, about: int = 8) -> list[float]:
 
 
 def numbers(values: Sequence[float]) -> list[str]:
-    """Each as it is written at an axis, all alike: in full, or by powers of ten if one is too small or large."""
+    """Axis labels of values, all in full, or all by powers of ten if one is too small or large."""
     low, high = PLAIN_RANGE
     if all(not value or low <= abs(value) < high for value in values):
         return [f"{value:.6g}" for value in values]
@@ -261,7 +263,7 @@ def by_powers(value: float) -> str:
 
 
 def drawable(series: Series, log_x: bool, log: bool) -> Series:
-    """The points that have a place on both axes."""
+    """The points that have a position on both axes."""
     kept = [
         (x, y)
         for x, y in zip(series.x, series.y, strict=True)
@@ -276,7 +278,7 @@ def thinned(series: Series) -> Series:
 
 
 def smooth(series: Series) -> Series:
-    """A moving mean that follows from behind, shorter where there is little behind."""
+    """Trailing moving average, shorter at the beginning."""
     reach = max(1, round(SMOOTHING * len(series.y)))
     means = []
     for i in range(len(series.y)):

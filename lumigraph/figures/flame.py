@@ -1,4 +1,4 @@
-"""Flame graphs as SVG text (Gregg 2016): each bar is a span of time, on top of it the spans inside it."""
+"""Flame graphs as SVG text (Gregg 2016): each bar is a span of time, below it the spans inside it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def placed(span: Span, left: float, row: int) -> Iterator[tuple[Span, float, int
 
 
 def bar(span: Span, left: float, width: float, row: int, share: float, unit: str) -> str:
-    """One bar with the name that fits into it; name, value and share on hovering."""
+    """One bar with the name if it fits; name, value and share on hovering."""
     if width < MIN_WIDTH:
         return ""
     letters = int((width - 2 * PADDING) / LETTER_WIDTH)

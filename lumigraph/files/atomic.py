@@ -7,6 +7,7 @@ gave --overwrite for it. A folder is replaced only if Lumigraph wrote it as one,
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import ctypes
 import errno
@@ -263,7 +264,14 @@ def read_bytes(path: Path, most: int = MAX_TEXT_BYTES) -> bytes:
 
 def read_text(path: Path) -> str:
     """Text of an ordinary file, as `read_bytes`; what is no UTF-8 becomes a replacement character."""
-    return read_bytes(path).decode("utf-8", errors="replace")
+    return without_mark(read_bytes(path)).decode("utf-8", errors="replace")
+
+
+def without_mark(data: bytes) -> bytes:
+    """Text in UTF-8 without the byte-order mark that editors of Windows begin it with; text in UTF-16 as UTF-8."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", errors="replace").encode()
+    return data.removeprefix(codecs.BOM_UTF8)
 
 
 def without_waiting(path: str, flags: int) -> int:
@@ -273,6 +281,7 @@ def without_waiting(path: str, flags: int) -> int:
 
 def from_json(data: bytes, where: Path | str) -> Any:
     """Plain values of JSON. where: what to name in a LumigraphError; see `read_json`."""
+    data = without_mark(data)
     nesting = accumulate(1 if bracket in b"[{" else -1 for bracket in data.translate(None, BUT_BRACKETS))
     if max(nesting, default=0) > MAX_JSON_DEPTH:
         raise LumigraphError(f"{where} nests deeper than {MAX_JSON_DEPTH} levels, as no sound file does; restore it")

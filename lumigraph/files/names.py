@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 MAX_DIGITS = 20  # more than any number in a file's name has: nanoseconds since 1970 have 19
 
@@ -15,6 +17,11 @@ def natural(name: str) -> tuple[str, str]:
     Names whose numbers have the same number of digits keep the order that `sorted` gives them.
     """
     return re.sub("[0-9]+", lambda number: number[0].zfill(MAX_DIGITS), name), name
+
+
+def next_free(prefix: str) -> Path:
+    """The first of prefix-1, prefix-2, ... that does not exist yet."""
+    return next(path for n in itertools.count(1) if not (path := Path(f"{prefix}-{n}")).exists())
 
 
 def counted(number: int, noun: str) -> str:

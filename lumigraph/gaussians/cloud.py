@@ -1,5 +1,5 @@
-"""Gaussians: a scene as a cloud of soft, coloured ellipsoids (Kerbl 2023), as methods learn it and files hold it; also
-several clouds as one, and a cloud without what lies outside a crop or floats, by opacity, size and isolation."""
+"""Clouds of 3D Gaussians (Kerbl 2023), in training and in files; joining, cropping, and removal of floaters by opacity,
+size and isolation."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ from ..geometry import multiply, to_quaternion
 ISOLATION_NEIGHBOURS = 16  # nearest Gaussians whose mean distance measures isolation
 BAND_0 = 0.5 / math.sqrt(math.pi)  # the constant harmonic
 EXTENT_OPACITY = 0.1  # opacity from which on a Gaussian counts for the extent of the cloud
+ROUNDING = 0.01  # of a Gaussian's size, which a centre may be off by
 EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """A cloud of N Gaussians, in the numbers that learning moves freely.
+    """A cloud of N Gaussians, in unconstrained parameters.
 
-    means:       centres, in the frame's units
+    means:       centres, in the frame's units; in double precision far from the origin, see `as_precise_as_needed`
     quaternions: rotations (w, x, y, z), of any length but zero
     log_scales:  natural logarithm of the standard deviation along each of the rotated axes
     opacities:   logits; the sigmoid is the opacity at the centre
-    harmonics:   colour, sRGB-encoded: c(d) = 1/2 + sum_k Y_k(d) h_k, negative ones cut to 0, where d points from the
-                 eye to the centre and Y_k are those of `kernels.spherical_harmonics`; K is 1, 4, 9 or 16
+    harmonics:   colour, sRGB-encoded: c(d) = max(0, 1/2 + sum_k Y_k(d) h_k), where d points from the eye to the centre
+                 and Y_k are those of `kernels.spherical_harmonics`; K is 1, 4, 9 or 16
     antialiased: whether opacities are meant for the 2-D filter that keeps a small Gaussian's light (Yu 2024)
     """
 
@@ -61,7 +62,7 @@ class Gaussians:
         return math.isqrt(self.harmonics.shape[1]) - 1
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Gaussians:
-        """The same cloud in another frame, x' = M x: moved, turned, scaled, and its colours turned with it."""
+        """The same cloud in another frame, x' = M x, with rotated spherical harmonics."""
         similarity = similarity.double().cpu()
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
         rotation = similarity[:3, :3] / scale
@@ -70,7 +71,7 @@ class Gaussians:
         turn = to_quaternion(rotation).to(self.quaternions)
         return replace(
             self,
-            means=means.to(self.means),
+            means=as_precise_as_needed(means, self.log_scales + float(scale.log())),
             quaternions=multiply(turn[None], self.quaternions),
             log_scales=self.log_scales + float(scale.log()),
             harmonics=turned(self.harmonics, rotation),
@@ -82,13 +83,23 @@ class Gaussians:
         return Gaussians(means, quaternions, log_scales, opacities, harmonics, self.antialiased)
 
 
+def as_precise_as_needed(
+    means: Float[Tensor, "gaussian 3"], log_scales: Float[Tensor, "gaussian 3"]
+) -> Float[Tensor, "gaussian 3"]:
+    """Centres in single precision, unless its step there is more than ROUNDING of most Gaussians' largest deviation."""
+    if means.dtype != torch.float64 or not len(means):
+        return means
+    steps = torch.finfo(torch.float32).eps * means.abs().amax(-1)
+    return means if (steps / log_scales.amax(-1).exp()).nanmedian() > ROUNDING else means.float()
+
+
 def turned(
     harmonics: Float[Tensor, "gaussian coefficient 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "gaussian coefficient 3"]:
-    """Coefficients of the turned function: c'(R d) = c(d).
+    """Rotate spherical harmonics: c'(R d) = c(d).
 
-    Each band turns within itself. Its matrix is what sends the band's values at some directions to those at the turned
-    ones, found by least squares in double precision, where more directions than needed leave no error but rounding.
+    Each band is rotated by a matrix of its own, found by least squares in double precision: it maps the band's values
+    at some directions to those at the rotated ones. With more directions than unknowns the error is that of rounding.
     """
     bands = math.isqrt(harmonics.shape[1])
     directions = torch.randn(64, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -105,7 +116,7 @@ def turned(
 
 
 def joined(clouds: Sequence[Gaussians]) -> Gaussians:
-    """One cloud from several. Harmonics that some lack are zero; opacities keep the meaning that most of them have."""
+    """One cloud from several. Missing harmonics are zero; opacities keep the meaning that most clouds have."""
     coefficients = max(cloud.harmonics.shape[1] for cloud in clouds)
     antialiased = [cloud.antialiased for cloud in clouds for _ in range(len(cloud))]
     majority = 2 * sum(antialiased) > len(antialiased)
@@ -123,7 +134,7 @@ def joined(clouds: Sequence[Gaussians]) -> Gaussians:
 
 
 def cleaned(gaussians: Gaussians, crop: Crop | None = None, max_scale: float | None = None) -> Gaussians:
-    """The Gaussians that a crop holds; see `unwanted`."""
+    """The cloud without the Gaussians of `unwanted`."""
     return gaussians[~gone(unwanted(gaussians, crop, max_scale))]
 
 
@@ -141,8 +152,8 @@ def unwanted(
 ) -> dict[str, Bool[Tensor, " gaussian"]]:
     """Masks of Gaussians to remove, by reason, in the order of the arguments; each under its first reason.
 
-    crop:      keeps those whose centres it holds, in the cloud's frame
-    max_scale: largest standard deviation that is left, as a share of `extent`; None for any
+    crop:      keeps those with centres inside, in the cloud's frame
+    max_scale: largest standard deviation to keep, as a share of `extent`; None for any
     floating:  floaters; None for none
     """
     outside = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
@@ -155,14 +166,14 @@ def unwanted(
 
 
 def painted(gaussians: Gaussians, which: Bool[Tensor, " gaussian"], colour: tuple[float, float, float]) -> Gaussians:
-    """The cloud with the Gaussians of a mask in one colour, sRGB-encoded, from every direction."""
+    """The cloud with the Gaussians of a mask in one view-independent colour, sRGB-encoded."""
     plain = torch.zeros_like(gaussians.harmonics)
     plain[:, 0] = (plain.new_tensor(colour) - 0.5) / BAND_0
     return replace(gaussians, harmonics=torch.where(which[:, None, None], plain, gaussians.harmonics))
 
 
 def extent(gaussians: Gaussians) -> float:
-    """The longest side of the upright box that holds the middle of the solid Gaussians' centres along each axis."""
+    """Longest side of the upright box around the central part of the solid Gaussians' centres."""
     solid = gaussians.means[gaussians.opacities.sigmoid() > EXTENT_OPACITY]
     some = (solid if len(solid) else gaussians.means)[:: max(1, len(gaussians) // 100_000)]
     low, high = torch.quantile(some, some.new_tensor([0.5 - EXTENT_SHARE / 2, 0.5 + EXTENT_SHARE / 2]), dim=0)
@@ -170,9 +181,9 @@ def extent(gaussians: Gaussians) -> float:
 
 
 def gaps(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
-    """Mean distance of each Gaussian to its nearest neighbours, in sums of both's sizes.
+    """Mean distance of each Gaussian to its nearest neighbours, relative to the sum of their sizes.
 
-    About 1 on a surface, however coarse: there Gaussians touch. It does not depend on the cloud's units, and sparse
+    About 1 on a surface of any resolution: there Gaussians touch. It does not depend on the cloud's units, and sparse
     backgrounds, whose Gaussians are large, are not taken for floaters. A size is the geometric mean of deviations.
     """
     means = gaussians.means.detach().cpu().numpy()

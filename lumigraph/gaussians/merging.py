@@ -1,4 +1,4 @@
-"""Merging: a cloud told with fewer Gaussians, for those who see it from afar.
+"""Merging: a cloud simplified to fewer Gaussians, as a level of detail.
 
 Neighbours become one Gaussian with the mean and covariance of both, as Kerbl 2024 ("A Hierarchical 3D Gaussian
 Representation", section 4.1) merges them, and those pairs merge whose pictures change the least.
@@ -26,7 +26,7 @@ EPSILON = 1e-30
 
 @torch.no_grad()
 def simplified(gaussians: Gaussians, count: int) -> Gaussians:
-    """At most so many Gaussians, at least one, that look alike from afar; on the CPU. Order is not kept.
+    """The cloud simplified to at most `count` Gaussians, at least one; on the CPU. Order is not kept.
 
     In each round the pairs that are each other's best merge, the cheapest first, which halves the cloud at most.
     """
@@ -44,7 +44,7 @@ def simplified(gaussians: Gaussians, count: int) -> Gaussians:
 
 @dataclass(frozen=True)
 class _Ellipsoids:
-    """Gaussians in double precision, with opacities and harmonics as they add up. covariances: of N x 3 x 3"""
+    """Gaussians in double precision, with linear opacities and harmonics. covariances: of N x 3 x 3"""
 
     means: Float[Tensor, "gaussian 3"]
     covariances: Float[Tensor, "gaussian 3 3"]
@@ -58,7 +58,7 @@ class _Ellipsoids:
         return _Ellipsoids(cloud.means.double(), axes @ axes.mT, opacities, cloud.harmonics.double())
 
     def gaussians(self, like: Gaussians) -> Gaussians:
-        """In single precision, with what else is known of a cloud."""
+        """As a cloud in single precision, with the remaining fields of `like`."""
         squares, axes = torch.linalg.eigh(self.covariances)
         axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # turned, not mirrored
         scales = squares.clamp_min(EPSILON).sqrt().log()
@@ -75,16 +75,16 @@ class _Ellipsoids:
 
     @property
     def weights(self) -> Float[Tensor, " gaussian"]:
-        """The light that each stops, up to a factor: its opacity times the area it shows from all sides."""
+        """Weight of each in a merge: opacity times mean projected area, up to a factor."""
         c = self.covariances
         trace = c.diagonal(dim1=-2, dim2=-1).sum(-1)
         return self.opacities * (0.5 * (trace.square() - c.square().sum((-1, -2)))).clamp_min(EPSILON).sqrt()
 
     def merged(self, other: _Ellipsoids) -> _Ellipsoids:
-        """Pairs as one each, with the weighted mean, covariance and harmonics of both.
+        """Pairs merged, with the weighted mean, covariance and harmonics of both.
 
-        The opacity is such that it stops as much light as both did, seen along its shortest axis. Where that takes more
-        than all, the Gaussian grows instead.
+        The opacity preserves the light stopped along the shortest axis. Where that needs more than 1, the Gaussian
+        grows instead.
         """
         a, b = self.weights, other.weights
         share = (a / (a + b).clamp_min(EPSILON))[:, None]
@@ -104,14 +104,14 @@ class _Ellipsoids:
 
     @property
     def colours(self) -> Float[Tensor, "gaussian 4"]:
-        """Colour and opacity at the centre, from no direction in particular."""
+        """Base colour (view-independent) and opacity at the centre."""
         rgb = 0.5 + K00 * self.harmonics[:, 0]
         return self.opacities[:, None] * torch.cat([rgb, torch.ones_like(rgb[:, :1])], -1)
 
 
 @dataclass(frozen=True)
 class _Footprint:
-    """Gaussians seen along an axis: covariance in the plane across, and the square root of its determinant."""
+    """Gaussians projected along an axis: covariance in the plane across, and the square root of its determinant."""
 
     covariance: Float[Tensor, "gaussian 2 2"]
     size: Float[Tensor, " gaussian"]
@@ -131,9 +131,10 @@ class _Footprint:
 
 
 def _cost(one: _Ellipsoids, other: _Ellipsoids, merged: _Ellipsoids) -> Float[Tensor, " pair"]:
-    """The squared change of colour and opacity, summed over the plane, seen along the three axes of what is merged.
+    """Squared change of colour and opacity by a merge, integrated over the plane, along the merged Gaussian's three
+    axes.
 
-    Light adds up here, as it does where little of it is stopped: the integral of (a A + b B - m M)^2.
+    Light is additive here, as at low opacity: the integral of (a A + b B - m M)^2.
     """
     axes = torch.linalg.eigh(merged.covariances).eigenvectors
     parts, signs = (one, other, merged), (1, 1, -1)
@@ -149,7 +150,7 @@ def _cost(one: _Ellipsoids, other: _Ellipsoids, merged: _Ellipsoids) -> Float[Te
 
 
 def _neighbours(means: Float[Tensor, "gaussian 3"]) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
-    """Each pair of which one is among the nearest to the other, once."""
+    """Pairs of nearest neighbours, each once."""
     count = len(means)
     nearest = cKDTree(means.numpy()).query(means.numpy(), min(MERGE_NEIGHBOURS + 1, count))[1]
     here, there = torch.arange(count)[:, None].expand(nearest.shape), torch.from_numpy(nearest)
@@ -159,7 +160,7 @@ def _neighbours(means: Float[Tensor, "gaussian 3"]) -> tuple[Int[Tensor, " pair"
 
 
 def _matching(one: Int[Tensor, " pair"], other: Int[Tensor, " pair"], count: int) -> Int[Tensor, " chosen"]:
-    """Greedy matching of pairs that are sorted best first: indices of those chosen; none shares a Gaussian."""
+    """Greedy matching of pairs sorted best first: indices of the chosen ones; none shares a Gaussian."""
     left, chosen = torch.arange(len(one)), []
     while len(left):
         a, b = one[left], other[left]

@@ -1,4 +1,4 @@
-"""Moving clouds: each Gaussian exists for a span of time and moves evenly in it; a motion is many short spans."""
+"""Moving clouds: each Gaussian exists for a span of time and moves linearly in it; a motion is many short spans."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ BYTES_PER_STATE = 60  # of a moving Gaussian at one moment, and of what is compu
 
 @dataclass(frozen=True)
 class MovingGaussians:
-    """Gaussians of spans of time: shown for begin <= t < end, with centres at mean + velocity (t - middle).
+    """Gaussians with spans of time: visible for begin <= t < end, with centres at mean + velocity (t - middle).
 
-    cloud:       as it is at `middles`
+    cloud:       at the times `middles`
     duration:    seconds
     velocities:  in the frame's units per second
     middles:     seconds of the clock, which starts at 0
     begins, ends: of the spans, seconds
-    fades:       deviation in seconds, by which opacity falls off from the middle; infinite for none
+    fades:       deviation in seconds of the opacity's falloff from the middle; infinite for none
     """
 
     cloud: Gaussians
@@ -53,13 +53,13 @@ class MovingGaussians:
         return replace(self, cloud=self.cloud.transformed(similarity), velocities=self.velocities @ turn.T)
 
     def lasting(self, duration: float) -> MovingGaussians:
-        """The same motion in another number of seconds."""
+        """The same motion stretched to another duration in seconds."""
         times = duration / self.duration
         stretched = {name: getattr(self, name) * times for name in ("middles", "begins", "ends", "fades")}
         return replace(self, velocities=self.velocities / times, duration=duration, **stretched)
 
     def at(self, time: float) -> Gaussians:
-        """The cloud at a moment; the last one shows what is there just before it."""
+        """The cloud at a time; the duration's end is the moment just before it."""
         last = float(torch.nextafter(torch.tensor(self.duration), torch.tensor(0.0)))
         now = min(max(time, 0.0), last)
         some = self[(self.begins <= now) & (now < self.ends)]
@@ -72,7 +72,7 @@ class MovingGaussians:
 
     @property
     def moving(self) -> int:
-        """Number of Gaussians that are not there all the time at one place."""
+        """Number of Gaussians that move or exist for a part of the time."""
         still = (self.velocities == 0).all(1) & (self.begins <= 0) & (self.ends >= self.duration)
         return int((~still).sum())
 
@@ -81,11 +81,11 @@ class MovingGaussians:
 def fitted(
     states: Callable[[float], Gaussians], duration: float, tolerance: float = TOLERANCE, levels: int = LEVELS
 ) -> MovingGaussians:
-    """A motion as spans of even motion, ordered by Gaussian and time. Gaussians that stand still have one span.
+    """A motion as spans of linear motion, ordered by Gaussian and time. Static Gaussians have one span.
 
-    states:    the cloud at a share of the time, 0 to 1, always of the same Gaussians in the same order
-    tolerance: error that a span may have: of positions, and of the ends of axes by rotation and scale, as a share of
-               the Gaussian's largest deviation. Spans are halved, at most `levels` times, until they keep to it.
+    states:    the cloud at times from 0 to 1, always of the same Gaussians in the same order
+    tolerance: largest error of a span, of positions and of the ends of axes by rotation and scale, as a share of the
+               Gaussian's largest deviation. Spans are halved, at most `levels` times, until they meet it
     Opacities and colours are those of the first moment.
     Raises LumigraphError where the states are of different Gaussians, or take more memory than is free.
     """
@@ -156,8 +156,8 @@ def spans(
 def span_errors(
     track: dict[str, Float[Tensor, "moment gaussian _"]], some: Int[Tensor, " some"], begin: int, end: int
 ) -> Float[Tensor, " some"]:
-    """Largest error of a span of some Gaussians: what is left of positions beside a straight line, the way of the ends
-    of axes that turn and grow, in largest deviations."""
+    """Largest error of a span of some Gaussians, in largest deviations: distance of positions from a straight line, and
+    movement of the ends of axes."""
     means, quaternions, log_scales = (track[name][begin : end + 1, some] for name in track)
     share = torch.linspace(0, 1, end - begin + 1, device=means.device)[:, None, None]
     off = (means - means[:1] - share * (means[-1:] - means[:1])).norm(dim=-1).amax(0)

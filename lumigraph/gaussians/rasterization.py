@@ -1,4 +1,4 @@
-"""rasterization(): Gaussians as pictures, with the signature and the conventions of gsplat (Ye 2024, arXiv 2409.06765).
+"""rasterization(): render Gaussians with the signature and the conventions of gsplat (Ye 2024, arXiv 2409.06765).
 
 Code that calls `gsplat.rasterization` runs without CUDA by importing it from here.
 """
@@ -64,15 +64,15 @@ def rasterization(
     colors:     (N, D) or (C, N, D); with sh_degree coefficients (N, K, 3) or (C, N, K, 3), K >= (sh_degree + 1)^2
     viewmats:   world to camera, +x right, +y down, +z forward
     Ks:         intrinsics in pixels, pixel centres at + 0.5
-    far_plane:  Gaussians whose centres lie farther are not rendered
-    radius_clip: neither are those of at most so many pixels
+    far_plane:  Gaussians with centres beyond are not rendered
+    radius_clip: nor are those of at most so many pixels
     eps2d:      square pixels added to each footprint
     render_mode: colours, accumulated depth D, expected depth ED = D / alpha; depth is the last channel
     packed, tile_size, channel_chunk, segmented: accepted, and without effect on the result
 
     Returns pictures, opacities, and a dictionary: "means2d" (C, N, 2), which may retain its gradient, "radii"
     (C, N, 2) in whole pixels, "depths", "conics", "opacities", "width", "height", "n_cameras"; zeros for Gaussians that
-    a camera does not show. Opacity of one Gaussian at a pixel is at most 0.99 (Kerbl 2023), where gsplat has 0.999.
+    are invisible to a camera. Opacity of one Gaussian at a pixel is at most 0.99 (Kerbl 2023), where gsplat has 0.999.
     Raises LumigraphError for options that the kernels do not have.
     """
     refused = {
@@ -142,10 +142,10 @@ def camera_of(viewmat: Float[Tensor, "4 4"], intrinsics: Float[Tensor, "3 3"], w
 def in_camera(
     means: Float[Tensor, "gaussian 3"], quats: Float[Tensor, "gaussian 4"], viewmat: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "gaussian 3"], Float[Tensor, "gaussian 4"]]:
-    """Means and rotations in a camera's frame, differentiable in its pose, which the kernels take for a constant.
+    """Means and rotations in a camera's frame, differentiable in its pose, which is a constant for the kernels.
 
-    The camera's rotation acts on quaternions to first order about itself, exp(w) R with w = 0, so gradients in viewmats
-    are those of rotations.
+    The camera's rotation is exp(w) R with w = 0, acting on quaternions to first order, so gradients in viewmats are
+    those of rotations.
     """
     rotation = viewmat[:3, :3]
     change = rotation @ rotation.detach().T
@@ -158,7 +158,7 @@ def in_camera(
 def colours(
     colors: Tensor, means: Float[Tensor, "gaussian 3"], viewmat: Float[Tensor, "4 4"], camera: int, degree: int | None
 ) -> Float[Tensor, "gaussian channel"]:
-    """Values of the Gaussians for one camera: as they are, or by their harmonics, max(0, 1/2 + sum_k Y_k(d) h_k)."""
+    """Values of the Gaussians for one camera: unchanged, or from harmonics, max(0, 1/2 + sum_k Y_k(d) h_k)."""
     plain = 2 if degree is None else 3
     own = colors if colors.ndim == plain else colors[camera]
     if degree is None:
@@ -186,7 +186,7 @@ def composited(
 
 
 def radii_of(conics: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian 2"]:
-    """Three deviations of each footprint along both axes, in whole pixels; zero where there is none."""
+    """Three deviations of each footprint along both axes, in whole pixels; zero for an empty one."""
     xx, xy, yy = conics.unbind(-1)
     determinant = xx * yy - xy * xy
     variance = torch.stack([yy, xx], -1) / determinant.clamp_min(1e-30)[:, None]

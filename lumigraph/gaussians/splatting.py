@@ -1,4 +1,4 @@
-"""Splatting: a cloud of Gaussians, seen through a camera, becomes a picture (Kerbl 2023)."""
+"""Splatting: rendering a cloud of Gaussians for a camera (Kerbl 2023)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ EDGE_SAMPLES = 9  # pixels along each edge that measure a lens's field of view
 
 @dataclass(frozen=True)
 class Splatted:
-    """A picture of a cloud, and the footprints that made it (see `kernels.project` and `kernels.rasterize`).
+    """A picture of a cloud, and its footprints (see `kernels.project` and `kernels.rasterize`).
 
     rgb:     colours over black
     depth:   opacity-weighted sum of depths along the optical axis
-    opacity: share of light that the cloud stops
-    centres, conics, opacities: of each Gaussian's footprint, zero for those that the picture does not show
+    opacity: accumulated opacity
+    centres, conics, opacities: of each Gaussian's footprint, zero for invisible ones
     tiles:   footprints of each tile, in order
     """
 
@@ -48,13 +48,13 @@ class Splatted:
     ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
         """Further values of the Gaussians, composited as colours are: sums of w_i v_i, of w_i x_i and of w_i.
 
-        stop: transmittance at which a pixel is finished; 1/2 leaves those behind the median Gaussian out
+        stop: early termination transmittance; 1/2 excludes Gaussians behind the median depth
         """
         footprints = self.centres, self.conics, self.opacities
         return kernels.rasterize(*footprints, vectors, numbers, self.tiles, stop)
 
     def along_rays(self, camera: Camera) -> Float[Tensor, "height width"]:
-        """Mean distance along each pixel's ray of what is opaque, infinity where nothing is."""
+        """Expected distance along each pixel's ray, over its opacity; infinity for empty pixels."""
         along = camera.cosines().clamp_min(1e-3).to(self.depth.device)
         return torch.where(self.opacity > 1e-3, self.depth / self.opacity.clamp_min(1e-3) / along, torch.inf)
 
@@ -65,7 +65,7 @@ def splat(
     """Project, tile, rasterise; differentiable in the cloud.
 
     bands: of the harmonics in use, at most as many as there are
-    stop:  transmittance at which a pixel is finished
+    stop:  early termination transmittance
     """
     ellipsoids = cloud.means, cloud.quaternions, cloud.log_scales.exp(), cloud.opacities.sigmoid()
     centres, conics, depths, colours, opacities = kernels.project(
@@ -95,7 +95,7 @@ def render(
 
 
 def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:
-    """One camera as the kernels want it. Raises LumigraphError for lenses without a flat picture."""
+    """One camera as kernel input. Raises LumigraphError for lenses without a flat picture."""
     lens = camera.lens[0] if isinstance(camera.lens, Mixed) else camera.lens
     if not isinstance(lens, Pinhole | OpenCV):
         raise LumigraphError(
@@ -112,8 +112,8 @@ def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:
 
 
 def _limits(lens: Pinhole | OpenCV, width: int, height: int) -> Float[Tensor, " 4"]:
-    """The part of the plane z = 1 that the picture shows, and a margin around it. Found on the processor: on a GPU it
-    would be few numbers in hundreds of launches."""
+    """Bounds of the picture on the plane z = 1, with a margin. Computed on the CPU: on a GPU it would be a few numbers
+    in hundreds of launches."""
     x, y = (torch.linspace(0, n, EDGE_SAMPLES) for n in (width, height))
     left, top = torch.zeros_like(y), torch.zeros_like(x)
     edges = [torch.stack(pair, -1) for pair in ((left, y), (left + width, y), (x, top), (x, top + height))]

@@ -1,30 +1,30 @@
-"""For the Triton engines: launching kernels, and rows of three numbers."""
+"""Triton helpers: kernel launches, masked loads of rows of three numbers."""
 
 import triton
 import triton.language as tl
 
 
 def blocks(count: int, block: tl.constexpr) -> int:
-    """Number of blocks that hold `count` things."""
+    """Number of blocks for `count` elements."""
     return triton.cdiv(count, block.value)
 
 
 def launch(kernel, grid: tuple[int, ...], *arguments, **options) -> None:
-    """Run a kernel on a grid of programs, which may be empty."""
+    """Launch a kernel on a grid; do nothing for an empty grid."""
     if all(grid):
         kernel[grid](*arguments, **options)
 
 
 @triton.jit
 def indices(count, BLOCK: tl.constexpr):
-    """Numbers of the things in this program's block, and whether each is below the count."""
+    """Element indices of this program's block, and a mask of those below the count."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     return i, i < count
 
 
 @triton.jit
 def load_row(array, r, here, first=0.0):
-    """Row r of an (_, 3) array; (first, 0, 0) where it is not here."""
+    """Row r of an (_, 3) array; (first, 0, 0) where masked out."""
     x = tl.load(array + 3 * r, mask=here, other=first)
     y = tl.load(array + 3 * r + 1, mask=here, other=0.0)
     z = tl.load(array + 3 * r + 2, mask=here, other=0.0)

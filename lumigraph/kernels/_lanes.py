@@ -1,8 +1,8 @@
-"""Several numbers as one value, for the Numba engines: lanes add, multiply and compare as a number does.
+"""SIMD vectors for the Numba engines: lanes add, multiply and compare elementwise.
 
-Numba has no vector type; this one lives in registers, so that a block's sums never touch memory. There are sixteen
-lanes, or as many as a tuple `like` is long: its length tells the compiler. Without Numba (NUMBA_DISABLE_JIT) the same
-code runs on rows of a NumPy array, which check what is loaded and stored. Arrays are flat.
+Numba has no vector type. This one lives in registers, so that a block's sums never touch memory. There are sixteen
+lanes, or as many as a tuple `like` is long: the compiler knows its length. Without Numba (NUMBA_DISABLE_JIT) the same
+code runs on rows of a NumPy array, with bounds checks on loads and stores. Arrays are flat.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def _spread(context, builder, fromty, toty, value):
 
 
 def _common(args):
-    """The type of those of several values that are lanes, where all can be of it."""
+    """Common lane type of operands; None if they have none."""
     among = [x for x in args if isinstance(x, LanesType)]
     fits = among and all(x == among[0] or isinstance(x, SCALARS[among[0].kind]) for x in args)
     return among[0] if fits else None
 
 
 def _binary(symbol, compares=False, **emit):
-    """Make an operator of Python's act on lanes. emit: what it does to each kind"""
+    """Overload a Python operator for lanes. emit: LLVM instruction builder of each kind"""
 
     @infer_global(symbol)
     class Template(AbstractTemplate):
@@ -91,12 +91,12 @@ _binary(operator.xor, whole=lambda b, x, y: b.xor(x, y))
 
 
 def fetch(array, at):
-    """The sixteen numbers of an array from `at` on."""
+    """Load array[at : at + 16]."""
     return array[_places(array, at, LANES)].copy()
 
 
 def fetch_like(array, at, like):
-    """Numbers of an array from `at` on, one for each entry of the tuple."""
+    """Load array[at : at + len(like)]."""
     return array[_places(array, at, len(like))].copy()
 
 
@@ -106,22 +106,22 @@ def put(array, at, x):
 
 
 def gather(array, at, stride, like):
-    """Numbers `at`, `at` + `stride` and so on of an array, as many as the tuple is long."""
+    """Strided load: array[at + k stride] for each lane k of `like`."""
     return array[at + stride * np.arange(len(like))]
 
 
 def scatter(array, at, stride, x):
-    """Lane k becomes number `at` + k `stride` of an array."""
+    """Strided store: array[at + k stride] = x[k] for each lane k."""
     array[at + stride * np.arange(len(x))] = x
 
 
 def filled(x, like):
-    """Lanes of one value, one for each entry of the tuple."""
+    """Broadcast one value to as many lanes as `like` has."""
     return np.full(len(like), x)
 
 
 def turn(array, at, to, apart):
-    """Column i of the square of sixteen rows from `at` on becomes row i of that from `to` on. apart: from row to row"""
+    """Transpose the 16 x 16 matrix from `at` on into that from `to` on. apart: row stride"""
     square = apart * np.arange(LANES)[:, None] + np.arange(LANES)
     array[to + square] = array[at + square].T
 
@@ -133,7 +133,7 @@ def _places(array, at, count):
 
 
 def put_where(condition, array, at, x):
-    """array[at : at + 16] = x where the mask holds; the other numbers are not touched."""
+    """Masked store: array[at : at + 16] = x where the mask holds."""
     array[_places(array, at, LANES)][condition] = x[condition]
 
 
@@ -143,22 +143,22 @@ def where(condition, x, y):
 
 
 def lowest(x, y):
-    """The smaller of each pair."""
+    """Elementwise minimum."""
     return np.minimum(x, y)
 
 
 def highest(x, y):
-    """The larger of each pair."""
+    """Elementwise maximum."""
     return np.maximum(x, y)
 
 
 def whole(x):
-    """Numbers from 0 to below 2^31 without what follows the point."""
+    """Truncate numbers from 0 to below 2^31 to integers."""
     return x.astype(np.uint32)
 
 
 def real(x):
-    """Whole numbers below 2^31 as floating-point numbers."""
+    """Convert integers below 2^31 to floating point."""
     return x.astype(np.float32)
 
 
@@ -173,22 +173,24 @@ def some(condition):
 
 
 def exp2(x):
-    """2^x for x from -126 to 127, anything for others. Relative error at most 3e-7: a quintic on [-1/2, 1/2]."""
+    """2^x for x from -126 to 127, undefined for others. Relative error at most 3e-7: a quintic on [-1/2, 1/2]."""
     return np.exp2(x, dtype=np.float32)
 
 
 def ahead(array, at):
-    """Ask the memory for what is at array[at], to be fetched later."""
+    """Prefetch array[at] into the cache."""
     _places(array, at, 1)
 
 
 def totals(vectors):
-    """Lane k is the sum of all lanes of the k-th of up to sixteen vectors; lanes beyond mean nothing."""
+    """Horizontal sums: lane k is the sum of all lanes of vector k, of at most sixteen vectors; other lanes are
+    undefined.
+    """
     return np.array([x.sum() for x in vectors] + [0] * (LANES - len(vectors)), np.float32)
 
 
 def bytes_between(x):
-    """Eight bytes as one number: in byte r the bits from x[8 + r], rounded up, to x[r], rounded down, are set."""
+    """Bit mask of eight bytes: byte r has the bits from ceil(x[8 + r]) to floor(x[r]) set."""
     last = np.floor(np.minimum(x[:8], 7)).astype(int)
     first = np.ceil(np.maximum(x[8:], 0)).astype(int)
     bits = ((1 << np.maximum(last + 1, 0)) - (1 << np.minimum(first, 8))) * (first <= last)
@@ -196,12 +198,12 @@ def bytes_between(x):
 
 
 def first_bit(x):
-    """Number of the lowest bit that is set."""
+    """Index of the lowest set bit."""
     return (int(x) & -int(x)).bit_length() - 1
 
 
 def _vector(context, builder, sig, args, at, of):
-    """Pointer to the lanes of type `of` that begin with element args[at] of the array args[at - 1]."""
+    """Pointer to the lanes of type `of` at element args[at] of the array args[at - 1]."""
     kind = ir.VectorType(ELEMENTS[of.kind], of.count)
     return builder.bitcast(builder.gep(_data(context, builder, sig, args, at - 1), [args[at]]), kind.as_pointer())
 
@@ -212,7 +214,7 @@ def _data(context, builder, sig, args, number=0):
 
 
 def _apart(context, builder, sig, args, count):
-    """Pointers to elements args[1], args[1] + args[2] and so on of the array args[0]."""
+    """Pointers to `count` elements of the array args[0], from args[1] on in strides of args[2]."""
     array = _data(context, builder, sig, args)
     for k in range(count):
         yield builder.gep(array, [builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), k)))])
@@ -281,7 +283,7 @@ def _filled(typing, x, like):
 
 @intrinsic
 def _turn(typing, array, at, to, apart):
-    """Swap the square's off-diagonal quarters, then those of each quarter, down to single lanes."""
+    """Transpose recursively: swap the off-diagonal quarters, then those of each quarter, down to single lanes."""
 
     def generate(context, builder, sig, args):
         def rows(first):
@@ -305,7 +307,7 @@ def _turn(typing, array, at, to, apart):
 
 
 def _swapped(size):
-    """For rows a and b of a square's halves: the lanes of (a, b) that belong into a, and those that belong into b."""
+    """Shuffle masks for rows a and b of a square's halves: lanes of (a, b) for the new a, and for the new b."""
     upper = [LANES + lane - size if lane & size else lane for lane in range(LANES)]
     lower = [LANES + lane if lane & size else lane + size for lane in range(LANES)]
     return ir.Constant(INTS, upper), ir.Constant(INTS, lower)
@@ -318,7 +320,7 @@ def _where(typing, condition, x, y):
 
 
 def _chosen(real, whole):
-    """The one of each pair that comes first by an order of LLVM's."""
+    """Elementwise selection by an LLVM comparison: the operand for which it holds."""
 
     @intrinsic
     def choose(typing, x, y):
@@ -353,7 +355,7 @@ def _real(typing, x):
 
 
 def _each(builder, name, x):
-    """An operation of LLVM's on every lane."""
+    """Apply an LLVM intrinsic to every lane."""
     kind = ir.FunctionType(FLOATS, [FLOATS])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), [x])
 
@@ -408,7 +410,7 @@ _ROUNDER = 1.5 * 2.0**23  # adding it leaves the nearest whole number in the low
 
 @intrinsic
 def _exp2(typing, x):
-    """Pairs of terms are independent (Estrin), which is quicker than a chain of them."""
+    """Evaluate the polynomial by Estrin's scheme, whose terms are independent: faster than Horner's chain."""
 
     def generate(context, builder, sig, args):
         def constant(value, kind=ir.FloatType()):
@@ -444,7 +446,7 @@ def _ahead(typing, array, at):
 
 @intrinsic
 def _totals(typing, vectors):
-    """Fold halves: after each fold lanes of different vectors share a register, so that few shuffles do for all."""
+    """Sum by folding halves: after each fold lanes of different vectors share a register, which needs few shuffles."""
 
     def generate(context, builder, sig, args):
         lines = list(cgutils.unpack_tuple(builder, args[0]))

@@ -1,9 +1,9 @@
-"""Parts of an operation: its facts, checks of its inputs, the choice of an engine, and autograd around engines.
+"""Parts of an operation: its facts, input checks, engine dispatch, and autograd around engines.
 
-Compiled loops check no index. So `door` makes sure of the shapes and types that annotations state, and each function
-checks all else that an index is taken from: the starts of rays and tiles, the numbers of Gaussians. The values of
-samples are trusted, because checking each would cost as much as the loop; on a GPU indices are too, because checking
-them would wait for it.
+Compiled loops check no index. So `door` checks the shapes and types that annotations state, and each function
+checks all else that is used as an index: the starts of rays and tiles, the numbers of Gaussians. The values of
+samples are trusted, because checking each would cost as much as the loop. On a GPU indices are trusted too, because
+checking them would synchronise with it.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Facts:
-    """One operation in numbers. Inputs and outputs are named by their position, cases by theirs in `cases()`.
+    """Properties of an operation, for tests and benchmarks. Inputs and outputs are named by position, cases as in
+    `cases()`.
 
-    unit:           what the benchmark counts per second
-    unit_axes:      the first input has one unit for each entry along its leading so many axes
-    outputs:        how many tensors are returned
-    differentiable: the inputs that gradients reach; () where nothing is differentiated
+    unit:           benchmarked unit, counted per second
+    unit_axes:      number of leading axes of the first input that count units
+    outputs:        number of returned tensors
+    differentiable: inputs with gradients; () for an operation without
     typical:        a case that is neither empty nor extreme
     compiled:       the case whose options reach most of the GPU engine's code
-    smooth:         cases in which no input lies where the reference's slope jumps, small enough for `gradcheck`
+    smooth:         cases without inputs near discontinuous derivatives, small enough for `gradcheck`
     """
 
     unit: str
@@ -58,12 +59,12 @@ class Facts:
 
 
 def operations() -> list[str]:
-    """Names of all operations: those of the folders beside this file."""
+    """Names of all operations: the folders beside this file."""
     return sorted(module.name for module in pkgutil.iter_modules([str(Path(__file__).parent)]) if module.ispkg)
 
 
 def tensors(found: Any) -> tuple[Tensor, ...]:
-    """Outputs of an operation as a tuple: a tensor, several, or those that a dataclass holds."""
+    """Outputs of an operation as a tuple, from a tensor, a tuple or a dataclass of tensors."""
     if is_dataclass(found):
         found = tuple(getattr(found, field.name) for field in fields(found))
     return tuple(x for x in found if isinstance(x, Tensor)) if isinstance(found, tuple) else (found,)
@@ -116,7 +117,7 @@ def annotations_of(function: Callable) -> dict[str, Annotation]:
 
 
 def fits(tensor: Tensor, about: Annotation, sizes: dict[str, int]) -> bool:
-    """Check a tensor against an annotation. sizes: of the axes of earlier tensors; new ones are added."""
+    """Check a tensor against an annotation. sizes: named axes of earlier tensors; new ones are added"""
     if tensor.ndim != len(about.axes) or tensor.dtype not in about.types:
         return False
     for axis, size in zip(about.axes, tensor.shape, strict=True):
@@ -126,13 +127,13 @@ def fits(tensor: Tensor, about: Annotation, sizes: dict[str, int]) -> bool:
 
 
 def require(holds: bool, fault: str) -> None:
-    """Raise ValueError with the fault unless something holds."""
+    """Raise ValueError with the fault unless the condition holds."""
     if not holds:
         raise ValueError(fault)
 
 
 def require_starts(name: str, starts: Tensor, count: int) -> None:
-    """Raise ValueError unless the starts are int64 and rise from 0 to the count, some of them perhaps equal."""
+    """Raise ValueError unless the starts are int64 and non-decreasing from 0 to the count."""
     holds = len(starts) > 0 and starts.dtype == torch.int64
     if holds and not starts.is_cuda:
         holds = int(starts[0]) == 0 and int(starts[-1]) == count and bool((starts[1:] >= starts[:-1]).all())
@@ -151,7 +152,7 @@ _forced: contextvars.ContextVar[Engine | None] = contextvars.ContextVar("engine"
 
 @contextlib.contextmanager
 def using(engine: Engine) -> Iterator[None]:
-    """Run every operation inside this block on one engine, whatever device its tensors are on."""
+    """Run every operation inside this block on one engine, on any device."""
     token = _forced.set(engine)
     try:
         yield
@@ -165,9 +166,10 @@ _watch: Watch | None = None
 
 @contextlib.contextmanager
 def watching(watch: Watch) -> Iterator[None]:
-    """Inside this block, on all threads, take the result of watch(name, call, inputs) for that of each kernel's call().
+    """Replace the result of each kernel's call() by that of watch(name, call, inputs) inside this block, on all
+    threads.
 
-    name: "project forward", "project backward"; inputs: its own, and on the way back the context with saved tensors
+    name: "project forward", "project backward"; inputs: the forward inputs, or the context with saved tensors
     """
     global _watch
     before, _watch = _watch, watch
@@ -178,12 +180,12 @@ def watching(watch: Watch) -> Iterator[None]:
 
 
 def watched(name: str, run: Callable, *inputs: Any) -> Any:
-    """Result of run(*inputs), by the watch of the block around if there is one."""
+    """Result of run(*inputs), through the hook of `watching` if one is set."""
     return run(*inputs) if _watch is None else _watch(name, partial(run, *inputs), inputs)
 
 
 def implementation(operation: str, tensor: Tensor) -> Callable:
-    """The `run` function of an operation, on the engine that fits the tensor's device."""
+    """`run` function of an operation on the engine for the tensor's device."""
     engine = _forced.get() or ("gpu" if tensor.is_cuda else "cpu")
     try:
         run = importlib.import_module(f"{__package__}.{operation}.{engine}").run
@@ -195,7 +197,7 @@ def implementation(operation: str, tensor: Tensor) -> Callable:
 
 
 def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-    """Memory for an engine's output. LUMIGRAPH_DEBUG fills it with NaN, which shows entries never written."""
+    """Uninitialised output tensor. LUMIGRAPH_DEBUG fills it with NaN, which shows entries never written."""
     out = torch.empty(shape, dtype=dtype, device=device)
     if os.environ.get("LUMIGRAPH_DEBUG") and dtype.is_floating_point:
         out.fill_(torch.nan)
@@ -203,7 +205,7 @@ def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device 
 
 
 def differentiable(forward: Callable, backward: Callable, contiguous: bool = True) -> Callable:
-    """The `run` of an engine made of `forward` and `backward`, which are as in `torch.autograd.Function`.
+    """`run` function of an engine from `forward` and `backward` as in `torch.autograd.Function`.
 
     contiguous: make input tensors and gradients contiguous first
     """

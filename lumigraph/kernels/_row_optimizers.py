@@ -29,7 +29,7 @@ def _lazy(p, grad, mean, square, rates, count, width, rate, b1, b2, eps, keep, R
 
 
 def lazy_adam(p, grad, mean, square, rates, rate, b1, b2, eps, keep):
-    """A step of `LazyAdam`, in place. rates: of rows, or None"""
+    """One step of `LazyAdam`, in place. rates: learning rates of rows, or None"""
     given = rates is not None
     tensors = p, grad.contiguous(), mean, square, rates if given else p
     numbers = p.numel(), math.prod(p.shape[1:]), rate, b1, b2, eps, keep
@@ -60,7 +60,7 @@ def _cloud(
 
 
 def cloud_adam(p, grad, mean, square, last, columns, t, rate, betas, eps):
-    """A step of `CloudAdam`, in place. p, grad, mean, square: (row, column); columns: factors of their rates"""
+    """One step of `CloudAdam`, in place. p, grad, mean, square: (row, column); columns: learning rate factors"""
     count, width = p.shape
     padded = triton.next_power_of_2(width)
     rows = max(TILE // padded, 1)

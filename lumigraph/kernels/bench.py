@@ -1,4 +1,4 @@
-"""Time of each engine and of the reference on the same device, in one run."""
+"""Benchmark of each engine and of the reference on the same device, in one run."""
 
 from __future__ import annotations
 
@@ -34,16 +34,17 @@ def bench_kernels(
     output: Path | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
-    """Time the engines that a device has, print a table, and return (and write to `output`) what is in it.
+    """Time the engines of a device, print a table, and return its contents (and write them to `output`).
 
     operations: their names; None for all
     device:     "cpu" for `reference` and `cpu`, "cuda" for `reference` and `gpu`; None for CUDA where there is one
     size:       samples, directions or pixels in each operation's benchmark case; marching takes one ray for every 64
-    repeats:    how many calls each median is taken over, after a first one that is reported by itself
-                because it compiles or loads what was compiled before
+    repeats:    number of calls for each median. The call before them is reported separately because it includes
+                compilation
 
-    Backward is the gradient in what training differentiates (for hash encoding the table alone), given a gradient
-    of the outputs. Rates are in operations["unit"] per second. Raises LumigraphError if `output` cannot be written.
+    Backward is the gradient in the inputs that training differentiates (for hash encoding the table alone), given a
+    gradient of the outputs. Rates are in operations["unit"] per second. Raises LumigraphError if `output` cannot be
+    written.
     """
     if output is not None:
         claim(output, "benchmark")

@@ -1,5 +1,5 @@
 """Alignment of blocks: the appearance code of each is fitted to the pictures of its neighbours (Tancik 2022, 4.3.3),
-and all are rendered with one exposure. Stops count from the median of its photographs."""
+and all are rendered with one exposure, relative to the median of their photographs."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ def align_appearance(
     cameras: Camera,
     kept: Iterable[int] | None = None,
 ) -> list[Float[Tensor, " code"]]:
-    """The appearance code of each block, in which it looks like its neighbours.
+    """Appearance code of each block, fitted to match its neighbours.
 
-    Some blocks keep the appearance that they show: those of `kept`, or where it is None the one nearest to the middle
-    of all, in the average of its photographs. Outward from there, nearest first, each block's code is optimised so that
-    rays of cameras which it and blocks that are aligned already see well show the same colours, with all weights as
-    they are. All neighbours that are aligned are compared with. A block with none in reach is aligned to the nearest.
+    Some blocks keep their appearance: those of `kept`, or if None the block nearest to the centre of all, in the
+    average appearance of its photographs. Outward from there, nearest first, each block's code is optimised, with fixed
+    weights, to match the colours of all aligned neighbours along rays that both see well. A block without neighbours in
+    reach is aligned to the nearest.
 
-    parts, centres, radii: as `InBlocks` takes them, in one common frame
-    cameras: from which places to compare are chosen: the capture's photographs, in the common frame
+    parts, centres, radii: as for `InBlocks`, in one common frame
+    cameras: of the photographs, in the common frame; comparisons use some of them
 
     A code is stored as a plain list of numbers; `method.given(Appearance(torch.tensor(numbers)))` restores it. A block
-    that learnt no appearance has an empty code. To align a block that was trained again, give the others their codes
+    without appearance codes has an empty one. To align a block that was trained again, give the others their codes
     first and name them in `kept`.
     """
     parts = Nearby.of(parts)
@@ -55,7 +55,7 @@ def align_appearance(
     found = dict[int, Appearance]()
 
     def lit(number: int) -> Placed:
-        """A part in its light, as far as that is found."""
+        """A part in its appearance, if already fitted."""
         part = exposed(parts[number], exposure)
         return replace(part, method=part.method.given(found[number])) if number in found else part
 
@@ -81,7 +81,7 @@ def align_appearance(
 
 
 def appearance_of(part: Placed) -> Float[Tensor, " code"]:
-    """The code that a part is shown in; empty where it has none."""
+    """A part's current appearance code; empty without one."""
     if not can(part.method, HasAppearance):
         return torch.zeros(0)
     return needs(part.method, HasAppearance).shown_in.code.detach().cpu()
@@ -90,8 +90,8 @@ def appearance_of(part: Placed) -> Float[Tensor, " code"]:
 def patch(
     known: Placed, other: Placed, centres: Float[Tensor, "2 3"], radii: Float[Tensor, 2], cameras: Camera
 ) -> Batch | None:
-    """Rays in the frame of one block, with the colours that another shows along them: those of some cameras between the
-    two, of pixels that both saw well (section 4.3.3). None where there are no cameras."""
+    """Rays in the frame of one block with another block's colours along them, from some cameras between the two, at
+    pixels that both see well (section 4.3.3). None without such cameras."""
     views = [looked(known, other, camera) for camera in between(centres, radii, cameras)]
     views = sorted(views, key=lambda view: float(view.visibility.mean()), reverse=True)[:COMPARED_CAMERAS]
     return joined([view.well_seen() for view in views]) if views else None
@@ -99,14 +99,14 @@ def patch(
 
 @dataclass(frozen=True)
 class BlockView:
-    """Colours that one block shows a camera, the camera in the frame of another, and how well both saw each pixel."""
+    """One block's rendering for a camera in another block's frame, and the visibility of each pixel in both."""
 
     rgb: Float[Tensor, "height width 3"]
     camera: Camera
     visibility: Float[Tensor, "height width"]
 
     def well_seen(self) -> Batch:
-        """Patches of SIDE by SIDE pixels that both saw well, one after the other, as rays of the other block."""
+        """Patches of SIDE by SIDE pixels of high visibility in both, concatenated, as rays of the other block."""
         height, width = (n // PATCH_SIDE * PATCH_SIDE for n in self.visibility.shape)
         pixel = torch.arange(self.visibility.numel(), device=self.visibility.device).view_as(self.visibility)
         rows = pixel[:height, :width].unfold(0, PATCH_SIDE, PATCH_SIDE)
@@ -118,7 +118,7 @@ class BlockView:
 
 
 def looked(known: Placed, other: Placed, camera: Camera) -> BlockView:
-    """One block looked at through a small picture, and by how much the less seeing of both saw each pixel."""
+    """Render one block in a small picture, with each pixel's lesser visibility of both."""
     small = camera.resized(min(1.0, PICTURE_SIDE / int(camera.size.max())))
     seen, theirs = known.rendering(small), other.rendering(small)
     both = torch.minimum(saw(known, small, seen), saw(other, small, theirs))
@@ -127,14 +127,14 @@ def looked(known: Placed, other: Placed, camera: Camera) -> BlockView:
 
 
 def between(centres: Float[Tensor, "2 3"], radii: Float[Tensor, 2], cameras: Camera) -> list[Camera]:
-    """Some of the cameras that are about as near to one block as to the other, by their radii, the nearest of them."""
+    """Cameras about as near to one block as to the other, relative to their radii; some of the nearest."""
     farther = ((cameras.position[:, None] - centres) / radii[:, None]).norm(dim=-1).amax(-1)
     near = farther.argsort()[: 3 * MAX_CAMERAS]
     return [cameras[int(i)] for i in evenly(near.tolist(), MAX_CAMERAS)]
 
 
 def joined(batches: Sequence[Batch]) -> Batch:
-    """One batch of several, none of them with alpha."""
+    """Concatenate batches without alpha."""
     columns = {
         name: torch.cat([getattr(x.rays, name) for x in batches]) for name in ("origins", "directions", "radius")
     }
@@ -143,12 +143,12 @@ def joined(batches: Sequence[Batch]) -> Batch:
 
 
 def own_exposure(part: Placed) -> float | None:
-    """log2 of the exposure that is usual in one part; None where it knows of none."""
+    """Usual exposure of one part, log2; None if unknown."""
     return needs(part.method, HasExposure).usual_exposure if can(part.method, HasExposure) else None
 
 
 def exposed(part: Placed, exposure: float | None) -> Placed:
-    """The same part as if photographed with an exposure, log2 of it, or as near to it as it learnt from."""
+    """The same part at an exposure, log2, clamped to its training range."""
     usual, reach = own_exposure(part), own_range(part)
     if usual is None or reach is None or exposure is None:
         return part
@@ -157,7 +157,7 @@ def exposed(part: Placed, exposure: float | None) -> Placed:
 
 
 def own_range(part: Placed) -> tuple[float, float] | None:
-    """The least and the most exposure, log2 of it, that one part learnt from; None where it has no choice."""
+    """Least and largest training exposure of one part, log2; None without exposure control."""
     control = next((x for x in part.method.controls if x.name == EXPOSURE), None)
     own = own_exposure(part)
     if control is None or control.range is None or own is None:
@@ -167,13 +167,13 @@ def own_range(part: Placed) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class Asked:
-    """Controls and exposures of many parts, each of which is asked once.
+    """Controls and exposures of all blocks.
 
-    photographs: whether each finds its own appearance in a photograph
-    refined:     whether any was learnt with poses
-    controls:    that any of them has, the first of each name, but for exposure and those that name photographs
-    usual:       log2 of the exposure that is usual among them, the median of theirs; None where none of them knows
-    exposures:   the least and the most that any learnt from, log2 of them; None where none has a choice
+    photographs: whether each can fit its appearance to a photograph
+    refined:     whether any was trained with pose optimisation
+    controls:    of any block, the first of each name, except for exposure and those that name photographs
+    usual:       median of the blocks' usual exposures, log2; None if all are unknown
+    exposures:   least and largest training exposure of all, log2; None without exposure control
     """
 
     photographs: bool
@@ -184,7 +184,7 @@ class Asked:
 
     @classmethod
     def of(cls, parts: Iterable[Placed]) -> Asked:
-        """One part after the other is asked, and none is held."""
+        """Evaluate blocks one by one; load none permanently."""
         photographs, refined, controls = True, False, dict[str, Control]()
         usual, ranges = list[float](), list[tuple[float, float]]()
         for part in parts:

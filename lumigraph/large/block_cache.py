@@ -1,4 +1,4 @@
-"""Cache of the blocks of a scene that is too large for memory: opened when in use, the least recently used closed."""
+"""LRU cache of the blocks of a scene that is too large for memory."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ MAX_OPEN_BLOCKS = 8  # parts that stay open; a picture needs three
 
 
 class Nearby:
-    """Parts by number, of which the most recently used are open.
+    """Parts by number; the most recently used are open.
 
     open:  opens a part by its number, on its device
-    most:  number of parts that stay open
+    most:  largest number of open parts
     """
 
     def __init__(self, open: Callable[[int], Placed], count: int, most: int = MAX_OPEN_BLOCKS):
@@ -25,7 +25,7 @@ class Nearby:
 
     @classmethod
     def of(cls, parts: Sequence[Placed] | Nearby) -> Nearby:
-        """The same parts; those of a list are all open, and stay so."""
+        """Wrap a list, whose parts all stay open; a Nearby is returned unchanged."""
         return parts if isinstance(parts, Nearby) else cls(parts.__getitem__, len(parts), max(1, len(parts)))
 
     def __len__(self) -> int:
@@ -44,9 +44,9 @@ class Nearby:
         return (self[number] for number in range(len(self)))
 
     def each(self, change: Callable[[Placed], Placed]) -> Nearby:
-        """The same parts, each changed when it is asked for."""
+        """Lazy map: the parts with `change` applied on access."""
         return Nearby(lambda number: change(self[number]), len(self), self._most)
 
     def but(self, others: Mapping[int, Placed]) -> Nearby:
-        """The same parts, but for some that others stand for; these stay open."""
+        """The parts with some replaced by others, which stay open."""
         return Nearby(lambda number: others[number] if number in others else self[number], len(self), self._most)

@@ -1,7 +1,7 @@
-"""A run in blocks, opened as one scene: every block in its place, those in reach of a camera in its picture.
+"""An opened block run: every block in its place; a camera renders the blocks in its reach.
 
 RUN/
-├── blocks.json    see `plan`;  blocks.png  the plan seen from above
+├── blocks.json    see `plan`;  blocks.png  map of the plan
 ├── blocks/0/      an ordinary run for each block, in a frame of its own
 └── eval.json, eval.png, renders/ ...   as of any run
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -34,7 +35,7 @@ from ..opening import open_dataset
 from ..readers import Before, CapturePart
 from ..run.checkpoint import State
 from ..run.folder import Run
-from ..run.opened import Trained
+from ..run.opened import Trained, controlled
 from ..run.records import warn_of_changes
 from ..run.settings import Settings, Source
 from .block_cache import Nearby
@@ -45,10 +46,10 @@ MAX_REACH = 64.0
 
 
 class BlockRun(Trained):
-    """A folder with a run in blocks. Raises LumigraphError where none of its blocks has a state.
+    """A folder with a block run. Raises LumigraphError if none of its blocks has a state.
 
-    plan:   what blocks.json says
-    blocks: those that have a state, and their runs by name; the others are named in a LumigraphWarning
+    plan:   contents of blocks.json
+    blocks: runs by name of those with a state; the others are named in a LumigraphWarning
     frame:  upright, all blocks within [-1, 1]^3
     """
 
@@ -84,7 +85,7 @@ class BlockRun(Trained):
 
     @cached_property
     def _around(self) -> CapturePart:
-        """A ball on the ground that holds all blocks of the plan, in the source's frame."""
+        """Bounding ball of all blocks of the plan, centred on the ground, in the source's frame."""
         upright = np.array(self.plan.upright)
         centres = np.array([block.centre for block in self.plan.blocks]) @ upright.T
         radii = np.array([[block.radius] for block in self.plan.blocks])
@@ -119,9 +120,9 @@ class BlockRun(Trained):
     def method(
         self, device: torch.device | str = "cpu", exposures: Float[Tensor, " photograph"] | None = None
     ) -> Method:
-        """All blocks as one method; clouds of Gaussians, each cut to its cell, as one cloud.
+        """All blocks as one method; clouds of Gaussians, each cropped to its cell, as one cloud.
 
-        exposures: of photographs that it will be given, by their `image_index`
+        exposures: of photographs that will be passed to it, by their `image_index`
         """
         if all(can(methods.find(run.method_name), HasGaussians) for run in self.runs.values()):
             parts = [self.placed(block, device) for block in self.blocks]
@@ -133,8 +134,8 @@ class BlockRun(Trained):
         return InBlocks(self.frame, nearby, self.centres, self.radii, exposures=exposures).to(device)
 
     def placed(self, block: Block, device: torch.device | str = "cpu") -> Placed:
-        """A block in its place, in the light that all are shown in where they have been aligned. What was learnt with
-        poses has a frame of its own, which training photographs align with the given one."""
+        """A block with its place in the common frame, in its aligned appearance if any. A run with pose optimisation
+        has a frame of its own, which is aligned by its training photographs."""
         run = self.runs[block.name]
         method = run.method(device).requires_grad_(False)
         if code := self.plan.appearance.get(block.name):
@@ -147,7 +148,7 @@ class BlockRun(Trained):
 
     @cached_property
     def _photographs(self) -> dict[tuple[str, str], tuple[str, str]]:
-        """By source and name, the block nearest to each photograph, and what it serves there."""
+        """Nearest block and split of each photograph, by source and name."""
         found: dict[tuple[str, str], tuple[float, str, str]] = {}
         for block in self.blocks:
             run, source = self.runs[block.name], self._source(block)
@@ -163,7 +164,7 @@ class BlockRun(Trained):
         return (block.scene or self.plan.scene).source
 
     def cameras(self) -> dict[str, Camera]:
-        """The photographs' cameras by split, in the frame: each once, as the block nearest to it has it."""
+        """The photographs' cameras by split, in the frame; each once, from its nearest block."""
         return {split: Camera.cat([camera for _, camera in some]) for split, some in self._views.items()}
 
     def view_names(self) -> dict[str, list[str]]:
@@ -171,7 +172,7 @@ class BlockRun(Trained):
 
     @cached_property
     def _views(self) -> dict[str, list[tuple[str, Camera]]]:
-        """Names and cameras of photographs by split, those to learn from first."""
+        """Names and cameras of photographs by split, the training ones first."""
         found: dict[str, list[tuple[str, Camera]]] = {"train": []}
         for block in self.blocks:
             run, names = self.runs[block.name], self.runs[block.name].view_names()
@@ -192,10 +193,10 @@ class BlockRun(Trained):
         return f"is a run in blocks; convert each by itself: {self.folder / BLOCKS_FOLDER / self.blocks[0].name}"
 
     def dataset(self, source: str | None = None, split: str | None = None) -> Scene:
-        """The photographs again, in the frame.
+        """Open the photographs again, in the frame.
 
-        source: where they are now, if they have moved; that of a block which was learnt again, for those of it alone
-        split:  those of this one alone, and one to learn from, which no scene is without; None for all
+        source: their present path, if they have moved; that of a retrained block opens its photographs alone
+        split:  only this one and a training photograph, which every scene needs; None for all
         """
         again = {self._source(block) for block in self.blocks if block.scene is not None}
         asked = str(Path(source).resolve()) if source and Path(source).exists() else source
@@ -222,13 +223,20 @@ class BlockRun(Trained):
     def learnt_from(self) -> Source:
         return self.plan.scene
 
+    def method_and_data(
+        self, device: torch.device | str, settings: Iterable[str] = (), source: str | None = None, split: str = "test"
+    ) -> tuple[Method, Scene]:
+        """Method by the exposures of the photographs that it will be given, and these."""
+        data = self.dataset(source, split)
+        return controlled(self, self.method(device, data.about.get("exposure")), settings), data
+
     @property
     def method_name(self) -> str:
         return self.plan.method
 
     @property
     def state(self) -> State:
-        """Steps and seconds of all blocks together, and the memory of the one that needed most."""
+        """Steps and seconds of all blocks together, and the largest peak memory."""
         states = [run.state for run in self.runs.values()]
         return State(
             sum(x.step for x in states),
@@ -243,7 +251,7 @@ class BlockRun(Trained):
 
     @property
     def settings(self) -> Settings:  # type: ignore[override]  # from all blocks, when it is asked for
-        """Settings that an ordinary run of the whole would have."""
+        """Settings of an equivalent ordinary run."""
         plan, counts = self.plan, dict[str, int]()
         for _, split in self._photographs.values():
             counts[split] = counts.get(split, 0) + 1

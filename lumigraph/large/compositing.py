@@ -1,9 +1,10 @@
-"""Compositing of blocks: a scene too large for one field, rendered by the blocks that saw what a camera looks at.
+"""Compositing of blocks: rendering a scene that is too large for one field.
 
-Tancik et al. 2022 (Block-NeRF, arXiv 2202.05263), section 4.3: blocks within reach of a camera, without those that do
-not see what it sees (4.3.1), each rendered by itself, their pictures mixed by how near the camera is to each (4.3.2).
-Clouds of Gaussians become one cloud: a block models badly what lies beyond its own ground, so each gives only what lies
-in its own cell, and cells do not overlap (Lin 2024, VastGaussian, section 3.4; Liu 2024, CityGaussian, section 3.3).
+Tancik et al. 2022 (Block-NeRF, arXiv 2202.05263), section 4.3: each block within reach of a camera and of sufficient
+visibility (4.3.1) is rendered by itself, and the pictures are mixed by the camera's distance to each (4.3.2).
+Clouds of Gaussians become one cloud: a block models badly what lies beyond its own ground, so each contributes only the
+Gaussians in its own cell, and cells do not overlap (Lin 2024, VastGaussian, section 3.4; Liu 2024, CityGaussian,
+section 3.3).
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ FULL_WEIGHT = 0.02  # share of a picture from which on a block counts fully wher
 
 
 class InBlocks(Method):
-    """Several placed methods, each for a part of one large scene. Ready to render, and nothing else.
+    """Several placed methods, each for a part of one large scene. For rendering only.
 
-    frame:     the common frame, in which cameras, centres and radii are given
-    parts:     a block each: its method, on its device, and the way from its own frame to the common one, which is
-               `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common frame belong
-               to no block's photographs. `Nearby` opens them where a camera comes near
+    frame:     the common frame of cameras, centres and radii
+    parts:     one per block: its method, on its device, and the similarity from its own frame to the common one,
+               `frame.to_source.inverse @ part_frame.to_source`. No part leads: cameras of the common frame belong to no
+               block's photographs. `Nearby` opens them where a camera comes near
     radii:     distance from its centre within which a camera uses a block; a camera in reach of none uses the nearest
-    exposures: of the capture's photographs, by their `image_index`, as `Scene.about["exposure"]` has them, where known
+    exposures: of the capture's photographs, by their `image_index`, as in `Scene.about["exposure"]`, where known
 
-    Blocks are shown as if photographed with one exposure, the median of what is usual in each. The control `exposure`
-    counts stops from there; others that blocks have, but for those that name photographs, are passed on to all. A
-    Photograph may be given: each block in reach of its camera finds its own appearance in it.
+    Blocks are rendered at one exposure, the median of their usual ones. The control `exposure` counts stops from there;
+    the blocks' other controls, except those that name photographs, are passed on to all. With a Photograph as evidence
+    each block in reach of its camera fits its own appearance to it.
     """
 
     any_lens = True
@@ -89,8 +90,8 @@ class InBlocks(Method):
 
     @torch.no_grad()
     def weights(self, camera: Camera) -> Float[Tensor, " block"]:
-        """Weight of each block in the picture of a camera; they sum up to 1. Pixels have weights of their own where
-        mixing is not by the camera."""
+        """Weight of each block in a camera's picture; they sum to 1. Mixing by points or visibility has weights per
+        pixel instead."""
         c = self.config
         distance = (camera.position.to(self.centres) - self.centres).norm(dim=-1)
         weights = inverse_distance(distance, self.radii, c.power, c.most)
@@ -124,8 +125,8 @@ class InBlocks(Method):
     def _by_pixel(
         self, camera: Camera, chosen: Tensor, weights: Float[Tensor, " chosen"], seen: Sequence[Rendering]
     ) -> Float[Tensor, "height width chosen"]:
-        """Shares of each pixel: by how far from a block's centre lies what it shows there, or by how much of it the
-        block saw; a block that has hardly a say in the picture has no more in its pixels."""
+        """Weights per pixel: by the distance of the visible point from a block's centre, or by its visibility in the
+        block; at most the block's weight in the picture."""
         c, entered = self.config, (weights / FULL_WEIGHT).clamp(max=1)
         if c.by == "visibility":
             found = [saw(self.blocks[i], camera, x) for i, x in zip(chosen.tolist(), seen, strict=True)]
@@ -140,8 +141,8 @@ class InBlocks(Method):
         return shares((distance / distance.amin(-1, keepdim=True)) ** -c.power * entered)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per unit of the common frame: that of blocks in whose reach points lie, mixed by inverse distance.
-        Raises LumigraphError where a block knows none."""
+        """Density per unit of the common frame: that of blocks in reach of the points, mixed by inverse distance.
+        Raises LumigraphError for a block without density."""
         weights = self._at(points)
         density = torch.zeros_like(points[:, 0])
         for i in (weights > MIN_WEIGHT).any(0).nonzero()[:, 0].tolist():
@@ -150,7 +151,7 @@ class InBlocks(Method):
         return density
 
     def _at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point block"]:
-        """Shares that blocks have at places."""
+        """Weights of blocks at points."""
         distance = (points[:, None] - self.centres).norm(dim=-1)
         return shares(inverse_distance(distance, self.radii, self.config.power, self.config.most))
 
@@ -160,7 +161,7 @@ class InBlocks(Method):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Exposure, and what else any block can be told that does not name photographs."""
+        """Exposure, and the blocks' other controls that do not name photographs."""
         found = self.asked.controls
         if self.asked.exposures and self.usual is not None:
             least, most = (x - self.usual for x in self.asked.exposures)
@@ -169,8 +170,8 @@ class InBlocks(Method):
         return found
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same blocks, each told what it has a control for; or each in the appearance that it finds in a
-        Photograph, where its camera is in reach."""
+        """The same blocks with evidence: controls for those that have them, or a Photograph to which each block in
+        reach of its camera fits its appearance."""
         mine: list[Any] = [piece for piece in evidence if isinstance(piece, self.accepts)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
         assert isinstance(told, InBlocks)
@@ -184,7 +185,7 @@ class InBlocks(Method):
         return told
 
     def _seen_in(self, photograph: Photograph, parts: Nearby) -> Nearby:
-        """Parts in the light of a photograph, and in its exposure where that is known, those in reach of its camera."""
+        """Parts in the appearance and, if known, the exposure of a photograph, for those in reach of its camera."""
         camera, exposure = photograph.camera.to(self.device), None
         if self.exposures is not None and camera.image_index is not None:
             found = float(self.exposures[int(camera.image_index[0])].log2())
@@ -203,9 +204,9 @@ class InBlocks(Method):
 
 
 def mixed(seen: Sequence[Rendering], weights: Float[Tensor, "height width block"], frame: Frame) -> Rendering:
-    """One picture of several over black, by their shares of each pixel, before a frame's background.
+    """Mix pictures over black by weights per pixel, and composite them over a frame's background.
 
-    Depth is the mean of what is opaque, by the same shares; infinity where most say that nothing is there.
+    Depth is the mean over opaque ones, by the same weights; infinity where most are empty.
     """
     rgb, opacity, depth = (torch.stack([getattr(x, name) for x in seen], -1) for name in ("rgb", "opacity", "depth"))
     rgb, opacity = (rgb * weights[..., None, :]).sum(-1), (opacity * weights).sum(-1)
@@ -218,14 +219,13 @@ def mixed(seen: Sequence[Rendering], weights: Float[Tensor, "height width block"
 
 @torch.no_grad()
 def merged(parts: Sequence[Placed], centres: Float[Tensor, "block 3"] | None = None) -> Gaussians:
-    """One cloud in the frame that the parts are placed in: of each part the Gaussians whose centres its cell holds.
+    """One cloud in the parts' common frame: the Gaussians of each part whose centres lie in its cell.
 
-    parts:   one for each block, its method a cloud; a part's crop, in the part's own frame, holds besides its cell
-    centres: of the blocks, in the order of the parts, in the common frame; a part's cell are the points nearest to its
-             centre (Voronoi's), which reach to infinity at the outermost blocks, so that the sky is kept once as well.
-             None where the parts' crops are the cells
-    Ground plans stay upright where all centres have the same height. Harmonics, and what opacities mean, as `joined`
-    has them. Raises LumigraphError where parts and centres differ in number, no part is given, or one is no cloud.
+    parts:   one for each block, its method a cloud; a part's crop, in the part's own frame, applies besides its cell
+    centres: of the blocks, in the order of the parts, in the common frame; a part's cell is its Voronoi cell, unbounded
+             for the outermost blocks, so that the sky is kept once as well. None where the parts' crops are the cells
+    Cells are vertical where all centres have the same height. Harmonics, and the meaning of opacities, as in `joined`.
+    Raises LumigraphError for different numbers of parts and centres, for no part, and for a part that is no cloud.
     """
     if not parts or (centres is not None and len(centres) != len(parts)):
         raise LumigraphError(
@@ -239,7 +239,7 @@ def merged(parts: Sequence[Placed], centres: Float[Tensor, "block 3"] | None = N
 
 
 def nearest(points: Float[Tensor, "point 3"], centres: Float[Tensor, "block 3"]) -> Int[Tensor, " point"]:
-    """The number of the centre nearest to each point, the first of equals."""
+    """Number of the centre nearest to each point, the first of equals."""
     best = torch.zeros(len(points), dtype=torch.int64, device=points.device)
     least = torch.full((len(points),), torch.inf, dtype=torch.float64, device=points.device)
     for i, centre in enumerate(centres.to(points.device).double()):

@@ -1,8 +1,8 @@
 """Layout of blocks, and the photographs that each learns from (Tancik 2022, section 3 and 4.1).
 
-A block is a disc on the ground. At crossings, where photographs were taken along streets that meet; otherwise where
-k-means puts so many of them. Each photograph is nearest to one centre, and a block's radius is 4/3 of how far its
-cell goes: to the farthest of those, and half-way to the next centre. Two neighbours then overlap by half a radius.
+A block is a disc on the ground. Centres are at crossings, for photographs along streets that meet; otherwise by
+k-means. Each photograph belongs to its nearest centre, and a block's radius is 4/3 of its cell's extent: to the
+farthest of its photographs, and half-way to the next centre. Two neighbours then overlap by half a radius.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STEP_SCALES = (1.0, 1.5, 2.0, 3.0)  # times a step, at which streets are searche
 
 @dataclass(frozen=True)
 class Disc:
-    """A block as a file says it: in the source's frame and units."""
+    """A block in a file, in the source's frame and units."""
 
     centre: Point
     radius: Positive
@@ -57,13 +57,13 @@ class Discs:
 
 
 def lay_out(places: Places, wish: str | Path = "auto", source: str = "the capture") -> list[Block]:
-    """The blocks of a capture, each with at least one photograph to learn from.
+    """Blocks of a capture, each with at least two training photographs.
 
     wish:   "auto", a number, or a file with `Discs`
-    source: what to name
-    Blocks that no photograph is of are left out, and named in a LumigraphWarning; so is how many photographs are of no
-    block. Raises LumigraphError for a number that there are too few places for, a file that is none, and one whose
-    blocks are all elsewhere.
+    source: named in faults
+    Smaller blocks are left out and named in a LumigraphWarning, as is the number of training photographs outside all
+    blocks. Raises LumigraphError for a number that exceeds the places, an invalid file, and one whose blocks are all
+    elsewhere.
     """
     from_file = not (str(wish) == "auto" or str(wish).isdigit())
     if not from_file:
@@ -104,7 +104,7 @@ def lay_out(places: Places, wish: str | Path = "auto", source: str = "the captur
 
 
 def discs(places: Places, number: int | None) -> list[Disc]:
-    """Discs that hold every photograph, as many as asked for; None for as many as suits."""
+    """Discs that cover every photograph; None chooses their number."""
     ground = places.ground
     centres = spread(ground, number) if number else centres_for(ground)
     owner = cells(ground, centres)
@@ -122,7 +122,7 @@ def discs(places: Places, number: int | None) -> list[Disc]:
 
 
 def centres_for(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, "block 2"]:
-    """Crossings, and more where streets go far beyond them; k-means where there are no such streets."""
+    """Centres at crossings, and more where streets reach far beyond them; by k-means without streets that meet."""
     centres = find_crossings(ground)
     if len(centres) < 2 or len(ground) < MIN_CROSSING_VIEWS * len(centres):
         return spread(ground, max(1, round(len(ground) / VIEWS_PER_BLOCK)))
@@ -140,7 +140,7 @@ def centres_for(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, 
 
 
 def spread(ground: Float[np.ndarray, "photograph 2"], number: int) -> Float[np.ndarray, "block 2"]:
-    """So many centres by k-means, from places as far apart as can be; by y, then by x. Nothing is random."""
+    """`number` centres by k-means from farthest-point initialisation, sorted by y, then x. Deterministic."""
     there = np.unique(ground.round(9), axis=0)
     if number > min(len(there), MAX_BLOCKS):
         raise LumigraphError(
@@ -190,10 +190,10 @@ def reaches(
 
 
 def find_crossings(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, "crossing 2"]:
-    """The middles of crossings and corners, seen from above; none where there are no streets, or they never meet.
+    """Centres of crossings and corners on the ground; none without streets that meet.
 
-    Both lanes of a street are one street only from a step on that is about as long as they are apart. So several are
-    tried, and the one counts at which most streets meet, the finest of equals.
+    The lanes of a street merge only at a step about as long as their distance. So several steps are tried; the one with
+    most crossings is used, the finest of equals.
     """
     step = usual_step(ground)
     if step == 0:
@@ -202,7 +202,7 @@ def find_crossings(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarra
 
 
 def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Float[np.ndarray, "crossing 2"]:
-    """Crossings and corners, as far as they show in places that are a step apart."""
+    """Crossings and corners in places thinned to a step."""
     nodes = thinned(ground, step)
     near = cKDTree(nodes).query_ball_point(nodes, OUTER_RADIUS * step)
     found = [ways(nodes[some] - node, step) for node, some in zip(nodes, near, strict=True)]
@@ -217,7 +217,9 @@ def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Floa
 
 
 def usual_step(ground: Float[np.ndarray, "photograph 2"]) -> float:
-    """Distance from one place to the next along the way; 0 where all places are one."""
+    """Typical distance between neighbouring photographs, a quantile of their spanning tree's edges; 0 for a single
+    place.
+    """
     if len(ground) < 3:
         return 0.0
     distance, index = cKDTree(ground).query(ground, min(GRAPH_NEIGHBOURS, len(ground)))
@@ -229,15 +231,15 @@ def usual_step(ground: Float[np.ndarray, "photograph 2"]) -> float:
 
 
 def thinned(ground: Float[np.ndarray, "photograph 2"], step: float) -> Float[np.ndarray, "node 2"]:
-    """One place for all photographs within a square of a step."""
+    """One place for all photographs within a grid square of a step."""
     _, cell = np.unique(np.floor(ground / step).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
     return np.stack([np.bincount(cell, ground[:, k]) for k in range(2)], -1) / np.bincount(cell)[:, None]
 
 
 def ways(around: Float[np.ndarray, "near 2"], step: float) -> tuple[int, float]:
-    """In how many directions streets leave the middle of these places, 0 where there are places all around or none;
-    and the widest angle between two of them, radians."""
+    """Number of directions in which streets leave the middle of these places, 0 for places all around or none; and the
+    widest angle between two of them, radians."""
     far = around[np.linalg.norm(around, axis=-1) > INNER_RADIUS * step]
     if not len(far):
         return 0, 0.0

@@ -33,7 +33,7 @@ PROGRESS_FILE = "progress.json"
 
 @dataclass(frozen=True)
 class Stand:
-    """Progress of one block: the share of its budget, seconds of training, and the PSNR of what it learns from."""
+    """Progress of one block: the share of its budget, seconds of training, and the PSNR of its training photographs."""
 
     state: str = "waiting"
     share: float = 0.0
@@ -59,7 +59,7 @@ def stand_of(folder: Path) -> Stand:
 
 
 def last_line(path: Path) -> dict[str, Any]:
-    """The last whole line of a run's metrics; nothing where there is none."""
+    """The last complete line of a run's metrics; {} without one."""
     try:
         with open(path, "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
@@ -76,7 +76,7 @@ def last_line(path: Path) -> dict[str, Any]:
 
 
 class Watching:
-    """Context in which the progress of all blocks is shown. folders: of the blocks, by name"""
+    """Context that displays the progress of all blocks. folders: of the blocks, by name"""
 
     def __init__(self, run: Path, folders: dict[str, Path], show: bool = True):
         self.run, self.folders, self.show = run, folders, show
@@ -97,7 +97,7 @@ class Watching:
         self.note()
 
     def look(self) -> list[str]:
-        """Read all that is not done yet; the names of those that are new among those done."""
+        """Update unfinished blocks; returns the names of newly finished ones."""
         new = []
         for name, folder in self.folders.items():
             if self.stands[name].state != "done":
@@ -106,7 +106,7 @@ class Watching:
         return new
 
     def note(self) -> None:
-        """Write the progress of all blocks into the run's folder, for other processes."""
+        """Write the progress of all blocks to the run's folder, for other processes."""
         stands = {name: asdict(stand) for name, stand in self.stands.items()}
         files.write_json(self.run / PROGRESS_FILE, stands, ours=True)
 
@@ -156,7 +156,7 @@ class Watching:
 
 
 def described(stand: Stand) -> str:
-    """A stand in a few words."""
+    """Progress in a few words."""
     if stand.state in ("waiting", "beginning"):
         return stand.state
     parts = [f"{100 * stand.share:3.0f} %", f"{clock(stand.seconds)} trained"]
@@ -164,5 +164,5 @@ def described(stand: Stand) -> str:
 
 
 def in_order(folders: dict[str, Path]) -> Sequence[str]:
-    """Names of blocks, those that are begun already first, so that few are half-done at any time."""
+    """Names of blocks, those in progress first, so that few are half-done at any time."""
     return sorted(folders, key=lambda name: (not (folders[name] / "config.json").exists(), int(name)))

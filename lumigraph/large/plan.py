@@ -1,4 +1,4 @@
-"""blocks.json: how a large scene was divided into blocks, and what each of them learns. One file for all of a run.
+"""blocks.json: division of a large scene into blocks, and the training of each. One file for all of a run.
 
 {
   "format": "lumigraph blocks 1",
@@ -34,19 +34,19 @@ Number = Annotated[float, between(-1e6, 1e6)]
 
 
 def source_of(source: str, options: dict[str, Any]) -> Source:
-    """The photographs of a scene or a block, and the options to open them with that say something."""
+    """Source of photographs of a scene or a block, without options that are unset."""
     path, said = Path(source), {name: value for name, value in options.items() if value is not None}
     return Source(str(path.resolve()) if path.exists() else source, said)
 
 
 @dataclass(frozen=True)
 class Block:
-    """A place and the photographs of it.
+    """A block and its photographs.
 
     name:   of its folder
     centre, radius: in the source's frame and units
-    photographs: by name, those held out among them
-    scene, budget: of a block that was learnt again from other photographs: where they are, and for how long
+    photographs: by name, held-out ones included
+    scene, budget: source and budget of a block that was retrained on other photographs
     """
 
     name: BlockLabel
@@ -59,13 +59,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Task:
-    """task.json: all that a block is made of; nothing else says what becomes of its folder.
+    """task.json: complete description of a block's training.
 
     scene:   source and options of `open_dataset`, with the block as `part`
     upright: the rotation from the source's frame that brings up to +z, the same for all blocks
     budget:  {"steps": n}, {"seconds": s} or {"quality": word}
-    memory:  bytes of photographs that may stay in memory; a file holds what is more
-    threads: that a step may use; None for all there are
+    memory:  bytes of photographs in memory; larger captures use a file
+    threads: per step; None for all
     """
 
     method: str
@@ -80,7 +80,7 @@ class Task:
 
     @property
     def key(self) -> str:
-        """A hash of everything that the block's weights depend on."""
+        """Hash of everything that the block's weights depend on."""
         said = {name: value for name, value in asdict(self).items() if name != "threads"}
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
@@ -93,10 +93,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Done:
-    """done.json, the last file of a block: what it took.
+    """done.json, the last file of a block: its cost.
 
     key:     of the task
-    seconds: of training; compiling, and opening the photographs, are beside
+    seconds: of training, without compilation and opening the photographs
     """
 
     key: str
@@ -114,7 +114,7 @@ class Plan:
     """The contents of blocks.json.
 
     budget:  of each block
-    appearance: the code that each block is shown in, once they are aligned
+    appearance: appearance code of each block, once they are aligned
     """
 
     method: str
@@ -149,7 +149,7 @@ class Plan:
         )
 
     def block(self, name: str) -> Block:
-        """The block of a name. Raises LumigraphError, naming all blocks, if there is none."""
+        """Block by name. Raises LumigraphError, naming all blocks, if there is none."""
         blocks = {block.name: block for block in self.blocks}
         if name not in blocks:
             raise LumigraphError(f"There is no block {name}; there are {', '.join(blocks)}")

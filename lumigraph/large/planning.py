@@ -1,10 +1,10 @@
-"""Begin a run of many blocks: its folder, the task of every block and a picture of the plan, before any training."""
+"""Create a block run: its folder, the task of every block and a map of the plan, before any training."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from .. import files
-from ..budget import Budget
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files.plain import alike
@@ -21,10 +20,11 @@ from ..opening import read_capture
 from ..readers import Places, places_of
 from ..run import check_new, processor
 from ..run.folder import versions
+from ..training.options import DEFAULT_SECONDS, BlockOptions, TrainOptions
 from .layout import lay_out
 from .plan import BLOCKS_FOLDER, PLAN_FILE, TASK_FILE, Block, Plan, Task, source_of
 
-DEFAULT_SECONDS = 60.0  # per block
+SCENE_OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 PICTURE_FILE = "blocks.png"
 DRAWING_SIDE, SUPERSAMPLING = 1000, 3  # pixels of the longer side; supersampling factor
 MARGIN, HEADER_HEIGHT = 40, 60
@@ -39,59 +39,47 @@ def survey(source: str, reader: str | None = None) -> Places:
     return places_of(read_capture(source, reader))
 
 
-@dataclass(frozen=True)
-class BlockRecipe:
-    """Training of every block.
-
-    options: of `open_dataset` for the whole scene
-    budget:  of all blocks together, shared out evenly; None for a minute each, or a quality
-    here:    whether the device is this machine's
-    """
-
-    method: str
-    config: Any
-    options: dict[str, Any]
-    budget: Budget | None = None
-    quality: str | None = None
-    seed: int = 0
-    device: str = "cpu"
-    here: bool = True
-
-    def budget_of_each(self, blocks: int) -> dict[str, Any]:
-        """Budget of one of so many blocks."""
-        if self.quality:
-            return {"quality": self.quality}
-        if self.budget is None:
-            return {"seconds": DEFAULT_SECONDS}
-        if self.budget.steps is not None:
-            return {"steps": max(1, math.ceil(self.budget.steps / blocks))}
-        return {"seconds": self.budget.total / blocks}
-
-
-def make_plan(source: str, places: Places, wish: str, recipe: BlockRecipe) -> Plan:
-    """The plan of a scene: its blocks, see `lay_out`, and what each of them learns."""
-    blocks = lay_out(places, wish, source)
+def make_plan(
+    source: str,
+    places: Places,
+    method: str,
+    config: Any,
+    train: TrainOptions,
+    blocks: BlockOptions = BlockOptions(),
+    device: str = "cpu",
+) -> Plan:
+    """The plan of a scene: its blocks, see `lay_out`, and what each of them learns, by a method of its own."""
+    parts = lay_out(places, blocks.blocks or "auto", source)
     turn: Any = tuple(tuple(float(x) for x in row) for row in places.upright)
     return Plan(
-        recipe.method,
-        asdict(recipe.config),
-        source_of(source, recipe.options),
+        method,
+        asdict(config),
+        source_of(source, {name: getattr(train, name) for name in SCENE_OPTIONS}),
         turn,
-        blocks,
-        recipe.budget_of_each(len(blocks)),
-        recipe.seed,
-        recipe.device,
-        processor(torch.device(recipe.device)) if recipe.here else "machines of a cluster",
+        parts,
+        budget_of_each(train, len(parts)),
+        getattr(config, "seed", train.seed),
+        device,
+        processor(torch.device(device)) if blocks.address is None else "machines of a cluster",
         versions(),
     )
 
 
-def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int | None = None) -> Plan:
-    """Write a run's plan, with a task for every block; where it is there already, find that it is the same.
+def budget_of_each(train: TrainOptions, blocks: int) -> dict[str, Any]:
+    """Budget of one of so many blocks: the steps or seconds are shared out, and a quality is that of each."""
+    if train.quality:
+        return {"quality": train.quality}
+    if train.steps is not None:
+        return {"steps": max(1, math.ceil(train.steps / blocks))}
+    return {"seconds": DEFAULT_SECONDS if train.seconds is None else train.seconds / blocks}
 
-    places:  of all photographs, for the picture of the plan
+
+def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int | None = None) -> Plan:
+    """Write a run's plan and a task for every block, or check that the folder has the same plan already.
+
+    places:  of all photographs, for the map of the plan
     threads: see `Task`
-    Returns the plan as the folder has it. Raises LumigraphError where something else lies there, or another plan.
+    Returns the plan in the folder. Raises LumigraphError for a folder with other contents or another plan.
     """
     if (folder / PLAN_FILE).exists():
         known = Plan.read(folder / PLAN_FILE)
@@ -109,7 +97,7 @@ def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int |
 
 
 def write_task(folder: Path, task: Task) -> None:
-    """Leave a task in a block's folder; one that is there already stays if it is the same."""
+    """Write a task to a block's folder, unless the same is there already."""
     if (folder / TASK_FILE).exists() and (there := Task.read(folder)).key == task.key and there.threads == task.threads:
         return
     files.write_json(folder / TASK_FILE, asdict(task))  # a run that begins there knows it for ours
@@ -121,8 +109,8 @@ def place_of(run: Path, block: Block) -> Path:
 
 
 def difference(known: Plan, wanted: Plan) -> str | None:
-    """The first thing that two plans differ in, in a user's words; None if they come to the same. Blocks that were
-    learnt again from other photographs do not count."""
+    """First difference between two plans, in a user's words; None if they are equivalent. Retrained blocks are
+    ignored."""
     mine, other = asdict(known), asdict(wanted)
     for name in ("method", "scene", "config", "budget", "seed", "device", "upright"):
         if not alike(mine[name], other[name]):
@@ -133,7 +121,7 @@ def difference(known: Plan, wanted: Plan) -> str | None:
 
 
 def draw_plan(places: Places, blocks: Sequence[Block]) -> Image.Image:
-    """North is where the second axis of the levelled source points; photographs that are held out are orange."""
+    """Map of the plan. North is the second axis of the levelled source; held-out photographs are orange."""
     turn = places.upright.T
     centres = np.array([block.centre for block in blocks]) @ turn
     radii = np.array([block.radius for block in blocks])

@@ -1,9 +1,9 @@
 """Train all blocks of a run, in this process one after another or on Ray's workers; then align their appearances, or
-merge their clouds. Train one block again from other photographs.
+merge their clouds. Retrain one block on other photographs.
 
-Workers are on this machine, or on a cluster with storage that all its machines share. A block goes out as a path and
-comes back as a few numbers: photographs are read where they are learnt from, and states are files. So a worker, a
-machine or this process may be lost at any time; training continues from what was saved.
+Workers are on this machine, or on a cluster with shared storage. Only a block's path is sent, and a few numbers are
+returned: workers read photographs and write states on the shared storage. So a worker, a machine or this process may
+fail at any time; training continues from the saved states.
 """
 
 from __future__ import annotations
@@ -20,23 +20,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from .. import files, methods
-from ..budget import Budget
+from ..budget import given_budget
 from ..components.fields.appearance import Appearance
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
+from ..files import scene_name
 from ..files.locks import held
+from ..files.names import next_free
 from ..method.capabilities import HasGaussians, can
+from ..opening import kind_of
 from ..readers import Places
+from ..system.memory import free_memory
 from ..system.signals import Interrupt
+from ..training.options import BlockOptions, TrainOptions
 from .alignment import align_appearance
 from .block_cache import Nearby
 from .block_run import BlockRun
-from .layout import Disc, members
+from .layout import MIN_LARGE_VIEWS, Disc, members
 from .monitor import Watching, in_order
-from .plan import PLAN_FILE, TASK_FILE, Block, Done, Plan, Task, source_of
-from .planning import place_of, write_task
+from .plan import DONE_FILE, PLAN_FILE, TASK_FILE, Block, Done, Plan, Task, source_of
+from .planning import SCENE_OPTIONS, begin, difference, make_plan, place_of, survey, write_task
 from .worker import Conducted, Ended, finished, train_block, writable
 
 CLOUD_FILE = "cloud.ply"
@@ -55,10 +62,10 @@ RAY_ENVIRONMENT = {  # that Ray reads as it is loaded, unless the user's environ
 
 
 def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Conducted:
-    """Train all blocks of a run that are not done yet.
+    """Train all unfinished blocks of a run.
 
-    A block that fails leaves the others alone. Raises LumigraphError where another process works in the run, and where
-    workers cannot be had.
+    A block's failure does not affect the others. Raises LumigraphError where another process works in the run, and for
+    unavailable workers.
     """
     folders = {block.name: place_of(run, block) for block in plan.blocks}
     with held(run, "trained"), Watching(run, folders, show):
@@ -78,10 +85,10 @@ def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Condu
 
 
 def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
-    """Align the blocks' appearances and write their codes into blocks.json; of clouds, write the one that they make.
+    """Align the blocks' appearances and write their codes into blocks.json; for clouds, write the merged cloud.
 
-    again: names of blocks that were learnt again, which are aligned to the others as these are
-    Returns the plan as it is then. What is done already is not done again.
+    again: names of retrained blocks, which are aligned to the others
+    Returns the resulting plan. Finished steps are not repeated.
     """
     opened = BlockRun(folder)
     first = opened.placed(opened.blocks[0]).method
@@ -93,7 +100,7 @@ def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
 
 
 def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
-    """The plan with an appearance for every block; those that are known stay as they are (Tancik 2022, 4.3.3)."""
+    """Plan with an appearance code for every block; known ones stay unchanged (Tancik 2022, 4.3.3)."""
     names = [block.name for block in opened.blocks]
     known = {name: code for name, code in opened.plan.appearance.items() if name not in again}
     if all(name in known for name in names):
@@ -108,22 +115,20 @@ def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
     return plan
 
 
-def update(
-    run: Path, name: str, source: str, places: Places, options: dict[str, Any], budget: Budget | None, show: bool = True
-) -> Ended:
+def update(run: Path, source: str, train: TrainOptions, blocks: BlockOptions, show: bool = True) -> Ended:
     """Learn a block of a run again, put it into its place, and align it to its neighbours.
 
-    source, places: of the new photographs, in the frame of the old ones
-    options: of `open_dataset` for them
-    budget:  None for the one that the block had
+    source: of the new photographs, in the frame of the old ones
     The new block replaces the old one when it is done; an interrupted update continues. Files of other blocks stay.
     Raises LumigraphError for an unknown block, and where no photograph is of it.
     """
+    if (name := blocks.blocks) is None or not name.isdigit():
+        raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
     if not files.is_file(run / PLAN_FILE):
         raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
     with held(run, "trained"):
         plan = Plan.read(run / PLAN_FILE)
-        block = again(plan.block(name), source, places, options, budget)
+        block = again(plan.block(name), source, train)
         task, place = plan.task(block), place_of(run, block)
         if not ((place / TASK_FILE).exists() and Task.read(place).key == task.key and finished(place, task)):
             folder = run / UPDATES_FOLDER / f"{name}-{task.key[:8]}"
@@ -134,14 +139,15 @@ def update(
                 return ended
             files.exchange(folder, place)
             shutil.rmtree(folder, ignore_errors=True)  # what was there before
-        blocks = [block if one.name == name else one for one in plan.blocks]
-        replace(plan, blocks=blocks).write(run / PLAN_FILE)
+        replace(plan, blocks=[block if one.name == name else one for one in plan.blocks]).write(run / PLAN_FILE)
         finish(run, again=[name])
     return Ended(finished(place, task))
 
 
-def again(block: Block, source: str, places: Places, options: dict[str, Any], budget: Budget | None) -> Block:
-    """The block as it will learn from other photographs."""
+def again(block: Block, source: str, train: TrainOptions) -> Block:
+    """The block as it will learn from other photographs, by the budget of the options, or the one that it had."""
+    places, budget = survey(source, train.reader), given_budget(train.steps, train.seconds, train.quality)
+    options = {name: getattr(train, name) for name in SCENE_OPTIONS}
     chosen = members(places, Disc(block.centre, block.radius))
     learnt = np.array([split == "train" for split in places.splits])
     if (chosen & learnt).sum() < 2:
@@ -158,8 +164,8 @@ def again(block: Block, source: str, places: Places, options: dict[str, Any], bu
 class Workers:
     """Workers that train blocks.
 
-    count:   blocks at a time on this machine, each in a process of its own; None for this process alone
-    address: of a Ray cluster that is there already, HOST:PORT
+    count:   blocks at a time on this machine, each in its own process; None for this process alone
+    address: of a running Ray cluster, HOST:PORT
     cpus, gpus, memory: demand of a block: processors, GPUs, bytes
     """
 
@@ -171,7 +177,7 @@ class Workers:
 
 
 def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
-    """Learn blocks on workers. Raises LumigraphError where Ray is not there, or nothing answers at the address."""
+    """Train blocks on workers. Raises LumigraphError without Ray, and if the address does not answer."""
     ray = library("--workers" if workers.address is None else "--address")
     with connected(ray, workers), Interrupt() as interrupt:
         feasible(ray.nodes(), workers)
@@ -207,9 +213,9 @@ def on_workers(folders: dict[str, Path], workers: Workers) -> Conducted:
 
 
 def on_worker(folder: str, method_files: Sequence[str] = ()) -> Done | str | None:
-    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped.
+    """Train a block on a worker. Returns its cost, a sentence if it failed, None if it was stopped.
 
-    method_files: of methods from elsewhere, on storage that all machines share
+    method_files: of external methods, on the shared storage
     """
     with contextlib.redirect_stderr(sys.stdout):
         try:
@@ -223,7 +229,7 @@ def on_worker(folder: str, method_files: Sequence[str] = ()) -> Done | str | Non
 
 @contextlib.contextmanager
 def connected(ray: Any, workers: Workers) -> Iterator[None]:
-    """A cluster: one on this machine for as long as the block lasts, or one that is there already."""
+    """Block with a connection to a Ray cluster: a new one on this machine, or a running one."""
     if workers.address is not None:
         answering(workers.address)
         place: dict[str, Any] = {"address": workers.address}
@@ -245,7 +251,7 @@ def connected(ray: Any, workers: Workers) -> Iterator[None]:
 
 
 def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
-    """Raise LumigraphError unless some machine of the cluster has what a block asks for; Ray would wait for one."""
+    """Raise LumigraphError unless some machine of the cluster meets a block's demand; Ray would wait for ever."""
     asked = {"CPU": workers.cpus, "GPU": workers.gpus, "memory": workers.memory}
     there = [node["Resources"] for node in nodes if node.get("Alive")]
     if not any(all(node.get(name, 0) >= least for name, least in asked.items()) for node in there):
@@ -256,7 +262,7 @@ def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
 
 
 def library(option: str) -> Any:
-    """Ray itself. Raises LumigraphError, saying how to install it, where it is not."""
+    """Import Ray. Raises LumigraphError, with the command to install it, if it is missing."""
     for name, value in RAY_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
@@ -267,7 +273,7 @@ def library(option: str) -> Any:
 
 
 def answering(address: str) -> None:
-    """Raise LumigraphError unless something listens at HOST:PORT."""
+    """Raise LumigraphError unless HOST:PORT accepts connections."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit()):
         raise LumigraphError(f"--address {address} is no HOST:PORT; `ray start --head` says which it is")
@@ -281,7 +287,7 @@ def answering(address: str) -> None:
 
 
 def sentence(fault: BaseException) -> str:
-    """Why a block was given up."""
+    """One sentence on a block's failure."""
     if "OutOfMemory" in type(fault).__name__:
         return "its worker ran out of memory again and again; give smaller blocks, or fewer --workers"
     return f"its worker was lost {MAX_LOSSES} times or failed ({first_line(fault)})"
@@ -290,3 +296,56 @@ def sentence(fault: BaseException) -> str:
 def first_line(fault: BaseException) -> str:
     lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
     return (lines[-1] if lines else type(fault).__name__).rstrip(".")
+
+
+MEMORY_BYTES = 2 << 30  # bytes reserved for a block
+
+
+def places_in_blocks(source: str, train: TrainOptions, blocks: BlockOptions) -> Places | None:
+    """Positions of the photographs of a scene that is learnt in blocks; None for one that is learnt as a whole."""
+    if kind_of(source, Scene) is not Scene or Path(source).is_file() or (blocks.blocks == "1" and not blocks.field):
+        return None  # a file is a single picture
+    places = survey(source, train.reader)
+    few = places.splits.count("train") < MIN_LARGE_VIEWS
+    if few and not blocks.field and (blocks.blocks, blocks.workers, blocks.address) == (None, None, None):
+        return None
+    for name in ("view", "pause_at", "views", "depth_from"):
+        if getattr(train, name, None):
+            raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
+    return places
+
+
+def begin_blocks(
+    source: str,
+    places: Places,
+    method: str,
+    config: Any,
+    device: torch.device,
+    train: TrainOptions,
+    blocks: BlockOptions,
+    output: Path | None = None,
+) -> tuple[Path, Plan, Workers]:
+    """Begin a run in blocks, or go on with the latest one of the same plan. Returns its folder, plan and workers.
+
+    config: of the method of the blocks, which is the user's unless the options name another
+    """
+    learner, here = methods.check(blocks.field or method), blocks.address is None
+    plan = make_plan(source, places, learner, config, train, blocks, str(device))
+    folder = output or unfinished(f"runs/{scene_name(source)}-{methods.check(method)}", plan)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = blocks.workers
+    cpus = max(1, cores // count) if count else 1
+    plan = begin(folder, plan, places, None if here and count is None else cpus)
+    memory = min(MEMORY_BYTES, free_memory() // (2 * count)) if here and count else MEMORY_BYTES
+    return folder, plan, Workers(count, blocks.address, cpus, 1.0 if device.type == "cuda" else 0.0, memory)
+
+
+def unfinished(prefix: str, plan: Plan) -> Path:
+    """The latest run of this name, if it is the same and not done; else the next name that is free."""
+    free = next_free(prefix)
+    number = int(free.name.rpartition("-")[2])
+    latest = free.with_name(f"{free.name.rpartition('-')[0]}-{number - 1}")
+    if (latest / PLAN_FILE).is_file() and difference(known := Plan.read(latest / PLAN_FILE), plan) is None:
+        if not all((place_of(latest, block) / DONE_FILE).exists() for block in known.blocks):
+            return latest
+    return free

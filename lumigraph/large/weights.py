@@ -23,11 +23,11 @@ RAY_FRACTIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to a pixel's surface,
 
 @dataclass(frozen=True)
 class Mixing:
-    """Options for choosing the blocks of a picture and mixing them (section 4.3 and its comparison of ways).
+    """Options for choosing the blocks of a picture and mixing them (section 4.3).
 
     by: "camera", inverse distance from the camera to the blocks' centres, one weight for all pixels (the paper's);
-        "points", from what each pixel shows; "visibility", how much a block saw of what each pixel shows;
-        "nearest", the block whose centre is nearest alone
+        "points", inverse distance from each pixel's visible point; "visibility", that of each pixel's visible point in
+        a block's training photographs; "nearest", only the block with the nearest centre
     """
 
     by: Literal["camera", "points", "visibility", "nearest"] = "camera"
@@ -58,23 +58,23 @@ def inverse_distance(
 
 
 def seeing(visibility: Float[Tensor, "*place block"], threshold: float) -> Float[Tensor, "*place block"]:
-    """Weights of blocks by the mean visibility of what they show (section 4.3.1): 0 up to a threshold, 1 from twice
-    that on, so that none leaves a film at once."""
+    """Weights of blocks by their mean visibility (section 4.3.1): 0 up to a threshold, 1 from twice that on, so that no
+    block disappears abruptly in a film."""
     return (visibility / max(threshold, UNSEEN_WEIGHT) - 1).clamp(UNSEEN_WEIGHT, 1)
 
 
 def shares(weights: Float[Tensor, "*place block"]) -> Float[Tensor, "*place block"]:
-    """Weights that sum up to 1."""
+    """Normalise weights to sum 1."""
     return weights / weights.sum(-1, keepdim=True)
 
 
 @torch.no_grad()
 def saw(part: Placed, camera: Camera, seen: Rendering) -> Float[Tensor, "height width"]:
-    """Share of the way to what each pixel shows that the block's photographs saw, in [0, 1]; 1 for a method that does
-    not know.
+    """Visibility of each pixel's point in the block's training photographs, in [0, 1]; 1 for a method without
+    visibility.
 
     camera: in the picture's frame
-    seen:   what the part rendered for it; where nothing is, the way goes to the end of the block's frame
+    seen:   the part's rendering for it; at empty pixels the point is at the end of the block's frame
     """
     if not can(part.method, HasVisibility):
         return torch.ones_like(seen.depth)

@@ -1,12 +1,12 @@
-"""Train one block of a large scene: a function over the folder of the block, the same on every machine.
+"""Train one block of a large scene: a restartable function of the block's folder.
 
     RUN/blocks/3/
-    ├── task.json     what it is made of, all of it
+    ├── task.json     complete description of the training
     ├── config.json, cameras.json, checkpoints/, metrics.jsonl ...   an ordinary run
     └── done.json     last, with a hash of the task
 
-A finished block is skipped, a block with a state continues from it, any other begins. So it may be called again after
-the loss of a process or a machine.
+A finished block is skipped, a block with a state continues, any other begins. So the call may be repeated after the
+loss of a process or a machine.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SAVE_SECONDS = 30.0  # of training, the most that a lost worker costs
 
 @dataclass(frozen=True)
 class Ended:
-    """End of a call: with what the block took, or by a signal before it was done."""
+    """Result of a call: the block's cost, or the signal that stopped it."""
 
     done: Done | None
     signal: int | None = None
@@ -50,8 +50,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Conducted:
-    """Outcome of all blocks: what blocks took by name, a sentence for each that failed, and the signal that
-    stopped it."""
+    """Result of all blocks: costs by name, a sentence for each that failed, and the signal that stopped it."""
 
     done: dict[str, Done]
     failed: dict[str, str]
@@ -59,10 +58,10 @@ class Conducted:
 
 
 def train_block(folder: Path, save_every: float = SAVE_SECONDS) -> Ended:
-    """Learn what a block's task.json says, as far as that is not done.
+    """Train a block by its task.json, unless it is finished.
 
-    Of a budget in steps the weights are the same to the bit, however often this was interrupted, on a CPU. Ctrl-C and
-    SIGTERM save. Raises LumigraphError for a task that cannot be done, and where the folder may not be written.
+    With a budget in steps, interruptions do not change the weights by a bit on a CPU. Ctrl-C and SIGTERM save. Raises
+    LumigraphError for an invalid task, and for a folder that is not writable.
     """
     task = Task.read(folder)
     if (done := finished(folder, task)) is not None:
@@ -86,7 +85,7 @@ def train_block(folder: Path, save_every: float = SAVE_SECONDS) -> Ended:
 
 
 def finished(folder: Path, task: Task) -> Done | None:
-    """Cost of a block that is done, None of any other. Raises LumigraphError for one that was another task's."""
+    """Cost of a finished block, else None. Raises LumigraphError for one finished with another task."""
     if not (folder / DONE_FILE).exists():
         return None
     done: Done = files.read_json(folder / DONE_FILE, Done)
@@ -98,7 +97,7 @@ def finished(folder: Path, task: Task) -> Done | None:
 
 
 def opened(task: Task) -> Scene:
-    """The photographs of a block, in a frame of its own that stands as all the others do."""
+    """Open the photographs of a block, in its own frame, with the orientation common to all."""
     options = {name: value for name, value in task.scene.options.items() if value is not None}
     before = Before(options["part"]["photographs"], np.array(task.upright))
     data = open_dataset(task.scene.source, Scene, **options, memory=task.memory, before=before)
@@ -107,7 +106,7 @@ def opened(task: Task) -> Scene:
 
 
 def begun(folder: Path, task: Task, data: Scene) -> tuple[Run, Method]:
-    """The run in a block's folder and its method, as far as it had come. Raises LumigraphError for another's run."""
+    """The run in a block's folder and its method, at its saved state. Raises LumigraphError for another task's run."""
     kind, device = methods.find(task.method), torch.device(task.device)
     if (folder / "config.json").exists():
         run = Run(folder)
@@ -128,7 +127,7 @@ def begun(folder: Path, task: Task, data: Scene) -> tuple[Run, Method]:
 
 @contextmanager
 def patiently_held(folder: Path) -> Iterator[None]:
-    """Hold a block's folder; wait for a while for a process that is about to end. Raises LumigraphError as `held`."""
+    """Lock a block's folder; wait a while for a process that is ending. Raises LumigraphError if it stays locked."""
     until = time.monotonic() + LOCK_TIMEOUT
     with ExitStack() as stack:
         while True:
@@ -144,7 +143,7 @@ def patiently_held(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def limited(threads: int | None) -> Iterator[None]:
-    """A block in which PyTorch and Numba use so many threads; None for as many as they did."""
+    """Block with a number of PyTorch and Numba threads; None keeps it."""
     if threads is None:
         yield
         return
@@ -159,7 +158,7 @@ def limited(threads: int | None) -> Iterator[None]:
 
 
 def writable(folder: Path) -> None:
-    """Raise LumigraphError, naming this machine, unless a block's folder is seen from here and may be written."""
+    """Raise LumigraphError, naming this machine, unless a block's folder exists here and is writable."""
     if not (folder / "task.json").is_file():
         raise LumigraphError(
             f"{os.uname().nodename} does not see {folder}; give --output a folder on storage that all machines share"

@@ -22,6 +22,7 @@ from torch import Tensor
 from .. import files
 from ..color.srgb import linear_from_srgb
 from ..errors import LumigraphError
+from ..files.exr import read_exr
 from ..files.ffmpeg import decode
 from ..files.reading import reading
 from ..kernels import spherical_harmonics
@@ -67,8 +68,8 @@ class EnvironmentLight:
         rows, columns = values.shape[:2] if values.ndim == 3 else (0, 0)
         if rows < MIN_ROWS or columns < MIN_COLUMNS or columns != 2 * rows:
             raise LumigraphError(
-                f"{source} has {columns} x {rows} pixels; an environment map is equirectangular, twice as wide as "
-                f"high, of at least {MIN_COLUMNS} x {MIN_ROWS}"
+                f"{source} has {columns} x {rows} pixels{shape_of(rows, columns)}; an environment map is "
+                f"equirectangular, twice as wide as high, of at least {MIN_COLUMNS} x {MIN_ROWS}, so convert it"
             )
         values = np.repeat(values, 3, -1) if values.shape[2] == 1 else values[..., :3]
         if values.shape[2] != 3 or not np.isfinite(values).all() or values.min() < 0:
@@ -211,6 +212,14 @@ def solid_angles(rows: int, columns: int) -> Float[Tensor, "row column"]:
     return ((edges[:-1] - edges[1:]) * (2 * math.pi / columns)).float()[:, None].expand(rows, columns)
 
 
+def shape_of(rows: int, columns: int) -> str:
+    """Kind of another map by its shape, as the rest of a sentence."""
+    cubes = ((6, 1), (1, 6), (4, 3), (3, 4), (3, 2), (2, 3))
+    if rows and any(columns * high == rows * wide for wide, high in cubes):
+        return ", as the faces of a cube map have"
+    return ", as a mirrored ball or an octahedral map has" if rows and rows == columns else ""
+
+
 def _overlap(source: Float[Tensor, " edge"], target: Float[Tensor, " end"]) -> Float[Tensor, "target source"]:
     """Share of each target interval in each source interval; edges ascend from 0 to 1."""
     low = torch.maximum(source[None, :-1], target[:-1, None])
@@ -230,5 +239,5 @@ def _values(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             values = linear_from_srgb(np.asarray(image.convert("RGB")) / 255)
     else:
-        values = decode(path)
+        values = read_exr(path).astype(np.float32) if suffix == ".exr" else decode(path)
     return values if values.ndim == 3 else values[..., None]

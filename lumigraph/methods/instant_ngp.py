@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
@@ -74,8 +74,8 @@ class InstantNGP(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and networks with both corrections and a grid of three sizes, within some twenty quick steps."""
-        c = Config(**TINY_HASH, poses=PoseNumbers(refine_cameras=True), exposure_correction="yes")
-        return replace(c, hidden_width=16, learning_rate=2e-2)
+        poses = PoseNumbers(refine_cameras=True)
+        return Config(**TINY_HASH, poses=poses, exposure_correction="yes", hidden_width=16, learning_rate=2e-2)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The Huber loss of composited colours, before random backgrounds where rays need not end."""

@@ -18,7 +18,7 @@ from ..components.sampling.spaces import space_of
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import BandSchedule, exponential_decay, joining_of
 from ..datasets.scene import Frame
-from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width
+from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, changed
 from ..method import FieldMethod
 from ..method.depth import DepthNumbers
 
@@ -34,7 +34,6 @@ class Config:
     measured: DepthNumbers = DepthNumbers()
     hidden_width: Width = 256  # channels of a layer, as NeRF's; wider holds more detail, and costs time
     coarse_to_fine: Share = 0.0  # share of the budget in which octaves are added (Yang 2023, eq. 2); 0: at once
-    resample_padding: NonNegative = 0.01  # alpha, least weight of a frustum, eq. 17; higher samples more evenly
     coarse_loss_weight: NonNegative = 0.1  # lambda, weight of the coarse colours, section 3.2; 0: it only guides
     learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 4; higher: faster, may diverge
     final_learning_rate: LearningRate = 5e-6  # learning rate at the end of the budget, section 4
@@ -56,17 +55,17 @@ class MipNeRF(FieldMethod):
         self.poses = poses_for(frame, c.poses)
         self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine else None
         self.network = FrustumField(c.network, c.hidden_width, space, joining=joining_of(self.poses, self.bands))
-        self.sampler = ConeSampler(space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding)
+        self.sampler = ConeSampler(space, c.rays, c.mask, c.coarse_loss_weight > 0)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller network, evaluated where something is."""
-        return Config(**CPU_NETWORK, network=NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16))
+        return changed(Config(**CPU_NETWORK), depth=6, skip_layer=3)
 
     @classmethod
     def smallest(cls) -> Any:
         """The paper's network, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
-        return Config(**TINY_NETWORK, network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6))
+        return changed(Config(**TINY_NETWORK), depth=3, skip_layer=2, position_frequencies=6)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """The network, taught at points by the teacher."""

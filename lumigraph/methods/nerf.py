@@ -19,7 +19,7 @@ from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import exponential_decay
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, between
+from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, between, changed
 from ..method import FieldMethod
 from ..method.depth import DepthNumbers
 
@@ -75,14 +75,13 @@ class NeRF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller network for both passes, evaluated where something is."""
-        network = NetworkNumbers(depth=6, skip_layer=3)
-        return Config(**CPU_NETWORK, network=network, networks=1, transmittance_threshold=1e-3)
+        return changed(Config(**CPU_NETWORK), depth=6, skip_layer=3, networks=1, transmittance_threshold=1e-3)
 
     @classmethod
     def smallest(cls) -> Any:
         """The paper's two networks, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
-        network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=5)
-        return Config(**TINY_NETWORK, network=network, transmittance_threshold=1e-3)
+        c = Config(**TINY_NETWORK, transmittance_threshold=1e-3)
+        return changed(c, depth=3, skip_layer=2, position_frequencies=5)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Both networks alike, taught at points by the teacher."""
@@ -96,5 +95,4 @@ class NeRF(FieldMethod):
             network.coarse.network.load_state_dict(network.network.state_dict())
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        own = torch.optim.Adam(self.network.parameters(), self.config.learning_rate, eps=1e-7)
-        return [own, *super().optimizers()]
+        return [*self.network.optimizers_at(self.config.learning_rate), *super().optimizers()]

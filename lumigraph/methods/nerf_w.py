@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,17 +14,16 @@ from torch.nn.functional import softplus
 from .. import kernels
 from ..camera.rays import Look, Rays, Rendering, Samples
 from ..components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes, sky_for
+from ..components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ..components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, HashNumbers, side_by_side
+from ..components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, side_by_side
 from ..components.fields.layers import MLP, Dense, in_chunks, truncated_exp
 from ..components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
-from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ..components.sampling.samplers import sampling_bytes
 from ..components.sampling.spaces import space_of
 from ..components.training.photometric import backdrop
-from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
-from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
+from ..files.ranges import Layers, NonNegative, PositiveShare, Seed, Share, Width, changed
 from ..method import FieldMethod, Pass, seeded
 from ..method.controls import Control
 from ..method.field import Densities, Points
@@ -120,13 +120,8 @@ def opaque(thickness: Float[Tensor, " sample"]) -> Float[Tensor, " sample"]:
 class Config:
     """The paper's numbers, with NeRF's learning rates; `NeRFW.preset` has those of a plain CPU."""
 
-    network: NetworkNumbers = NetworkNumbers(position_frequencies=15)  # supplement
+    backbone: BackboneNumbers = BackboneNumbers(NetworkNumbers(position_frequencies=15))  # supplement
     rays: RayNumbers = RayNumbers(512, 512, rays_per_step=2048)  # supplement
-    table: HashNumbers = HashNumbers()
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers()
-    proposals: ProposalNumbers = ProposalNumbers()
-    field: Literal["hash", "network"] = "network"  # field of the scene: the paper's networks, or a faster hash table
     appearance_code: CodeWidth = 48  # n^(a), numbers of an appearance code, section 5; more fit its light more closely
     transient_code: CodeWidth = 16  # n^(tau), numbers of a transient code, section 5; more fit more passers-by
     transient_layers: Layers = 4  # hidden layers of the transient head, supplement; more cost time
@@ -135,10 +130,6 @@ class Config:
     transient_weight: NonNegative = 0.01  # lambda_u, weight of transient density, section 5; higher: less transient
     transient_start: Share = 0.0  # share of the budget before the transient part is on; later: more is static
     own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
-    hidden_width: Width = 256  # channels of a layer, supplement; wider holds more detail, and costs time
-    learning_rate: LearningRate = 5e-4  # Adam's learning rate at first; higher learns faster, and may diverge
-    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -148,7 +139,7 @@ HIDDEN, SHOWN = "hidden", "shown"
 class NeRFW(FieldMethod):
     """A static scene whose colours depend on the appearance of a photograph, and a transient of each photograph."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
     network: EncodedHashField | CoordinateField
     transient_head: TransientHead | HashTransientHead
     appearance: AppearanceCodes
@@ -156,38 +147,36 @@ class NeRFW(FieldMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        space, code, hidden = space_of(frame), c.appearance_code, [c.transient_width] * c.transient_layers
-        self.sky = None
+        b, space, code, self.sky = c.backbone, space_of(frame), c.appearance_code, None
+        hidden = [c.transient_width] * c.transient_layers
+        network = partial(CoordinateField.twice, keep_input=True, activation=softplus)
         with seeded(c.seed):
-            if c.field == "hash":
-                self.network = EncodedHashField(c.table, c.hidden_width, space, frame.reach, code)
-                self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
-                encoded = c.table.levels * c.table.features_per_level
-                self.transient_head = HashTransientHead(encoded + c.transient_code, *hidden)
-                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
+            self.network = b.build(frame, space, EncodedHashField, network, code=code)
+            if b.hashed:
+                self.sky = sky_for(frame, c.own_skies, b.table.sh_bands, code, b.hidden_width)
+                self.transient_head = HashTransientHead(b.table.width + c.transient_code, *hidden)
+                self.sampler = b.sampler(frame, space)
             else:
-                shape = c.network, c.hidden_width, space, code
-                coarse = CoordinateField(*shape, keep_input=True, activation=softplus)
-                self.network = CoordinateField(*shape, keep_input=True, activation=softplus, coarse=coarse)
-                exact = not c.network.bfloat16
-                self.transient_head = TransientHead(c.hidden_width + c.transient_code, *hidden, exact=exact)
-                self.sampler = HierarchicalSampler(space, c.rays)
-                self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
+                exact = not b.network.bfloat16
+                self.transient_head = TransientHead(b.hidden_width + c.transient_code, *hidden, exact=exact)
+                self.sampler = HierarchicalSampler(space, c.rays, rays_per_chunk=RAYS_WITH_FEATURES)
         self.appearance = AppearanceCodes(frame.image_count, code)
         self.transient = PhotographCodes(frame.image_count, c.transient_code)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, transient_layers=2, transient_width=32, beta_min=0.1)
-        c = replace(c, transient_start=0.1, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
-        return replace(c, rays=RayNumbers(64, 64, rays_per_step=2048))
+        return changed(
+            Config(), **CPU_BACKBONE, coarse_samples=64, fine_samples=64,
+            transient_layers=2, transient_width=32, transient_start=0.1, beta_min=0.1,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with tiny networks and a grid of three sizes, within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
-        return replace(c, appearance_code=4, transient_code=4, transient_layers=1, transient_width=16)
+        return changed(
+            Config(), **TINY_BACKBONE, appearance_code=4, transient_code=4, transient_layers=1, transient_width=16
+        )
 
     # Learning
 
@@ -229,13 +218,10 @@ class NeRFW(FieldMethod):
         return self.transient_head(seen.features, codes, self.network.space.along(rays, seen.samples))
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        rate, codes = self.config.learning_rate, [self.appearance.codes, self.transient.codes]
+        codes = [self.appearance.codes, self.transient.codes]
         others = [*self.transient_head.parameters(), *(self.sky.parameters() if self.sky else [])]
-        if isinstance(self.network, EncodedHashField):
-            groups = [{"params": others, "scale": OPEN_RATE}, {"params": codes, "scale": CODES_RATE}]
-            own = self.network.optimizers_at(rate, scale=OPEN_RATE, groups=groups)
-        else:
-            own = [torch.optim.Adam([*self.network.parameters(), *others, *codes], rate, eps=1e-7)]
+        groups = [{"params": others, "scale": OPEN_RATE}, {"params": codes, "scale": CODES_RATE}]
+        own = self.config.backbone.optimizers(self.network, groups=groups, eps=1e-7, scale=OPEN_RATE)
         return [*own, *super().optimizers()]
 
     # Rendering

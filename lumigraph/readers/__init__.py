@@ -1,6 +1,6 @@
-"""Readers of captures and shapes: a file for each layout, and the steps from what it holds to a Scene.
+"""Readers of captures and shapes: one file per layout, and the steps from a Capture to a Scene.
 
-Bounds, scale, splits and the loading of images are found in one place, `assemble`.
+Bounds, scale, splits and the loading of images are in one module, `assemble`.
 """
 
 from __future__ import annotations

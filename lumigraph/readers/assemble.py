@@ -1,4 +1,4 @@
-"""A Capture becomes a Scene: faults told, poses checked, images read, the place found, some views held out."""
+"""Assembly of a Scene from a Capture: checks, images, placement, held-out views."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ MAX_NAMES = 20  # missing files in a warning; further ones are counted
 
 @dataclass(frozen=True)
 class Before:
-    """Names and orientation of a run's photographs at its start, so that a later opening numbers and turns them alike.
+    """Names and orientation of a run's photographs at its start, so that reopening keeps their numbers and orientation.
 
     names:   of the photographs, in order
-    upright: the rotation from the source's frame that brought up to +z
+    upright: the rotation from the source's frame to +z up
     """
 
     names: Sequence[str]
@@ -53,12 +53,12 @@ def assemble(
     cache: Path | None = None,
     before: Before | None = None,
 ) -> Scene:
-    """The Scene that a capture holds.
+    """The Scene of a capture.
 
-    before: how it was opened for a run that goes on, or is evaluated
-    Raises LumigraphError for fewer than two photographs, poses that are no poses, images that cannot be read or
-    contradict their lens, and published splits that hold nothing out. What is missing or unusual becomes a
-    LumigraphWarning, which is kept in `Scene.warnings` too.
+    before: names and orientation at the start of a run that is resumed or evaluated
+    Raises LumigraphError for fewer than two photographs, invalid poses, images that are unreadable or contradict their
+    lens, and published splits without held-out views. Missing or unusual data becomes a LumigraphWarning, also in
+    `Scene.warnings`.
     """
     check_downscale(downscale)
     told = [about_missing(capture)] if capture.missing else []
@@ -143,13 +143,15 @@ def assemble(
 
 
 def in_order(shots: list[Shot], before: Before | None) -> list[Shot]:
-    """By name, 2 ahead of 10; as they were before, if that is known."""
+    """Shots by name, 2 before 10; in their previous order, if known."""
     place = {} if before is None else {name: i for i, name in enumerate(before.names)}
     return sorted(shots, key=lambda shot: (place.get(shot.name, len(place)), natural(shot.name)))
 
 
 def split(source: str, shots: list[Shot], whole: bool = True) -> dict[str, Int[Tensor, " image"]]:
-    """Image numbers by purpose: as published, otherwise every 8th held out. whole: of a part, none need be held out"""
+    """Image numbers by purpose: as published, else every 8th held out. whole: False for a part, which needs no
+    held-out views
+    """
     if any(shot.split for shot in shots):
         names = [shot.split for shot in shots]
     else:
@@ -165,7 +167,7 @@ def split(source: str, shots: list[Shot], whole: bool = True) -> dict[str, Int[T
 
 
 def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
-    """The capture without points that are nowhere or farther off than anything can be, and a sentence about them."""
+    """The capture without points that are not finite or implausibly far, and a sentence about them."""
     if capture.points is None:
         return capture, []
     near = (np.abs(capture.points) <= MAX_COORDINATE).all(-1)
@@ -177,7 +179,7 @@ def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
 
 
 def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:
-    """The shot's lens behind the picture as it will be used."""
+    """The shot's lens for the picture's final size."""
     scale = torch.tensor([chosen.picture.size], dtype=torch.float64) / torch.tensor([chosen.calibrated])
     return shot.lens.resized(scale.float())
 
@@ -187,8 +189,8 @@ def make_cameras(
 ) -> Camera:
     """One batch of cameras, numbered as the shots. They have times only if all shots have one.
 
-    poses: camera-to-world, in the frame that the cameras shall have
-    sizes: (width, height) in pixels, to which the lenses are fitted
+    poses: camera-to-world, in the target frame
+    sizes: (width, height) in pixels of the final pictures
     """
     times = [shot.time for shot in shots]
     time = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float32)
@@ -196,20 +198,20 @@ def make_cameras(
 
 
 def span(times: Float[Tensor, " camera"] | None) -> tuple[float, float] | None:
-    """First and last moment; None where there are none, or one alone."""
+    """First and last time; None for fewer than two."""
     found = None if times is None else (float(times.min()), float(times.max()))
     return None if found is None or found[0] == found[1] else found
 
 
 def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "camera 3 4"]:
-    """Poses in the frame that a similarity leads to: positions scale, rotations stay rotations."""
+    """Poses transformed by a similarity: positions scale, rotations stay rotations."""
     rotation = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ poses[:, :, :3]
     position = poses[:, :, 3] @ matrix[:3, :3].T + matrix[:3, 3]
     return np.concatenate([rotation, position[:, :, None]], -1)
 
 
 def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:
-    """The capture with its points and bounds moved; the poses are handed on separately."""
+    """The capture with its points and bounds shifted; poses are passed separately."""
     points = None if capture.points is None else capture.points + by
     if capture.around is not None:
         (x, y, z), half = capture.around
@@ -221,7 +223,7 @@ def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:
 
 
 def masked_by_lens(pictures: list[ImageSource], lenses: list[Lens]) -> list[ImageSource]:
-    """Pictures that also distrust what lies beyond their lens's reach, such as the black around a fisheye's circle."""
+    """Pictures with masks of their lens's valid region, such as a fisheye's circle."""
     known: dict[tuple[str, tuple[int, int]], np.ndarray | None] = {}
     masked = []
     for picture, lens in zip(pictures, lenses, strict=True):
@@ -234,7 +236,7 @@ def masked_by_lens(pictures: list[ImageSource], lenses: list[Lens]) -> list[Imag
 
 
 def with_mask(picture: ImageSource, trusted: np.ndarray, why: str) -> ImageSource:
-    """The picture with fewer trusted pixels. trusted: true where it may be; why: its part of the cache's key"""
+    """The picture with a further mask of trusted pixels. why: its part of the cache's key"""
 
     def read() -> tuple[np.ndarray, np.ndarray | None]:
         image, mask = picture.read()
@@ -244,7 +246,7 @@ def with_mask(picture: ImageSource, trusted: np.ndarray, why: str) -> ImageSourc
 
 
 def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
-    """Mask of pixels that a lens maps to directions and back; None if all do, as a test of the edges shows."""
+    """Mask of pixels that a lens unprojects and projects back; None if all, by a test of the edges."""
     if isinstance(lens, Pinhole | Equirectangular):
         return None
     width, height = size
@@ -275,7 +277,7 @@ def about_missing(capture: Capture) -> str:
 
 
 def about_times(source: str, shots: list[Shot]) -> list[str]:
-    """Warning of photographs without a moment beside others that have one."""
+    """Warning of photographs without a time beside others with one."""
     without = [shot.name for shot in shots if shot.time is None]
     if not without or len(without) == len(shots):
         return []

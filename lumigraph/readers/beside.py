@@ -34,8 +34,8 @@ DEPTH_VIEWS, POINTS_PER_VIEW = 64, 300  # depth maps that sparse points are draw
 def make_layers(
     shots: list[Shot], chosen: list[Chosen], images: ImageStore, scene_from_source: Float[np.ndarray, "4 4"]
 ) -> tuple[dict[str, Layer], list[str]]:
-    """Layers by name, nothing of which is read yet; and what the user should know, one sentence each. Raises
-    LumigraphError where values of one name are not of one kind, or a file's header cannot be read."""
+    """Layers by name, not yet read; and warnings for the user, one sentence each. Raises LumigraphError for values of
+    different kinds under one name, and for unreadable file headers."""
     unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
     turn = scene_from_source[:3, :3] / unit
     found = [shot.planes | own_bits(c.plane) for shot, c in zip(shots, chosen, strict=True)]
@@ -62,12 +62,12 @@ def make_layers(
 
 
 def own_bits(plane: PixelPlane | None) -> dict[str, PixelPlane]:
-    """A photograph of more than eight bits: `colours` as they are encoded, or `raw` light."""
+    """Layers of a photograph of more than eight bits: `colours`, encoded, or `raw` light."""
     return {} if plane is None else {"colours" if plane.encoding == "sRGB" else "raw": plane}
 
 
 def settled(plane: PixelPlane, name: str) -> PixelPlane:
-    """The plane with the type and number of channels that its values have, and what they depend on."""
+    """The plane with dtype, number of channels and identity of its values."""
     dtype, channels, identity = plane.dtype, plane.channels, plane.identity
     if isinstance(plane.values, np.ndarray):
         dtype, channels = plane.values.dtype, 1 if plane.values.ndim == 2 else plane.values.shape[2]
@@ -84,7 +84,7 @@ def settled(plane: PixelPlane, name: str) -> PixelPlane:
 
 
 def agreed(name: str, shots: list[Shot], planes: list[PixelPlane | None]) -> PixelPlane:
-    """The first plane, to which all others are alike."""
+    """The first plane, after checking that all others are of its kind."""
 
     def meaning(plane: PixelPlane) -> tuple[Any, ...]:
         return plane.encoding, plane.scale, plane.channels, plane.unknown, plane.empty, plane.names
@@ -113,7 +113,7 @@ def source_of(
 def read_plane(
     plane: PixelPlane, name: str, dtype: np.dtype, size: tuple[int, int], turn: Float[np.ndarray, "3 3"]
 ) -> np.ndarray:
-    """Stored numbers at the size of the photograph; directions turned to the scene's frame."""
+    """Stored numbers at the size of the photograph; directions rotated to the scene's frame."""
     if isinstance(plane.values, Path):
         with readable(plane.values):
             values = read_numbers(plane.values, name)
@@ -160,7 +160,7 @@ def with_depth_points(capture: Capture) -> Capture:
 
 
 def make_about(shots: list[Shot]) -> dict[str, Tensor]:
-    """Facts of each photograph, by name; NaN where unknown. The first axis is the photograph."""
+    """Values per photograph by name; NaN for unknown. The first axis is the photograph."""
     found = in_parallel(lambda i: taken(shots[i]) | shots[i].about, range(len(shots)))
     about = {}
     for name in dict.fromkeys(name for facts in found for name in facts):
@@ -176,7 +176,7 @@ def make_about(shots: list[Shot]) -> dict[str, Tensor]:
 
 
 def taken(shot: Shot) -> dict[str, float]:
-    """When and for how long a photograph was exposed, as far as its reader and its file say."""
+    """Time and duration of a photograph's exposure, if its reader or its file has them."""
     facts = {} if shot.time is None else {"time": shot.time}
     if isinstance(shot.image, dict) and (path := shot.image[min(shot.image)]).suffix.lower() in EXPOSURE_SUFFIXES:
         with readable(path), Image.open(path) as image:

@@ -1,7 +1,7 @@
-"""Blender's synthetic scenes (Mildenhall et al. 2020): transforms_train.json and its sisters, images with alpha.
+"""Blender's synthetic scenes (Mildenhall et al. 2020): transforms_train.json etc., images with alpha.
 
-Each file is a transforms.json; what differs is that there is one for each split. Validation views are read only where
-there are no test views, for nothing uses both.
+Each file is a transforms.json; there is one for each split. Validation views are read only without test views, since
+nothing uses both.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bones beside photographs, for every reader: bones.json has the skeleton of a character at all moments.
+"""Bones of captures of any reader: bones.json has the skeleton of a character at all times.
 
 Its layout is in `exchange/bones.py`; it is in the frame and unit of the photographs' poses.
 """
@@ -19,15 +19,15 @@ BONES_FILE = "bones.json"
 
 
 def with_bones(capture: Capture, folder: Path) -> Capture:
-    """The capture with the skeleton of its folder's bones.json, in place of the one that its reader found. Raises
-    LumigraphError for a file that is none."""
+    """The capture with the skeleton of its folder's bones.json, instead of the reader's. Raises LumigraphError for an
+    invalid file."""
     path = folder / BONES_FILE
     return replace(capture, skeleton=read_bones(path)) if path.is_file() else capture
 
 
 def scene_skeleton(capture: Capture, to_scene: Similarity, cameras: Camera) -> Skeleton | None:
-    """The skeleton in the scene's frame; None without one. Raises LumigraphError for poses at several moments beside
-    photographs without any."""
+    """The skeleton in the scene's frame; None without one. Raises LumigraphError for poses at several times with
+    photographs without times."""
     skeleton = capture.skeleton
     if skeleton is None:
         return None

@@ -1,4 +1,4 @@
-"""Capture: photographs and what is known about them, as a reader found them, before they become a Scene."""
+"""Capture: photographs and metadata from a reader, before they become a Scene."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha la
 
 @dataclass(frozen=True)
 class PixelPlane:
-    """Values of one layer beside one photograph, as a reader found them. See `images.Layer`.
+    """Values of one layer of one photograph, from a reader. See `images.Layer`.
 
-    values:   stored numbers, (height, width) or (height, width, channels), a function that makes them, or a file; in
-              any size of the photograph's shape
-    encoding: what they mean
-    scale:    what a stored 1 is worth, in the source's units for lengths
+    values:   stored numbers, (height, width) or (height, width, channels), a function that returns them, or a file; of
+              any size with the photograph's aspect ratio
+    encoding: meaning of the numbers
+    scale:    value of a stored 1, in the source's units for lengths
     unknown, empty, names: as in `Layer`
-    dtype, channels: of what a function makes
-    identity: says all that a function depends on
+    dtype, channels: of a function's result
+    identity: determines a function's result
     """
 
     values: Path | np.ndarray | Callable[[], np.ndarray]
@@ -48,24 +48,24 @@ class PixelPlane:
 
 @dataclass(frozen=True)
 class Shot:
-    """One photograph and where it was taken from.
+    """One photograph with its camera.
 
-    name:  unique within the capture, what warnings and reports call it; held-out views are chosen by its order
+    name:  unique within the capture, for warnings and reports; held-out views are chosen by its order
     pose:  camera-to-world, (3, 4), in the source's own frame and units; +x right, +y down, +z forward
     lens:  one lens, for a picture of `size`
-    size:  (width, height) that the lens was calibrated for; None if the source does not say, then the picture's own
-    image: the pixels, or a function that makes them when asked (it needs `size`), or files: the same photograph reduced
+    size:  (width, height) of the calibration; None for the picture's own size
+    image: the pixels, or a function that returns them (it needs `size`), or files: the same photograph reduced
            1, 2, 4... times, {1: Path, ...}
-    mask:  where the photograph is to be trusted: non-zero is good; a file or (height, width) numbers
-    alpha: a file, white where an object is that alone counts, black where nothing is to be. It becomes the opacity,
-           times that which the picture has
-    split: "train", "test" or "val" where the source publishes that. If no shot of a capture has one, every 8th by name
-           is held out
-    time:  moment of exposure
-    depths: (near, far) of what this camera saw, in the source's units
-    planes: what else is known of each pixel, by the layer's name
-    about: what else is known of the photograph, by name: numbers or arrays of them
-    identity: says all that the pixels depend on, where `image` is a function, so that they can be kept; None otherwise
+    mask:  trusted pixels are non-zero; a file or (height, width) numbers
+    alpha: a file, white for the object, black for empty background. It is multiplied by the picture's own alpha to give
+           the opacity
+    split: "train", "test" or "val" if the source publishes it. If no shot of a capture has one, every 8th by name is
+           held out
+    time:  time of exposure
+    depths: (near, far) of this view, in the source's units
+    planes: other per-pixel values by the layer's name
+    about: other values of the photograph by name: numbers or arrays
+    identity: determines the pixels, where `image` is a function, so that they can be cached; None otherwise
     """
 
     name: str
@@ -85,27 +85,27 @@ class Shot:
 
 @dataclass(frozen=True)
 class Capture:
-    """Photographs with poses, and everything else that a reader found.
+    """Photographs with poses, and all metadata from a reader.
 
-    source:   where it came from: a folder, or "procedural:<name>"
+    source:   a folder, or "procedural:<name>"
     shots:    at least two
-    points:   sparse points in the source's frame, from structure from motion; sightings says how many photographs
-              saw each
-    missing:  what the source lists but does not hold; its user is told, and the rest is used
+    points:   sparse points in the source's frame, from structure from motion; sightings is the number of photographs of
+              each
+    missing:  listed but missing files; the user is warned, and the rest is used
 
-    Hints, for captures that know better than what can be found from cameras and points:
+    Hints, for captures that know more than follows from cameras and points:
     bounds:   the box of interest ((x, y, z), (x, y, z)), source's frame and units
-    reach:    half-size of the cube around the bounds' centre that holds everything, source's units
-    near:     distance within which nothing is, source's units
-    background: colour behind everything
-    up:       which way is up, source's frame, any length
+    reach:    half-size of the cube around the bounds' centre that contains everything, source's units
+    near:     near distance of rays; the space in front is empty, source's units
+    background: background colour
+    up:       up direction, source's frame, any length
     around:   of a part of a larger capture, centre and half-size of its box of interest, source's frame and units
     origin:   of the source's frame on Earth; its axes then point east, north and up, in metres
-    notes:     what its user should know, one sentence each
-    tracks:   boxes of rigid things that move, source's frame and units, moments as in `Shot.time`
-    skeleton: bones of a character at all moments, source's frame and units
+    notes:    warnings for the user, one sentence each
+    tracks:   boxes of moving rigid objects, source's frame and units, times as in `Shot.time`
+    skeleton: bones of a character at all times, source's frame and units
     blocks:   of a block world, cubes with an edge of one unit of the source
-    kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
+    kept:     cache pictures even where they fit into memory, since they took long to make
     """
 
     source: str
@@ -128,7 +128,7 @@ class Capture:
     blocks: BlockLabels | None = None
 
     def with_points(self, kept: Bool[np.ndarray, " point"]) -> Capture:
-        """The capture with some of its points alone."""
+        """The capture with only some of its points."""
         points, colours, sightings = (
             None if x is None else x[kept] for x in (self.points, self.point_colours, self.sightings)
         )
@@ -136,7 +136,7 @@ class Capture:
 
 
 def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
-    """The pose with an exact rotation. Raises LumigraphError for what is no rigid pose."""
+    """The pose with an exact rotation. Raises LumigraphError for a pose that is not rigid."""
     axes = shot.pose[:, :3]
     if not np.isfinite(shot.pose).all():
         fault = "holds NaN or infinite numbers"

@@ -1,8 +1,7 @@
-"""Points of a LiDAR's file, read in a process of its own: on damaged files, libraries of such formats end the process
-or take all memory.
+"""Reading of LiDAR points in a separate process: on damaged files, libraries of such formats crash or exhaust memory.
 
 Run as a script: cloud_worker.py FILE RESULT.npy BYTES SECONDS. It imports nothing of the package. The exit code is 0
-once the result is whole; otherwise the last line of standard error has the reason.
+if the result is complete; otherwise the last line of standard error has the reason.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ POINT_BYTES = 3 * 24  # of memory for each point: its coordinates, and copies of
 
 
 def main(path: Path, result: Path, memory: int, seconds: int) -> None:
-    """Write an array of points. memory: bytes beyond those in use; seconds: of the processor."""
+    """Read a file and write an array of points. memory: bytes beyond those in use; seconds: of processor time"""
     limit(memory, seconds)
     points = read_e57(path) if path.suffix.lower() == ".e57" else read_las(path, memory)
     np.save(result, points)
@@ -53,8 +52,8 @@ def read_las(path: Path, memory: int) -> np.ndarray:
 
 
 def check_records(path: Path) -> None:
-    """Raise ValueError for more records of variable length than the file has room for: the library would walk through
-    all of them."""
+    """Raise ValueError for more records of variable length than the file has room for: the library would loop over all
+    of them."""
     with open(path, "rb") as file:
         head = file.read(LAS_HEADER_BYTES).ljust(LAS_HEADER_BYTES, b"\0")
         size = file.seek(0, 2)

@@ -1,10 +1,11 @@
-"""COLMAP models, binary or text, in the places where programs leave them."""
+"""COLMAP models, binary or text, in the usual folders of programs."""
 
 from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +13,20 @@ import torch
 
 from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
-from ..files import exists, read_bytes, read_text
-from ..files.names import natural
+from ..files import exists, explained, is_file, read_bytes, read_text
+from ..files.names import counted, natural
 from ..files.reading import reading, reads
 from ..system.library import pycolmap
 from ..system.memory import free_memory
 from .capture import Capture, Shot
+from .finding import find_named
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
+BASES = (".", "colmap", "dense", "dense/0", "undistorted")  # folders in which programs leave sparse/ or sparse/0
+PARTS = ("cameras", "images", "points3D")
 MAX_SIDE = 10**5  # pixels
+IMAGE_WORDS = 10  # of a line of images.txt; the last is the name, and may have spaces
 EXPECTED_FILES = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
 
 # COLMAP's models whose distortion begins the list of coefficients that the lenses here have.
@@ -35,26 +39,67 @@ def recognises(folder: Path) -> bool:
 
 
 def model_folder(folder: Path) -> Path | None:
-    """The first place that holds a whole model."""
-    for place in MODEL_FOLDERS:
-        for suffix in (".bin", ".txt"):
-            if all((folder / place / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
-                return folder / place
-    return None
+    """The model that is used of those in a folder."""
+    return next(iter(model_folders(folder)), None)
+
+
+def model_folders(folder: Path) -> list[Path]:
+    """Whole models of the first place that has any, the one of most photographs first."""
+    for base in BASES:
+        for place in (folder / base / "sparse", folder / base):
+            numbered = [one for one in place.iterdir() if one.name.isdecimal()] if place.is_dir() else []
+            found = [one for one in (*sorted(numbered, key=lambda one: natural(one.name)), place) if suffix_of(one)]
+            if found:
+                return sorted(found, key=lambda one: -image_count(one))
+    return []
+
+
+def suffix_of(place: Path) -> str | None:
+    """Suffix of the files of a whole model; None where there is none."""
+    return next((x for x in (".bin", ".txt") if all(is_file(place / f"{part}{x}") for part in PARTS)), None)
+
+
+def image_count(place: Path) -> int:
+    """Number of photographs that a model places, by its list."""
+    if suffix_of(place) == ".bin":
+        with explained(place), open(place / "images.bin", "rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    return sum(1 for _ in image_lines(read_text(place / "images.txt").splitlines()))
+
+
+def image_lines(lines: Sequence[str]) -> Iterator[int]:
+    """Numbers of the lines of images.txt that describe a photograph; each is followed by a line of its features."""
+    number = 0
+    while number < len(lines):
+        if lines[number].strip() and not lines[number].startswith("#"):
+            yield number
+            number += 1
+        number += 1
+
+
+def image_folders(folder: Path, place: Path) -> dict[int, Path]:
+    """Folders of the photographs of a model, by how many times they are reduced."""
+    above = [one for one in (folder, *place.parents) if one == folder or folder in one.parents]
+    for base in (*above, folder.parent):
+        for name in ("images", "input"):
+            if found := reductions(base / name):
+                return found
+    return {1: folder}
 
 
 def read(folder: Path) -> Capture:
     """The capture in a folder. Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and
     absent image folders."""
-    place = model_folder(folder)
-    assert place is not None
+    place, *others = model_folders(folder)
     model = read_model(place)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: natural(image.name))
     names = [image.name for image in images]
-    folders = reductions(folder / "images") or reductions(folder / "input") or {1: folder}
+    folders = image_folders(folder, place)
     shots, missing = [], []
     lenses = {k: (read_lens(camera, place), (camera.width, camera.height)) for k, camera in model.cameras.items()}
     for image, files in zip(images, versions(folders, names), strict=True):
+        if not files and is_file(named := find_named(folders[min(folders)], image.name)):
+            files = {1: named}
         if not files:
             missing.append(image.name)
             continue
@@ -63,21 +108,31 @@ def read(folder: Path) -> Capture:
         shots.append(Shot(image.name, pose, lens, size, files))
     if not shots and names:
         raise LumigraphError(
-            f"{folders[min(folders)]} holds none of the {len(names)} photographs that {place} lists, "
-            f"such as {names[0]}; put them into {folder / 'images'}"
+            f"{folders[min(folders)]} holds none of the {len(names)} photographs that {place} lists: looked for "
+            f"{names[0]} and its end there and in {folder}; put the photographs into {folder / 'images'}"
         )
-    return Capture(str(folder), shots, missing=missing, **vars(read_points(place, model)))
+    notes = [about_models(place, others)] if others else []
+    return Capture(str(folder), shots, missing=missing, notes=notes, **vars(read_points(place, model)))
+
+
+def about_models(place: Path, others: Sequence[Path]) -> str:
+    """A sentence on the models that are not used."""
+    rest = ", ".join(f"{counted(image_count(other), 'photograph')} in {other.name}" for other in others)
+    return (
+        f"{place.parent} has {1 + len(others)} models, each with a frame of its own; the largest, {place.name}, is "
+        f"used, without {rest}"
+    )
 
 
 @reads("holds no readable COLMAP model", "make or copy it again")
 def read_model(place: Path) -> pycolmap.Reconstruction:
-    """Raises LumigraphError for what is no whole model."""
+    """Read a model with pycolmap. Raises LumigraphError for an incomplete or damaged one."""
     if (place / "images.bin").is_file():
         check_whole(place)
         read_points3d(place / "points3D.bin")
     else:
         check_text(place / "images.txt")
-    model = pycolmap.Reconstruction(place)
+    model = pycolmap.Reconstruction(place) if suffix_of(place) == ".bin" else read_text_model(place)
     if (place / "cameras.bin").is_file():
         wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
         if (place / "cameras.bin").stat().st_size < wanted:
@@ -86,10 +141,10 @@ def read_model(place: Path) -> pycolmap.Reconstruction:
 
 
 def check_whole(place: Path) -> None:
-    """Walk through a binary model: to read a list that is longer than its file, pycolmap would allocate all memory or
-    run for hours.
+    """Walk through a binary model before reading it: with a list length beyond the file's end, pycolmap would allocate
+    all memory or run for hours.
 
-    Raises LumigraphError for a list that ends early, and for a rotation that is none.
+    Raises LumigraphError for a truncated list, and for an invalid rotation.
     """
     for name, walk in (("images.bin", walk_images), ("frames.bin", walk_frames), ("rigs.bin", walk_rigs)):
         path = place / name
@@ -102,8 +157,8 @@ def check_whole(place: Path) -> None:
 
 
 def walk_images(data: bytes, path: Path) -> int:
-    """Per image an id, a pose of seven numbers, a camera, a name that ends in zero, and a list of (x, y, point).
-    Returns where the list ends, as the other walks do."""
+    """Per image an id, a pose of seven numbers, a camera, a zero-terminated name, and a list of (x, y, point). Returns
+    the offset of the list's end, as the other walks do."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         quaternion = struct.unpack_from("<4d", data, offset + 4)
@@ -115,7 +170,7 @@ def walk_images(data: bytes, path: Path) -> int:
 
 
 def walk_frames(data: bytes, path: Path) -> int:
-    """Per frame its id and its rig's, a pose of seven numbers, and a list of (sensor's kind, sensor, image)."""
+    """Walk frames: an id and its rig's, a pose of seven numbers, and a list of (sensor's kind, sensor, image)."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         check_turn(struct.unpack_from("<4d", data, offset + 8), "a frame", path)
@@ -125,7 +180,7 @@ def walk_frames(data: bytes, path: Path) -> int:
 
 
 def walk_rigs(data: bytes, path: Path) -> int:
-    """Per rig an id and a number of sensors: the first, then others, each with a pose or without."""
+    """Walk rigs: an id and a number of sensors: the first, then others, each with a pose or without."""
     (count,), offset = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         (sensors,), offset = struct.unpack_from("<I", data, offset + 4), offset + 8
@@ -142,14 +197,29 @@ def check_turn(quaternion: Sequence[float], name: str, path: Path) -> None:
 
 
 def check_text(path: Path) -> None:
-    """Look at the rotations of images.txt: a line for each image, which another of its details follows."""
-    lines = iter(read_text(path).splitlines())
-    for line in lines:
-        words = line.split()
-        if words and not words[0].startswith("#"):
-            next(lines, "")
-            with contextlib.suppress(ValueError):  # pycolmap says what is wrong with it
-                check_turn([float(word) for word in words[1:5]] or [1.0], words[-1], path)
+    """Look at the rotations of images.txt."""
+    lines = read_text(path).splitlines()
+    for number in image_lines(lines):
+        words = lines[number].split(maxsplit=IMAGE_WORDS - 1)
+        with contextlib.suppress(ValueError):  # pycolmap says what is wrong with it
+            check_turn([float(word) for word in words[1:5]] or [1.0], words[-1], path)
+
+
+def read_text_model(place: Path) -> pycolmap.Reconstruction:
+    """A model as text. A name is the rest of its line, spaces and all, which pycolmap ends at the first."""
+    names: dict[str, str] = {}
+    with tempfile.TemporaryDirectory() as plain:
+        for path in place.glob("*.txt"):
+            lines = read_text(path).splitlines()
+            for number in image_lines(lines) if path.name == "images.txt" else ():
+                *numbers, name = lines[number].split(maxsplit=IMAGE_WORDS - 1)
+                names[f"{number}.png"] = name.strip()
+                lines[number] = " ".join([*numbers, f"{number}.png"])
+            (Path(plain) / path.name).write_text("\n".join(lines) + "\n")
+        model = pycolmap.Reconstruction(plain)
+    for image in model.images.values():
+        image.name = names[image.name]
+    return model
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:

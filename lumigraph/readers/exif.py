@@ -1,4 +1,4 @@
-"""Lens, place and time of a photograph from its file."""
+"""EXIF of a photograph: lens, position and time."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_facts(exif: Image.Exif, size: tuple[int, int]) -> ExifFacts:
 
 
 def device(tags: dict[int, Any], size: tuple[int, int]) -> str | None:
-    """Make, model, focal length and size. Pictures of one zoom at one setting say the same, others do not."""
+    """Make, model, focal length and size: a key for pictures of one lens at one zoom setting."""
     make, model = text(tags.get(Tag.Make)), text(tags.get(Tag.Model))
     if not model:
         return None
@@ -57,11 +57,12 @@ def device(tags: dict[int, Any], size: tuple[int, int]) -> str | None:
 
 
 def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
-    """The focal length in pixels of a picture of `size`, which was reduced or cropped since exposure, but not both.
+    """Focal length in pixels of a picture of `size`, which may be reduced or cropped since exposure, but not both.
 
     From the 35 mm equivalent f35, which compares diagonals: f35 / 43.27 mm = f / diagonal. Otherwise from the focal
-    length in mm and the sensor's pixels per length. None where the size at exposure has another shape and neither
-    side: nobody knows then how much the picture was reduced.
+    length in mm and the sensor's pixels per length. None where the original size has another aspect ratio and neither
+    side
+    matches: the reduction is then unknown.
     """
     # Software that turns a picture may leave the size at exposure as it was, hence the longer and the shorter side.
     long, short = max(size), min(size)
@@ -84,7 +85,7 @@ def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
 def exposure(exif: Image.Exif) -> float | None:
     """Exposure of a photograph up to a factor: seconds at f/1 and ISO 100, t S / (100 N^2).
 
-    Where the aperture or the sensitivity is not said, both are taken for constant.
+    Missing aperture or sensitivity is assumed constant.
     """
     tags = exif.get_ifd(ExifTags.IFD.Exif)
     seconds = number(tags.get(Tag.ExposureTime))
@@ -118,7 +119,7 @@ def degrees(parts: Any, side: Any) -> float | None:
 
 
 def moment(tags: dict[int, Any]) -> float | None:
-    """The exposure's moment in seconds since 1970. Where the file does not name its time zone, Greenwich's is taken."""
+    """Time of exposure in seconds since 1970; UTC if the file has no time zone."""
     try:
         taken = datetime.strptime(text(tags.get(Tag.DateTimeOriginal)), "%Y:%m:%d %H:%M:%S")
     except ValueError:
@@ -132,7 +133,7 @@ def moment(tags: dict[int, Any]) -> float | None:
 
 
 def number(value: Any) -> float | None:
-    """A number above zero; EXIF writes zero for unknown."""
+    """A positive number, else None; EXIF writes zero for unknown."""
     found = finite(value)
     return found if found and found > 0 else None
 

@@ -36,10 +36,10 @@ class Silhouette:
 def silhouettes(
     cameras: Camera, images: ImageStore, views: list[int], centre: Float[np.ndarray, " 3"]
 ) -> tuple[list[Silhouette], Vector] | None:
-    """Outlines of an object that has alpha or stands before one plain colour. None where the photographs show neither.
+    """Silhouettes of an object that has alpha or a plain backdrop. None for other photographs.
 
-    centre: what the cameras look at, roughly
-    Returns also the colour behind the object: that of the photographs, or white where they have alpha.
+    centre: rough point of interest
+    Returns also the background colour: that of the photographs, or white for alpha.
     """
     position = cameras.position[views].double().numpy() - centre
     position /= np.linalg.norm(position, axis=-1, keepdims=True).clip(min=1e-9)
@@ -66,7 +66,9 @@ def border(picture: Tensor) -> Tensor:
 
 
 def filled(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Also what lies between inside pixels of a row or a column: parts of the object may look like the background."""
+    """Mask filled between inside pixels of a row or a column, since parts of the object may look like the
+    background.
+    """
 
     def between(x: Tensor, axis: int) -> Tensor:
         before, after = x.cummax(axis).values, x.flip(axis).cummax(axis).values.flip(axis)
@@ -79,8 +81,9 @@ def filled(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]
 def hull_box(
     outlines: list[Silhouette], centre: Float[np.ndarray, " 3"], half: float, moves: bool = False
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
-    """Two corners of the box around the object, which lies within about `half` of `centre`. None where the silhouettes
-    enclose nothing, or no end to it. moves: whether the views are of several moments"""
+    """Two corners of the box around the object, which lies within about `half` of `centre`. None for an empty or
+    unbounded
+    hull. moves: whether the views have different times"""
     for slack in MOVING_DISAGREEMENTS if moves else MAX_DISAGREEMENTS:
         low, high = centre - half, centre + half
         for _ in range(MAX_DOUBLINGS + 1):
@@ -99,7 +102,7 @@ def hull_box(
 
 
 def ends_inside(found: tuple[np.ndarray, np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> bool:
-    """True if a found box is at least a cell away from the walls of the searched box."""
+    """True if the box is at least a cell inside the searched box."""
     inner_low, inner_high, cell = found
     return bool((inner_low > low + cell).all() and (inner_high < high - cell).all())
 
@@ -107,7 +110,7 @@ def ends_inside(found: tuple[np.ndarray, np.ndarray, np.ndarray], low: np.ndarra
 def carve(
     outlines: list[Silhouette], low: np.ndarray, high: np.ndarray, grid: int, slack: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """The box around those cells of a grid that no view sees past, and a cell's size."""
+    """Bounding box of the grid cells inside all silhouettes, and a cell's size."""
     cell = (high - low) / grid
     axes = [torch.from_numpy(low[k] + cell[k] * (np.arange(grid) + 0.5)).float() for k in range(3)]
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -130,7 +133,7 @@ def carve(
 
 
 def widened(outline: Silhouette, where: Tensor, radius: float) -> tuple[Tensor, int]:
-    """The silhouette grown by a cell's radius, on a coarser grid, and by how many times coarser."""
+    """The silhouette dilated by a cell's radius, on a coarser grid, and the reduction factor."""
     sideways = outline.camera.pose[0, :, 0]
     ends, _ = outline.camera.project(torch.stack([where, where + radius * sideways]))
     pixels = float((ends[1] - ends[0]).norm())
@@ -142,7 +145,7 @@ def widened(outline: Silhouette, where: Tensor, radius: float) -> tuple[Tensor, 
 
 
 def farthest(points: Float[np.ndarray, "point 3"], count: int) -> list[int]:
-    """Indices of points spread as far apart as they can be, one after another."""
+    """Indices of points by farthest-point sampling."""
     chosen = [0]
     away = np.linalg.norm(points - points[0], axis=-1)
     while len(chosen) < min(count, len(points)):

@@ -1,8 +1,8 @@
-"""Depth inside photographs of phones: auxiliary images of HEIC, Dynamic Depth and its forerunner GDepth in JPEG.
+"""Embedded depth of phone photographs: auxiliary images of HEIC, Dynamic Depth and its predecessor GDepth in JPEG.
 
-A stored v in [0, 1] is Z = near + v (far - near) where it is linear, 1 / Z = 1 / far + v (1 / near - 1 / far) where
-it is an inverse (HEIC) and, as Android has it, Z = far near / (far - v (far - near)) (RangeInverse). Depth is along the
-optical axis unless Dynamic Depth says that it is along the ray.
+A stored v in [0, 1] is Z = near + v (far - near) for "linear", 1 / Z = 1 / far + v (1 / near - 1 / far) for an inverse
+(HEIC) and, in Android, Z = far near / (far - v (far - near)) (RangeInverse). Depth is along the optical axis unless
+Dynamic Depth declares it along the ray.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ LINEAR_HEIC = (2, "uniform_Z")  # representations of HEIC's depth that are no in
 
 @dataclass(frozen=True)
 class InnerDepth:
-    """Depth of one photograph as stored.
+    """Embedded depth of one photograph as stored.
 
     values:    in [0, 1]
     near, far: metres
-    kind:      "linear", "inverse" (1 stands for near), or "range inverse" (1 stands for far)
+    kind:      "linear", "inverse" (1 is near), or "range inverse" (1 is far)
     along_ray: whether it is measured along the ray
     """
 
@@ -53,7 +53,7 @@ class InnerDepth:
 
     @property
     def metres(self) -> Float[np.ndarray, "height width"]:
-        """Depth; NaN where the file has none, or an infinite one."""
+        """Depth in metres; NaN for unknown or infinite depth."""
         v = self.values.astype(np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "linear":
@@ -67,7 +67,7 @@ class InnerDepth:
 
 
 def with_inner_depth(capture: Capture) -> Capture:
-    """The capture with the depth inside its photographs, where it has no other."""
+    """The capture with embedded depth, for photographs without other depth."""
     if any("depth" in shot.planes for shot in capture.shots):
         return capture
     return replace(capture, shots=[with_own_depth(shot) for shot in capture.shots])
@@ -98,7 +98,7 @@ def read_upright(path: Path, orientation: int | None) -> Float[np.ndarray, "heig
 
 
 def inner_depth(path: Path) -> InnerDepth | None:
-    """Depth inside a photograph; None where it has none, or none in metres."""
+    """Embedded depth of a photograph; None without one, or if it is not metric."""
     suffix = path.suffix.lower()
     with readable(path):
         if suffix in HEIC_SUFFIXES:
@@ -133,7 +133,7 @@ def of_heic(path: Path) -> InnerDepth | None:
 
 
 def of_jpeg(data: bytes) -> InnerDepth | None:
-    """Depth of Dynamic Depth, a picture behind the photograph, or of GDepth, a picture within its XMP."""
+    """Depth of Dynamic Depth, a picture appended to the photograph, or of GDepth, a picture within its XMP."""
     text = xmp_of(data)
     if "Depth:" not in text:
         return None
@@ -168,7 +168,7 @@ def xmp_of(data: bytes) -> str:
 
 
 def item_of(data: bytes, text: str) -> bytes | None:
-    """The picture of depth among those that lie one after another behind a photograph."""
+    """The depth picture among those appended to a photograph."""
     items = [dict(ITEM_FIELD.findall(one)) for one in ITEM.findall(text)]
     lengths = [int(item.get("Length") or 0) for item in items]
     for i, item in enumerate(items):

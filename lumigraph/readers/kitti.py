@@ -47,8 +47,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Photographs of the left colour camera, with the tracks of all labelled things. Raises LumigraphError for several
-    sequences, and for files that hold something else."""
+    """Photographs of the left colour camera, with the tracks of all labelled objects. Raises LumigraphError for several
+    sequences, and for malformed files."""
     root, name = sequence(folder)
     pictures = [root / PICTURES / name / x for x in list_images(root / PICTURES / name)]
     matrices = read_calibration(root / CALIBRATION / f"{name}.txt")
@@ -73,7 +73,7 @@ def read(folder: Path) -> Capture:
 
 
 def sequence(folder: Path) -> tuple[Path, str]:
-    """The folder of all sequences, and the name of the one that is asked for."""
+    """Folder of all sequences, and name of the requested one."""
     if folder.parent.name == PICTURES:
         return folder.parent.parent, folder.name
     names = sorted(path.name for path in (folder / PICTURES).iterdir() if path.is_dir())
@@ -91,7 +91,7 @@ def frame_number(path: Path) -> int:
 
 
 def read_rows(path: Path, columns: int, words: tuple[int, ...] = ()) -> list[list[str]]:
-    """Words of the lines of a file. words: columns that hold no numbers"""
+    """Words of the lines of a file. words: columns that are not numbers"""
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
     for row in rows:
         with reading(path, f"holds {' '.join(row)[:120]!r}, where {columns} columns were looked for", "correct it"):
@@ -102,7 +102,7 @@ def read_rows(path: Path, columns: int, words: tuple[int, ...] = ()) -> list[lis
 
 
 def read_calibration(path: Path) -> dict[str, np.ndarray]:
-    """Matrices by name. Raises LumigraphError where one that is needed is missing."""
+    """Matrices by name. Raises LumigraphError for a missing one."""
     found = {}
     for line in read_text(path).splitlines():
         name, *numbers = line.replace(":", " ").split() or [""]
@@ -118,7 +118,7 @@ def read_calibration(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_drive(path: Path, matrices: dict[str, np.ndarray]) -> tuple[list[np.ndarray], GeographicOrigin]:
-    """Poses (4, 4) of camera 0, rectified, in metres east, north and up of the first place."""
+    """Poses (4, 4) of camera 0, rectified, in metres east, north and up of the first position."""
     for name in ("R_rect", "Tr_velo_cam", "Tr_imu_velo"):
         if name not in matrices:
             raise LumigraphError(
@@ -144,7 +144,7 @@ def read_drive(path: Path, matrices: dict[str, np.ndarray]) -> tuple[list[np.nda
 
 
 def whole(matrix: np.ndarray) -> np.ndarray:
-    """A 4 x 4 matrix of one of 3 x 3 or 3 x 4."""
+    """A 4 x 4 matrix from one of 3 x 3 or 3 x 4."""
     found = np.eye(4)
     found[:3, : matrix.shape[1]] = matrix
     return found
@@ -160,7 +160,7 @@ def about(axis: int, angle: float) -> np.ndarray:
 
 
 def read_labels(path: Path, drive: list[np.ndarray] | None) -> tuple[BoxTrack, ...]:
-    """Tracks of all labelled things, in the frame of the poses. drive: poses of camera 0; None where it stands still"""
+    """Tracks of all labelled objects, in the frame of the poses. drive: poses of camera 0; None for a static camera"""
     boxes: dict[tuple[str, str], dict[float, tuple[np.ndarray, tuple[float, float, float]]]] = {}
     for row in read_rows(path, LABEL_COLUMNS, words=(2,)):
         frame, track, kind = int(float(row[0])), row[1], row[2]

@@ -1,11 +1,11 @@
-"""Light fields: pictures of a grid of cameras that look the same way, by their files' names (Levoy and Hanrahan 1996).
+"""Light fields: pictures of a planar grid of parallel cameras, by their file names (Levoy and Hanrahan 1996).
 
     out_03_12_-381.909271_1103.376221.png   row, column and position (y, x): the gantry of the Stanford archive
     name_03_12.png                          row and column of a complete grid
     input_Cam000.png ... and parameters.cfg   row by row, with the lens and the baseline: HCI's benchmark
 
-Columns go right, rows go down. Pictures are rectified: what lies on one plane, the focal plane, is at the same pixel in
-all. Where nothing says how far that plane is and how wide the lens, `lightfield.json` may:
+Columns go right, rows go down. Pictures are rectified: points of the focal plane have the same pixel in all. Where the
+files lack its distance and the field of view, `lightfield.json` may give them:
 {"field_of_view": degrees across, "plane_distance": in units of the positions}.
 """
 
@@ -40,7 +40,7 @@ DEPTHS = (0.5, 4.0)  # nearest and farthest, in distances of the focal plane
 
 @dataclass(frozen=True)
 class GridAbout:
-    """Numbers of `lightfield.json`. plane_distance: in the unit of the files' names, or in cells of a grid"""
+    """Contents of `lightfield.json`. plane_distance: in the unit of the file names, or in cells of a grid"""
 
     field_of_view: Annotated[float, between(1, 150)] = 40.0
     plane_distance: Positive | None = None
@@ -80,7 +80,7 @@ def places(folder: Path) -> dict[Path, tuple[float, float]] | None:
 
 
 def read(folder: Path) -> Capture:
-    """Cameras on a plane, with lenses whose centres move along, so that the focal plane is at the same pixels."""
+    """Cameras on a plane, with shifted lens centres, so that points of the focal plane have the same pixel."""
     found = places(folder)
     if found is None:
         raise LumigraphError(f"{folder} holds no complete grid of pictures; name them out_ROW_COLUMN_Y_X.png")

@@ -1,8 +1,8 @@
 """LLFF captures (Mildenhall et al. 2019): poses_bounds.npy, one row of 17 numbers for each image in order of name.
 
-A row holds a 3x5 matrix and the nearest and farthest depth seen. The matrix's columns are the camera's down, right and
-backward axes, its position, and (height, width, focal length) in pixels. How the lens bends is not in it; the camera of
-the COLMAP model that the table was made from, where that lies beside it, tells.
+A row has a 3x5 matrix and the nearest and farthest depth seen. The matrix's columns are the camera's down, right and
+backward axes, its position, and (height, width, focal length) in pixels. Lens distortion is not in it; it is read from
+the COLMAP model of the capture, if that is in the folder.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder. Raises LumigraphError where the array is no such table or its rows are not as many as
-    there are images."""
+    """The capture in a folder. Raises LumigraphError for an array of another shape, and for a number of rows that
+    differs from that of images."""
     path = folder / "poses_bounds.npy"
     with reading(path, "is not LLFF's table of 17 numbers for each image", "make or copy it again"):
         table = np.array(load_array(path))
@@ -62,7 +62,7 @@ def read(folder: Path) -> Capture:
 
 
 def lens_of(width: float, height: float, focal: float, bend: tuple[float, float] | None) -> Lens:
-    """A pinhole, or where a bend is known of the same focal length, in widths, the lens that has it."""
+    """A pinhole, or a lens with radial distortion if known for the same focal length, in widths."""
     focals, centre = torch.tensor([[focal, focal]]).float(), torch.tensor([[width / 2, height / 2]]).float()
     if bend is None or abs(bend[0] * width / focal - 1) > FOCAL_TOLERANCE:
         return Pinhole(focals, centre)
@@ -72,8 +72,8 @@ def lens_of(width: float, height: float, focal: float, bend: tuple[float, float]
 
 
 def bend_of(path: Path) -> tuple[float, float] | None:
-    """Focal length, in widths of the picture, and radial distortion of the one camera in a COLMAP file; None where it
-    is another kind of file."""
+    """Focal length, in widths of the picture, and radial distortion of the one camera in a COLMAP file; None for any
+    other file."""
     data = path.read_bytes() if path.is_file() else b""
     if len(data) != CAMERA_RECORD.size:
         return None

@@ -1,11 +1,11 @@
-"""Masks beside photographs, by the folders that they lie in, for every reader.
+"""Masks of photographs, by folder name, for every reader.
 
-masks/          what to learn from: where a mask is black (0) the photograph is ignored, be it a passer-by, a hand or
-                the sky. COLMAP's and nerfstudio's meaning.
-object_masks/   what the object is: where one is black there is nothing, so that the object stands alone. A mask is the
-                photograph's alpha.
+masks/          training masks: black (0) pixels are ignored, be it a passer-by, a hand or the sky. COLMAP's and
+                nerfstudio's meaning.
+object_masks/   silhouettes: black pixels are empty, so that the object stands alone. They become the photograph's
+alpha.
 
-labels/         what each pixel shows, as a whole number: the layer `labels`. `lumigraph segment` writes such a folder.
+labels/         class of each pixel, an integer: the layer `labels`. `lumigraph segment` writes such a folder.
 
 A mask is named after its photograph, image.png or image.jpg.png for image.jpg, and has its shape, at any size.
 """
@@ -26,13 +26,13 @@ IMAGE_FOLDERS = ("images", "image", "input", "photos", "photographs", "frames") 
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """The mask of a photograph in a folder of masks; None where there is none."""
+    """Mask of a photograph in a folder of masks, or None."""
     names = (x for own in inner_names(name) for x in (f"{own}.png", PurePosixPath(own).with_suffix(".png")))
     return next((folder / x for x in names if (folder / x).is_file()), None)
 
 
 def inner_names(name: str) -> Iterator[str]:
-    """A photograph's name below the folder of all photographs, which its path may begin with."""
+    """A photograph's name without leading folders, one after another."""
     path = PurePosixPath(name)
     if path.parts[0] in IMAGE_FOLDERS and len(path.parts) > 1:
         yield PurePosixPath(*path.parts[1:]).as_posix()
@@ -40,10 +40,10 @@ def inner_names(name: str) -> Iterator[str]:
 
 
 def with_masks(capture: Capture, folder: Path) -> Capture:
-    """The capture with the masks that lie in its folder; a mask that the capture itself names stays.
+    """The capture with the masks in its folder; a mask of the capture itself takes precedence.
 
-    Where there are silhouettes, photographs without one would show what the others say is not there: they are left
-    out, and named. Warns of masks none of which is named after a photograph.
+    If some photographs have silhouettes, those without would contradict them: they are left out, and named. Warns if no
+    mask is named after a photograph.
     """
     shots, missing = list(capture.shots), list(capture.missing)
     if (folder / MASKS).is_dir():
@@ -67,7 +67,7 @@ def with_masks(capture: Capture, folder: Path) -> Capture:
 
 
 def labelled(folder: Path, name: str) -> dict[str, PixelPlane]:
-    """The labels of a photograph in a folder; empty where there are none."""
+    """Labels of a photograph in a folder, or an empty dictionary."""
     found = find_mask(folder, name)
     return {} if found is None else {LABELS: PixelPlane(found, "index")}
 

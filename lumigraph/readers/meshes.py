@@ -1,4 +1,4 @@
-"""Meshes and clouds of points in files become Shapes."""
+"""Shapes from files of meshes and point clouds."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def is_mesh(path: Path) -> bool:
 
 
 def read_shapes(path: Path, partial: bool = False) -> Shapes:
-    """The shape in a file, or the shapes in a folder and in the folders below it, each normalised by itself.
+    """The shape in a file, or the shapes in a folder and its subfolders, each normalised by itself.
 
     partial: whether they are scans of some sides, see `Shape`
-    Of many, every 8th by name is for testing. What the Shapes should tell its user is a LumigraphWarning too.
-    Raises LumigraphError for files that hold no surface and no points.
+    Of many, every 8th by name is for testing. Warnings in Shapes are LumigraphWarnings too.
+    Raises LumigraphError for files without a surface or points.
     """
     found = [path] if path.is_file() else filter(is_mesh, path.rglob("*"))
     files = sorted(found, key=lambda file: natural(file.as_posix()))
@@ -63,14 +63,14 @@ def read_shapes(path: Path, partial: bool = False) -> Shapes:
 
 @reads("cannot be read as a shape", "export it once more")
 def read_shape(path: Path, name: str) -> Shape:
-    """All that one file holds, as one shape. Raises LumigraphError if that is nothing."""
+    """The contents of one file as one shape. Raises LumigraphError for an empty one."""
     made, up = read_mesh(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP
     return normalised(name, made, None if len(made.faces) else normals_of(path), up)
 
 
 @reads("cannot be read as a mesh", "export it once more")
 def read_mesh(path: Path) -> Mesh:
-    """All triangles of a file, or all its points, in its own frame. Raises LumigraphError if that is nothing."""
+    """All triangles of a file, or all its points, in its own frame. Raises LumigraphError for an empty one."""
     import trimesh  # which takes a while
 
     if path.stat().st_size > free_memory():
@@ -104,7 +104,7 @@ def has_texture(path: Path) -> bool:
 
 
 def read_ply(path: Path) -> Any:
-    """Triangles of a PLY file, its polygons cut into fans; its points if it has none."""
+    """Triangles of a PLY file, its polygons triangulated as fans; its points if it has none."""
     import trimesh
 
     rows = read_vertices(path, "face")
@@ -119,7 +119,7 @@ def read_ply(path: Path) -> Any:
 
 
 def fans(polygons: np.ndarray) -> tuple[Int[np.ndarray, "triangle 3"], Int[np.ndarray, " triangle"]]:
-    """Triangles of polygons from their first corner, and the polygon that each is of."""
+    """Triangle fans of polygons, and the polygon of each triangle."""
     lengths = np.array([*map(len, polygons)]) if polygons.dtype == object else np.full(*polygons.shape)
     triangles, faces = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for length in np.unique(lengths[lengths >= 3]):
@@ -151,9 +151,9 @@ def joined(parts: list[Any]) -> Mesh:
 
 
 def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
-    """A colour at each vertex: the file's, from vertices or from a material or texture; grey where it has none.
+    """Vertex colours of a file: from vertices, a material or a texture; grey without any.
 
-    Where no coordinates say which part of a texture goes where, a material's own colour is that of all vertices.
+    Without texture coordinates a material's own colour is used.
     """
     try:
         visual = part.visual
@@ -177,7 +177,7 @@ def cloud(part: Any) -> Mesh:
 
 
 def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
-    """The normals of a cloud of points, of unit length; None without, or with any that is 0 or NaN."""
+    """Unit normals of a point cloud; None without, or with any that is 0 or NaN."""
     if path.suffix.lower() != ".ply":
         return None
     table = read_vertices(path)["vertex"]

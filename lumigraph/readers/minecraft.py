@@ -116,7 +116,7 @@ def library(path: Path) -> Any:
 
 
 def there(region: Any) -> Iterator[tuple[int, int]]:
-    """Places of the chunks that a region has."""
+    """Coordinates of the chunks of a region."""
     if len(region.data) < 8192:  # bytes of the header
         return
     for z in range(32):
@@ -138,7 +138,7 @@ def unknown_version(file: Path, x: int, z: int, region: Any) -> LumigraphError:
 
 
 def densest(places: list[tuple[int, int]]) -> tuple[int, int]:
-    """The first corner of the square of chunks that holds most of the places."""
+    """Lowest corner of the square of chunks with most chunks."""
     candidates = [(x - i, z - k) for x, z in places for i in range(SIDE) for k in range(SIDE)]
     return max(Counter(candidates).items(), key=lambda item: (item[1], -abs(item[0][0]), -abs(item[0][1])))[0]
 

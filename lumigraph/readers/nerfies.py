@@ -1,8 +1,8 @@
-"""Captures of things that move, as Nerfies and HyperNeRF publish them (Park et al. 2021).
+"""Captures of dynamic scenes, as Nerfies and HyperNeRF publish them (Park et al. 2021).
 
-dataset.json has the ids of photographs and which of them test; metadata.json the moment of each, as a number of the
-frame; camera/ID.json a camera; scene.json the nearest and farthest distance, in units of its `scale`; rgb/2x/ID.png the
-photograph, here half as large; points.npy points of the background, which does not move.
+dataset.json has the ids of photographs and the split; metadata.json the time of each, as a frame number;
+camera/ID.json a camera; scene.json the near and far distance, in units of its `scale`; rgb/2x/ID.png the photograph at
+half size; points.npy points of the static background.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Bend = Annotated[float, between(-1e4, 1e4)]
 
 @dataclass(frozen=True)
 class PhotographList:
-    """Fields of dataset.json: ids of all photographs, and of those that test."""
+    """Fields of dataset.json: ids of all photographs, and of test photographs."""
 
     ids: list[Name]
     train_ids: list[Name] = field(default_factory=list)
@@ -90,7 +90,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder. Raises LumigraphError for malformed JSON and for photographs without a moment."""
+    """The capture in a folder. Raises LumigraphError for malformed JSON and for photographs without a time."""
     listed = read_json(folder / "dataset.json", PhotographList)
     path = folder / "metadata.json"
     moments = {name: typed(PhotographRecord, about, f"{path}: {name}") for name, about in read_json(path).items()}

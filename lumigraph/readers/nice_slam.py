@@ -68,12 +68,12 @@ def scannet(folder: Path) -> Path | None:
 
 
 def read(folder: Path) -> Capture:
-    """Frames without a finite pose are left out. Raises LumigraphError for files that do not hold what they should."""
+    """The capture in a folder, without frames whose pose is not finite. Raises LumigraphError for malformed files."""
     return with_depth_points(read_replica(folder) if is_replica(folder) else read_scannet(folder))
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> Pinhole:
-    """The lens whose centre is given with pixel centres at whole numbers."""
+    """Pinhole for a principal point that counts pixel centres at integers."""
     return Pinhole(torch.tensor([[fx, fy]]).float(), torch.tensor([[cx + 0.5, cy + 0.5]]).float())
 
 
@@ -131,7 +131,7 @@ def read_scannet(folder: Path) -> Capture:
 
 
 def differ(depth: Pinhole, depth_size: tuple[int, int], colour: Pinhole, size: tuple[int, int]) -> bool:
-    """True if the two cameras see different parts, by more than a pixel of the depth."""
+    """True if the two cameras' views differ by more than a pixel of the depth."""
     as_depth = colour.resized(torch.tensor([depth_size]) / torch.tensor([size]))
     assert isinstance(as_depth, Pinhole)
     edges = torch.tensor([[0.0, 0.0], list(map(float, depth_size))])
@@ -140,7 +140,7 @@ def differ(depth: Pinhole, depth_size: tuple[int, int], colour: Pinhole, size: t
 
 
 def registered_file(path: Path, depth: Pinhole, colour: Pinhole, size: tuple[int, int]) -> np.ndarray:
-    """Depth of a file as the camera of the colours sees it. Both are in one place, as ScanNet's export says."""
+    """Depth of a file, reprojected to the colour camera. Both have one position, as in ScanNet's export."""
     with readable(path):
         stored = read_numbers(path, "depth").astype(np.float64)
     metres = np.where((stored == 0) | (stored == 65535), np.nan, MILLIMETRES * stored)

@@ -1,8 +1,8 @@
-"""The similarity that maps a capture's box of interest into [-1, 1]^3, the reach of the rest, and the plane in front of
-all that forward-facing cameras see.
+"""Normalisation: the similarity that maps a capture's box of interest into [-1, 1]^3, the reach of the rest, and the
+near plane of forward-facing cameras.
 
-Three kinds of knowledge, best first: what the source says itself, silhouettes of an object, and sparse points together
-with where the cameras look. Nothing here depends on which program found the poses, nor on a user's numbers.
+By order of preference it uses the source's own bounds, silhouettes of an object, and sparse points with the cameras'
+viewing directions. Nothing here depends on the program that found the poses, nor on a user's numbers.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ OUTLIER_SHARE = 0.005  # of the sparse points may lie nearer
 
 @dataclass(frozen=True)
 class ScenePlacement:
-    """The similarity x_scene = M x_source, and the scene's frame as far as it follows from its geometry."""
+    """The similarity x_scene = M x_source, and the geometric fields of the scene's frame."""
 
     scene_from_source: Float[np.ndarray, "4 4"]
     frame: Frame
@@ -66,8 +66,8 @@ def find_place(
     """Placement of the capture.
 
     cameras: in the source's frame
-    views:   the images that may be looked at, not held out
-    upright: the rotation that brings up to +z; None to find it
+    views:   images that may be used, not held out
+    upright: the rotation to +z up; None to estimate it
     """
     background = capture.background or (WHITE_COLOUR if images.has_alpha else BLACK_COLOUR)
     if capture.bounds is not None:
@@ -86,7 +86,7 @@ def find_place(
 
 
 def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "3 3"]:
-    """The rotation that brings up to +z in a capture's frame: none where it states bounds, which stand upright."""
+    """The rotation of a capture's frame to +z up: the identity where it has bounds, which are upright."""
     if capture.bounds is not None:
         return np.eye(3)
     if capture.up is not None:
@@ -96,9 +96,9 @@ def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "3 3"]:
 
 
 def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, background: Vector) -> ScenePlacement:
-    """A part of a larger capture: a cube around its middle, and cubes around it as far as the points go.
+    """Placement of a part of a larger capture: a cube around its centre, and cubes around it as far as the points go.
 
-    cameras: in the turned frame
+    cameras: in the upright frame
     """
     assert capture.around is not None
     centre, half = upright @ np.array(capture.around[0]), capture.around[1]
@@ -116,7 +116,7 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
 
 
 def stated_place(capture: Capture, cameras: Camera, background: Vector) -> ScenePlacement:
-    """Placement that the source states: bounds, and reach and near if it states them."""
+    """Placement by the source's bounds, and its reach and near if it has them."""
     assert capture.bounds is not None
     low, high = np.array(capture.bounds, np.float64)
     centre, half = 0.5 * (low + high), 0.5 * float((high - low).max())
@@ -130,7 +130,7 @@ def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Scene
 def object_place(
     upright: np.ndarray, box: tuple[np.ndarray, np.ndarray], cameras: Camera, background: Vector
 ) -> ScenePlacement:
-    """An object alone: its box fills the scene."""
+    """Placement of a single object: its box fills the scene."""
     low, high = box
     centre, half = 0.5 * (low + high), 0.5 * BOX_MARGIN * float((high - low).max())
     low, high = centre - 0.5 * BOX_MARGIN * (high - low), centre + 0.5 * BOX_MARGIN * (high - low)
@@ -148,7 +148,7 @@ def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class WeightedPoints:
-    """Sparse points in the turned frame, and how often each was seen."""
+    """Sparse points in the upright frame, and their numbers of sightings."""
 
     points: Float[np.ndarray, "point 3"]
     weights: Float[np.ndarray, " point"]
@@ -156,13 +156,13 @@ class WeightedPoints:
 
 @dataclass(frozen=True)
 class Gaze:
-    """Point and region that the cameras look at, in the rotated frame.
+    """Point and region that the cameras look at, in the upright frame.
 
-    centre:     the middle of it
+    centre:     of the region
     distance:   typical, from the cameras
-    half:       half-size of a box that holds what matters most
-    nearest:    distance of the nearest thing any of them sees
-    cloud:      sparse points, if there are any
+    half:       half-size of the box of interest
+    nearest:    least depth of any camera's view
+    cloud:      sparse points, if any
     """
 
     centre: Float[np.ndarray, " 3"]
@@ -199,9 +199,10 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
 def open_place(
     capture: Capture, images: ImageStore, upright: np.ndarray, gaze: Gaze, background: Vector
 ) -> ScenePlacement:
-    """A room or the open: a box in the middle of what is looked at, and cubes around it as far as the points go.
+    """Placement of an unbounded capture: a box around the point of interest, and cubes around it as far as the points
+    go.
 
-    A stated reach of an object alone is taken only where masks may leave out what lies around it.
+    The reach of an object alone is used only where masks may remove its surroundings.
     """
     centre, half = gaze.centre, gaze.half
     reach = DEFAULT_REACH
@@ -220,7 +221,7 @@ def open_place(
 
 
 def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
-    """Move a box to the middle of the points inside it, and shrink it where they are fewer than it could hold."""
+    """Move a box to the mean of the points inside it, and shrink it to them."""
     points, weights = cloud.points, cloud.weights
     inside = np.abs(points - centre).max(-1) < half
     for _ in range(5):
@@ -233,7 +234,7 @@ def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.n
 
 
 def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | None:
-    """The finite points that were seen at least twice, if there are enough to speak of."""
+    """Finite points with at least two sightings; None if they are few."""
     if capture.points is None:
         return None
     sightings = np.full(len(capture.points), 2) if capture.sightings is None else capture.sightings
@@ -244,8 +245,8 @@ def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | N
 
 
 def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, "camera 2"] | None:
-    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture. NaN for a picture that
-    none are in, None if that is so for all."""
+    """Near (2nd percentile) and median distance of the points inside each picture. NaN for a picture without points,
+    None if all are."""
     chosen = evenly(range(len(cloud.points)), SAMPLED_POINTS)
     points, weights = cloud.points[chosen], cloud.weights[chosen]
     sampled = torch.from_numpy(points).float()
@@ -259,7 +260,7 @@ def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, 
 
 
 def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, bool]:
-    """The point nearest to all optical axes (least squares), and whether there is one: in front, at an angle."""
+    """Least-squares intersection of all optical axes, and whether it is reliable: in front, at an angle."""
     across = np.eye(3) - forward[:, :, None] * forward[:, None]
     if np.linalg.eigvalsh(across.mean(0))[0] < MIN_CONVERGENCE:
         return position.mean(0), False
@@ -269,7 +270,7 @@ def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarr
 
 
 def similarity(upright: np.ndarray, centre: np.ndarray, half: float) -> Float[np.ndarray, "4 4"]:
-    """Turn, then bring a centre to the origin and a half-size to 1."""
+    """Similarity: rotate upright, then map a centre to the origin and a half-size to 1."""
     matrix = np.eye(4)
     matrix[:3, :3] = upright / half
     matrix[:3, 3] = -np.asarray(centre) / half
@@ -287,7 +288,7 @@ def power_of_two(value: float) -> float:
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """The value below which a share of the weight lies."""
+    """Weighted quantile."""
     order = np.argsort(values)
     return float(
         values[order][np.searchsorted(np.cumsum(weights[order]), share * weights.sum()).clip(max=len(values) - 1)]
@@ -297,12 +298,12 @@ def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
 def find_forward(
     capture: Capture, shots: list[Shot], cameras: Camera, scene_from_source: Float[np.ndarray, "4 4"], near: float
 ) -> Forward | None:
-    """Forward-facing frame of an unbounded capture; None if its cameras do not all look one way.
+    """Frame of a forward-facing unbounded capture; None if its cameras do not all look one way.
 
-    shots, cameras: those to learn from; cameras in the scene's frame
-    near:           distance from every camera within which nothing is, in scene units
-    They do where each looks within 30 degrees of the mean camera, and a plane across its axis stands beyond all of them
-    and before all that they see.
+    shots, cameras: training ones; cameras in the scene's frame
+    near:           near distance of every camera, in scene units
+    Condition: each camera looks within 30 degrees of the mean camera, and a plane across its axis is in front of all
+    cameras and nearer than everything they see.
     """
     pose = mean_pose(cameras)
     if float((cameras.forward.double() @ pose[:, 2]).min()) < MIN_AXIS_COSINE:
@@ -337,10 +338,10 @@ def mean_pose(cameras: Camera) -> Float[Tensor, "3 4"]:
 
 def fitting_scale(cameras: Camera, pose: Float[Tensor, "3 4"], plane: float) -> tuple[float, float] | None:
     """Factors on x / z and y / z in the mean camera that bring everything visible beyond the plane into [-1, 1]; None
-    for lenses of too wide an angle.
+    for too wide lenses.
 
-    Mildenhall 2020 takes the focal lengths over half the picture. Cameras beside the mean one then see places beyond 1,
-    which a positional encoding cannot tell from others.
+    Mildenhall 2020 takes the focal lengths over half the picture. Cameras beside the mean one then see points beyond 1,
+    which alias in a positional encoding.
     """
     count = len(BORDER_POINTS) * len(cameras)
     pixels = (torch.tensor(BORDER_POINTS) * cameras.size[:, None]).reshape(count, 2)

@@ -1,6 +1,6 @@
-"""Numbers of files as they are stored: photographs of more than eight bits, depth, labels, arrays.
+"""Raw numbers of files: photographs of more than eight bits, depth, labels, arrays.
 
-Pillow keeps 16 bits of grey only, so colours of 16 bits and EXR go through FFmpeg (`av`), as films do.
+Pillow keeps 16 bits of grey only, so colours of 16 bits go through FFmpeg (`av`), as films do.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
 from ..color.srgb import srgb_from_linear
+from ..files.exr import picture_of, read_exr
 from ..files.ffmpeg import decode
 from ..system.memory import free_memory
 
@@ -47,7 +48,7 @@ class Kind:
 
     @property
     def deep(self) -> bool:
-        """True if it holds more than eight bits, in 1, 3 or 4 channels."""
+        """True for more than eight bits, in 1, 3 or 4 channels."""
         return self.dtype.itemsize > 1 and self.channels in (1, 3, 4)
 
     @property
@@ -59,7 +60,7 @@ class Kind:
 
 
 def check_pixels(size: tuple[int, int], each: int = 4) -> None:
-    """Raise ValueError for a declared picture that nothing has, or that takes more memory to read than is free.
+    """Raise ValueError for an implausible picture size, or one that exceeds free memory.
 
     each: bytes of a pixel
     """
@@ -74,8 +75,8 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
 
 
 def load_array(path: Path) -> Any:
-    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine. Raises ValueError,
-    and what np.load raises."""
+    """Load a file by np.load without pickles, limited by the file's bytes and free memory. Raises ValueError, and the
+    errors of np.load."""
     if not zipfile.is_zipfile(path):
         return np.load(path, mmap_mode="r", allow_pickle=False)
     with zipfile.ZipFile(path) as packed:
@@ -115,7 +116,7 @@ def kind_of(path: Path, name: str = "") -> Kind:
 
 
 def tiff_tags(path: Path) -> Mapping[int, Any]:
-    """A TIFF file's tags, also where its pixels are of a kind that Pillow cannot open."""
+    """Tags of a TIFF file, also of one whose pixel format Pillow cannot open."""
     with open(path, "rb") as file:
         header = file.read(8)
         header += file.read(8) if header[2:4] in (b"\x2b\0", b"\0\x2b") else b""  # the large kind of TIFF
@@ -148,13 +149,18 @@ def exr_kind(path: Path) -> Kind:
         types.append(struct.unpack_from("<i", channels, name_ends + 1)[0])
         at = name_ends + 17
     dtype = np.dtype(np.float16 if all(kind == EXR_HALF for kind in types) else np.float32)
-    return Kind((right - left + 1, bottom - top + 1), dtype, len(names) if set("RGB") <= set(names) else 1, True)
+    picture = picture_of(names) or names[:1]
+    if len(picture) == 3 and picture[0].endswith("Y"):
+        dtype = np.dtype(np.float32)  # colours are computed
+    return Kind((right - left + 1, bottom - top + 1), dtype, len(picture), True)
 
 
 def read_numbers(path: Path, name: str = "") -> np.ndarray:
     """All numbers as stored, (height, width) or (height, width, channels). name: as in `kind_of`"""
     if path.suffix.lower() in (".npy", ".npz"):
         return read_array(path, name)
+    if path.suffix.lower() == ".exr":
+        return read_exr(path).astype(exr_kind(path).dtype)
     kind, tiff = kind_of(path), path.suffix.lower() in TIFF_SUFFIXES
     grey_floats = tiff and kind.channels == 1 and kind.dtype.kind == "f"  # unknown to FFmpeg
     if kind.deep and not grey_floats:
@@ -167,7 +173,7 @@ def read_numbers(path: Path, name: str = "") -> np.ndarray:
 
 
 def read_array(path: Path, name: str) -> np.ndarray:
-    """The array of a NumPy file; of several the one that is called so."""
+    """Array of a NumPy file; of several that of the given name."""
     found = load_array(path)
     if isinstance(found, np.ndarray):
         array = found
@@ -186,7 +192,7 @@ def read_array(path: Path, name: str) -> np.ndarray:
 
 
 def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
-    """Upright, as EXIF's orientation says."""
+    """Pixels rotated upright by EXIF's orientation."""
     if orientation in (5, 6, 7, 8):
         values = values.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -195,7 +201,7 @@ def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
 
 
 def as_bytes(values: np.ndarray, encoding: str) -> np.ndarray:
-    """RGB or RGBA of more than eight bits as sRGB-encoded bytes, colours not multiplied by alpha."""
+    """RGB or RGBA of more than eight bits as sRGB-encoded bytes, not premultiplied."""
     found = values.astype(np.float64)
     found = np.nan_to_num(found) if values.dtype.kind == "f" else found / np.iinfo(values.dtype).max
     if encoding == "linear premultiplied":

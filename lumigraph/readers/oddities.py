@@ -1,4 +1,4 @@
-"""Warnings of captures that are well-formed but implausible, in a sentence each, before training begins."""
+"""Warnings of captures that are well-formed but implausible, before training."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ORDER_SHARE = 0.5  # distance of neighbours, as a share of that of any two, up t
 
 
 def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "camera 3 4"]) -> list[str]:
-    """Warnings of a capture; none where its source states the bounds."""
+    """Warnings of a capture; none where its source has bounds."""
     if capture.bounds is not None:
         return []
     found = [about_double(shots), about_places(poses), about_gaze(capture, poses), about_angles(shots)]
@@ -43,7 +43,7 @@ def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "came
 
 
 def about_double(shots: list[Shot]) -> str | None:
-    """Photographs that are listed more than once, by the file that they are."""
+    """Warning of photographs listed more than once, by file."""
     files = [str(shot.image[min(shot.image)]) if isinstance(shot.image, dict) else shot.name for shot in shots]
     double = [name for name, count in Counter(files).items() if count > 1]
     if not double:
@@ -53,7 +53,9 @@ def about_double(shots: list[Shot]) -> str | None:
 
 
 def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
-    """Cameras in one place, and units in which nothing is measured. LumigraphError if too small to compute with."""
+    """Warning of cameras in one place, and of implausible units. LumigraphError for positions too small to compute
+    with.
+    """
     place = poses[:, :, 3]
     spread = float(np.linalg.norm(place - place.mean(0), axis=-1).max())
     if spread <= MIN_RELATIVE_SPREAD * float(np.abs(place).max()):
@@ -70,7 +72,7 @@ def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
 
 
 def about_gaze(capture: Capture, poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
-    """Cameras that look away from where their axes meet, all of them, and from the points if there are any."""
+    """Warning of cameras that all look away from where their axes meet, and from the points if any."""
     place, forward = poses[:, :, 3], poses[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None]
     if np.linalg.eigvalsh(across.mean(0))[0] < MIN_CONVERGENCE:
@@ -94,7 +96,7 @@ def about_gaze(capture: Capture, poses: Float[np.ndarray, "camera 3 4"]) -> str 
 
 
 def about_angles(shots: list[Shot]) -> str | None:
-    """Focal lengths that no lens before such a picture has."""
+    """Warning of implausible focal lengths."""
     for shot in shots:
         focal = getattr(shot.lens, "focal", None)
         if focal is None or shot.size is None:
@@ -106,11 +108,12 @@ def about_angles(shots: list[Shot]) -> str | None:
 
 
 def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = ()) -> list[tuple[int, float]]:
-    """Leaps between consecutive cameras that see the same: the camera before, and the leap over the usual step.
+    """Jumps between consecutive cameras with overlapping views: index of the camera before, and distance over the usual
+    step.
 
-    A model that is folded, with parts of the place in it twice or two parts in one place, leaps where the fold is.
+    A folded model, with parts of the place in it twice or two parts in one place, jumps at the fold.
     poses:       camera-to-world
-    overlapping: photographs that are known to share details with the next; others count where both look the same way
+    overlapping: photographs known to share features with the next; others count if both look the same way
     """
     steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
     same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(MAX_VIEW_ANGLE))
@@ -125,7 +128,7 @@ def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = 
 
 
 def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
-    """True if neighbours in the list were taken near each other, as on a walk."""
+    """True if consecutive photographs were taken near each other, as on a walk."""
     if len(positions) < 8:
         return False
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
@@ -135,7 +138,7 @@ def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
 
 
 def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> str | None:
-    """A sentence about a possible fold, if there is one."""
+    """Warning of a possible fold, or None."""
     found = fold(shots, poses)
     return found and (
         f"has {found.before} and {found.after} next to each other, showing the same, but {found.times:.0f} times "
@@ -145,7 +148,7 @@ def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> 
 
 
 class Fold(NamedTuple):
-    """Names of two neighbours whose photographs show the same, and the distance of their cameras over the usual one."""
+    """Names of two consecutive photographs with the same view, and their cameras' distance over the usual one."""
 
     before: str
     after: str
@@ -153,10 +156,9 @@ class Fold(NamedTuple):
 
 
 def fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> Fold | None:
-    """The widest leap between neighbours whose photographs show the same, if there is one and the order of photographs
-    tells anything.
+    """Largest jump between consecutive photographs with the same view, if any and if their order is meaningful.
 
-    Those of each published split are a list of their own. Photographs are looked at only where cameras leap.
+    Each published split is a list of its own. Photographs are read only where cameras jump.
     """
     groups = [[i for i, shot in enumerate(shots) if shot.split == split] for split in {shot.split for shot in shots}]
     found = [(group, leaps_alike([shots[k] for k in group], poses[group])) for group in groups]
@@ -168,7 +170,7 @@ def fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> Fold |
 
 
 def leaps_alike(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> list[tuple[int, float]]:
-    """The widest jumps, whichever way cameras look, across which photographs differ no more than beside them."""
+    """Largest jumps, in any viewing direction, across which photographs differ no more than beside them."""
     if not in_steps(poses[:, :, 3]):
         return []
     found = sorted(jumps(poses, range(len(poses))), key=lambda jump: -jump[1])[:CHECKED_JUMPS]
@@ -185,7 +187,7 @@ def alike(four: Sequence[Shot]) -> bool:
 
 
 def thumbnail(shot: Shot) -> Float[np.ndarray, "row column"] | None:
-    """A photograph in a few grey pixels, whatever its exposure; None where no file holds it."""
+    """A photograph in a few grey pixels, normalised by exposure; None without a file."""
     if not isinstance(shot.image, dict):
         return None
     try:

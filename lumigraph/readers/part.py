@@ -1,4 +1,4 @@
-"""Parts of a large capture, each of which becomes a scene with its own frame; and camera positions without pixels."""
+"""Parts of a large capture, each a scene with its own frame; and camera positions without pixels."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ MAX_POINT_RADII = 16.0  # radii of a part within which sparse points are kept: b
 
 @dataclass(frozen=True)
 class CapturePart:
-    """Some photographs of a capture, and where the place is that they are of.
+    """Some photographs of a capture, and the region that they show.
 
     photographs: their names; those held out of the whole capture are held out here
-    centre, radius: of the place, in the source's frame and units
+    centre, radius: of the region, in the source's frame and units
     """
 
     photographs: list[str]
@@ -33,8 +33,8 @@ class CapturePart:
 
 
 def part_of(capture: Capture, part: CapturePart) -> Capture:
-    """The capture with these photographs alone, and a box of interest of that radius around that centre. Raises
-    LumigraphError where some of the photographs are not there."""
+    """The capture with only these photographs, and a box of interest of that radius around that centre. Raises
+    LumigraphError for missing photographs."""
     shots = {shot.name: shot for shot in with_splits(capture.shots)}
     if lost := [name for name in part.photographs if name not in shots]:
         raise LumigraphError(
@@ -52,7 +52,7 @@ def part_of(capture: Capture, part: CapturePart) -> Capture:
 
 
 def with_splits(shots: list[Shot]) -> list[Shot]:
-    """The photographs, each with its purpose: as published, otherwise every 8th by name is held out."""
+    """The photographs with their splits: as published, else every 8th by name is held out."""
     if any(shot.split for shot in shots):
         return shots
     purposes = {shot.name: "train" if i % HOLD_OUT else "test" for i, shot in enumerate(in_order(shots, None))}
@@ -61,10 +61,10 @@ def with_splits(shots: list[Shot]) -> list[Shot]:
 
 @dataclass(frozen=True)
 class Places:
-    """Photograph i is called names[i] and serves the purpose splits[i].
+    """Camera positions; photograph i is names[i] in the split splits[i].
 
-    positions, forwards: in the source's frame and units; where it looks, unit length
-    upright:   the rotation that brings up to +z
+    positions, forwards: in the source's frame and units; viewing direction, unit length
+    upright:   the rotation to +z up
     """
 
     names: list[str]
@@ -83,8 +83,8 @@ class Places:
 
 
 def places_of(capture: Capture) -> Places:
-    """The places of a capture's photographs by name, 2 ahead of 10. Raises LumigraphError for a capture without
-    photographs, and for poses that are none."""
+    """Camera positions of a capture by name, 2 before 10. Raises LumigraphError for a capture without photographs, and
+    for invalid poses."""
     shots = with_splits(in_order(capture.shots, None))
     if not shots:
         raise LumigraphError(f"{capture.source} has no photograph with a pose; add some")

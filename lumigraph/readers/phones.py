@@ -18,7 +18,7 @@ import torch
 
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..files import read_bytes, read_json
+from ..files import is_file, read_bytes, read_json
 from ..files.names import natural
 from ..files.ranges import Coordinate, Positive, Side
 from ..files.reading import reading
@@ -52,8 +52,12 @@ class PolycamCamera:
     fy: Positive
     cx: Coordinate
     cy: Coordinate
-    width: Side
-    height: Side
+    width: Side | None = None
+    height: Side | None = None
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        return None if self.width is None or self.height is None else (self.width, self.height)
 
     @property
     def pose(self) -> np.ndarray:
@@ -82,7 +86,7 @@ def is_polycam(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Raises LumigraphError for malformed files."""
+    """The capture in a folder. Raises LumigraphError for malformed files."""
     return read_polycam(folder) if is_polycam(folder) else read_record3d(folder)
 
 
@@ -91,7 +95,7 @@ def opencv(pose: np.ndarray) -> np.ndarray:
 
 
 def read_polycam(folder: Path) -> Capture:
-    """The corrected poses with their pictures, where Polycam has optimised them."""
+    """Polycam's optimised poses with their pictures, if there are any, else the original ones."""
     frames = folder / "keyframes"
     corrected = "corrected_" if (frames / "corrected_cameras").is_dir() else ""
     shots, missing = [], []
@@ -103,7 +107,11 @@ def read_polycam(folder: Path) -> Capture:
         lens = Pinhole(torch.tensor([[said.fx, said.fy]]), torch.tensor([[said.cx, said.cy]]))
         depth = frames / "depth" / f"{path.stem}.png"
         planes = {"depth": PixelPlane(depth, "z-depth", MILLIMETRES, unknown=(0,))} if depth.is_file() else {}
-        size = (said.width, said.height)
+        size = said.size
+        if size is None and is_file(
+            first := frames / "cameras" / path.name
+        ):  # present Polycam leaves it out of the others
+            size = read_json(first, PolycamCamera).size
         shots.append(Shot(path.stem, opencv(said.pose), lens, size, {1: picture}, planes=planes))
     return Capture(str(folder), shots, missing=missing, up=UP)
 
@@ -131,7 +139,7 @@ def read_record3d(folder: Path) -> Capture:
 
 
 def unpacked(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Depth of a file of Record3D. Raises LumigraphError without the library that unpacks it, or for another size."""
+    """Depth of a Record3D file. Raises LumigraphError without the LZFSE library, or for another size."""
     try:
         import liblzfse
     except ImportError as fault:

@@ -1,7 +1,8 @@
-"""Arrays and dictionaries of them in pickled .npy files, as some data sets are published. Nothing else is read.
+"""Arrays and dictionaries of them in pickled .npy files, as some data sets are published, without unpickling.
 
-A pickle is a program for a stack machine. Nothing of it runs here: its opcodes only describe lists, dictionaries, texts
-and numbers, and calls of the six functions by which NumPy describes an array. Arrays are then made from their bytes.
+A pickle is a program for a stack machine. Nothing of it is executed: only opcodes for lists, dictionaries, texts and
+numbers are interpreted, and calls of the six functions by which NumPy describes an array. Arrays are then made from
+their bytes.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ OBJECTS = ("O", "O4", "O8")  # names of the type of references
 
 @reads("cannot be read as arrays")
 def load_pickled(path: Path) -> Any:
-    """The dictionary of arrays, numbers and lists in a pickled .npy file. Raises LumigraphError for others."""
+    """Load the dictionary of arrays, numbers and lists in a pickled .npy file. Raises LumigraphError for others."""
     file = io.BytesIO(read_bytes(path))
     version = npy.read_magic(file)
     shape, _, dtype = (npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(file)
@@ -62,7 +63,7 @@ class NamedFunction:
 
     @staticmethod
     def of(module: str, name: str) -> NamedFunction:
-        """Raises ValueError for a name that no array needs."""
+        """Name of an allowed function. Raises ValueError for any other."""
         found = f"{module}.{name}".replace("numpy.core.", "numpy._core.").replace("__builtin__.", "builtins.")
         if found not in NAMED:
             raise ValueError(f"it names {module}.{name}, which is no array")
@@ -71,7 +72,7 @@ class NamedFunction:
 
 @dataclass(eq=False)
 class Call:
-    """A call that a pickle describes, and the state that it gives to the result."""
+    """A call described by a pickle, and the state for its result."""
 
     name: str
     arguments: tuple
@@ -79,7 +80,7 @@ class Call:
 
 
 def opcodes(file: io.BytesIO) -> Iterator[tuple[str, Any]]:
-    """Name and argument of each opcode, as `pickletools.genops`, which does not read bytes above 127 of Python 2."""
+    """Name and argument of each opcode, as `pickletools.genops`, but also of Python 2 strings with bytes above 127."""
     for _ in range(MAX_OPCODES):
         opcode = OPCODES.get(file.read(1).decode("latin-1"))
         if opcode is None:
@@ -93,7 +94,7 @@ def opcodes(file: io.BytesIO) -> Iterator[tuple[str, Any]]:
 
 
 def described(program: Iterable[tuple[str, Any]]) -> Any:
-    """Lists, dictionaries, values and `Call`s that opcodes describe. Raises ValueError for opcodes of anything else."""
+    """Lists, dictionaries, values and `Call`s of opcodes. Raises ValueError for other opcodes."""
     stack, below, memo = list[Any](), list[list[Any]](), dict[int, Any]()
     for name, argument in program:
         if name in VALUES:
@@ -153,7 +154,7 @@ def described(program: Iterable[tuple[str, Any]]) -> Any:
 
 
 def extend(target: Any, kind: type, items: Sequence[Any]) -> None:
-    """Append items to a list, or put pairs of them into a dictionary."""
+    """Append items to a list, or pairs of them to a dictionary."""
     if not isinstance(target, kind):
         raise ValueError(f"it adds items to something else than a {kind.__name__}")
     if isinstance(target, list):
@@ -167,7 +168,7 @@ def extend(target: Any, kind: type, items: Sequence[Any]) -> None:
 
 
 class Values:
-    """Plain values of what opcodes describe, with the number of values that each has where all references are followed.
+    """Plain values from described ones, with the number of values in each after following all references.
 
     References multiply: a few bytes can describe lists that would fill any memory.
     """
@@ -204,7 +205,7 @@ class Values:
 
 
 def result(name: str, arguments: tuple, state: tuple) -> Any:
-    """Result of a call that a pickle describes, without calling it."""
+    """Result of a described call, without executing it."""
     if name == "bytes" and not arguments:
         return b""
     if name == "encode":
@@ -222,7 +223,7 @@ def result(name: str, arguments: tuple, state: tuple) -> Any:
 
 
 def dtype_of(code: str, order: str) -> np.dtype:
-    """Type of an array's numbers or texts. Raises ValueError for others."""
+    """NumPy type of numbers or texts. Raises ValueError for others."""
     if code in OBJECTS:
         return np.dtype(object)
     if not (isinstance(code, str) and DTYPE.fullmatch(code) and order in ("<", ">", "=", "|")):
@@ -231,7 +232,7 @@ def dtype_of(code: str, order: str) -> np.dtype:
 
 
 def array_of(shape: tuple[int, ...], dtype: np.dtype, data: Any, order: Literal["C", "F"] = "C") -> Any:
-    """Array of bytes; of references the only item, or a list of items."""
+    """Array from bytes; for object arrays the only item, or a list of items."""
     if not (isinstance(shape, tuple) and isinstance(dtype, np.dtype) and order in ("C", "F")):
         raise ValueError("it holds an array whose shape or type is none")
     if len(shape) > MAX_AXES or not all(type(side) is int and 0 <= side <= MAX_VALUES for side in shape):

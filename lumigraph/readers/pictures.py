@@ -1,4 +1,4 @@
-"""Photographs as files: found, measured, turned upright, reduced, and read as bytes."""
+"""Image files of photographs: search, size, orientation, downscaling, reading as bytes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from ..datasets.images import ImageSource, resized
-from ..errors import LumigraphError
+from ..errors import LumigraphError, LumigraphWarning
 from ..files import is_file
 from ..files.reading import reading
+from ..system.memory import free_memory
 from .capture import PixelPlane, Shot
 from .numbers import (
     DECODING_COPIES,
@@ -30,6 +31,7 @@ from .numbers import (
     tiff_tags,
     turned,
 )
+from .profiles import Colours, colours_of
 
 DIGEST_SAMPLES, DIGEST_BYTES = 16, 1 << 12  # steps from one sample of a file's content to the next; bytes of a sample
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
@@ -41,23 +43,25 @@ IMAGE_SUFFIXES = (
 NO_HEIC = "is HEIC, and pi-heif, which reads that, is missing; pip install pi-heif, or convert it to JPEG"
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
+ICC_TAG = 34675  # of TIFF
 EXIF_UPRIGHT = (None, 0, 1)
 EXIF_SIDEWAYS = (5, 6, 7, 8)
 
 Size = tuple[int, int]
-warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `check_pixels` limits the size
+Image.MAX_IMAGE_PIXELS = free_memory() // (8 * DECODING_COPIES)  # refused from twice that; `check_pixels` is stricter
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
 def find_file(path: Path) -> Path:
-    """The file itself, or where it was named without a suffix, the image of that name. The file may not exist."""
+    """The file itself, or for a name without suffix the image of that name. The file may not exist."""
     if is_file(path) or not path.name:
         return path
     return next((p for s in IMAGE_SUFFIXES if is_file(p := path.with_name(path.name + s))), path)
 
 
 def list_images(folder: Path) -> list[str]:
-    """Names of the images below a folder, with / between folders, in the order in which programs pair them with poses:
-    by their letters, 10 before 2."""
+    """Names of the images below a folder, with / between folders, sorted as strings (10 before 2), the order in which
+    programs pair them with poses."""
     if not folder.is_dir():
         return []
     files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in IMAGE_SUFFIXES} and p.is_file())
@@ -65,7 +69,7 @@ def list_images(folder: Path) -> list[str]:
 
 
 def reductions(folder: Path) -> dict[int, Path]:
-    """Folders of the same photographs, reduced: images, images_2, images_4..., by how many times."""
+    """Folders of the same photographs at reduced size: images, images_2, images_4..., by factor."""
     found = {1: folder} if folder.is_dir() else {}
     for beside in folder.parent.glob(f"{folder.name}_*"):
         times = beside.name.removeprefix(f"{folder.name}_")
@@ -75,10 +79,10 @@ def reductions(folder: Path) -> dict[int, Path]:
 
 
 def versions(folders: dict[int, Path], names: list[str]) -> list[dict[int, Path]]:
-    """For each named photograph its files in folders of photographs reduced so many times.
+    """Files of each named photograph by reduction factor.
 
-    A file may have another suffix than the name says. In a reduced folder where no name fits but the number of files
-    does, the order of names decides.
+    A file may have another suffix than the name says. A reduced folder with the same number of files but no matching
+    name is matched in order of names.
     """
     found: list[dict[int, Path]] = [{} for _ in names]
     for times, place in folders.items():
@@ -103,10 +107,10 @@ def stem(name: str) -> str:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A photograph as it will be used: its pixels, the size its lens was calibrated for, and the size wanted.
+    """A photograph's file at its final size: its pixels, the size of its lens calibration, and the target size.
 
     plane: all its bits, where they are more than eight
-    digest: of its file, see `digest_of`; empty where there is none
+    digest: of its file, see `digest_of`; empty without a file
     """
 
     picture: ImageSource
@@ -117,9 +121,9 @@ class Chosen:
 
 
 def choose(shot: Shot, downscale: int | None) -> Chosen:
-    """File of a shot to read, and its reduction: `downscale` times the size that the lens was calibrated for.
+    """Choose a shot's file to read, and its reduction: `downscale` times the size that the lens was calibrated for.
 
-    Raises LumigraphError for a file that is no image or whose shape contradicts the lens.
+    Raises LumigraphError for a file that is no image or whose aspect ratio contradicts the lens.
     """
     if isinstance(shot.image, dict):
         return choose_file(shot, shot.image, downscale)
@@ -193,7 +197,7 @@ def reduced(size: Size, downscale: int | None) -> Size:
 
 
 def smaller(own: Size, wanted: Size) -> Size:
-    """The size to read at: the wanted one, unless that is larger, or smaller only by another program's rounding."""
+    """The size to read at: the target size, unless the file is smaller, or equal up to another program's rounding."""
     return own if max(own) <= max(wanted) + 1 else wanted
 
 
@@ -209,7 +213,7 @@ def stat(path: Path) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """Size of a file and a hash of samples of its content, by which a changed photograph is noticed."""
+    """Size of a file and a hash of samples of its content, to detect changed photographs."""
     with readable(path), open(path, "rb") as file:
         size, crc = path.stat().st_size, 0
         for number in range(DIGEST_SAMPLES + 1):
@@ -220,8 +224,8 @@ def digest_of(path: Path) -> str:
 
 @cache
 def reads_heic() -> bool:
-    """Let Pillow read HEIC, turned upright by the decoder and without an orientation left in EXIF. False where the
-    package for it is missing."""
+    """Register HEIC support in Pillow, with orientation applied by the decoder. False if the package for it is
+    missing."""
     try:
         import pi_heif
     except ImportError:
@@ -231,7 +235,7 @@ def reads_heic() -> bool:
 
 
 def measure(path: Path) -> tuple[Size, int | None]:
-    """Width and height as stored, and how EXIF says to turn it."""
+    """Width and height as stored, and EXIF's orientation."""
     with readable(path):
         if path.suffix.lower() == ".exr":
             return kind_of(path).size, None
@@ -243,7 +247,7 @@ def measure(path: Path) -> tuple[Size, int | None]:
 
 
 def upright_size(files: dict[int, Path]) -> Size:
-    """Full size of a photograph in files that are reduced so many times, upright as EXIF says."""
+    """Full size of a photograph from files by reduction factor, after EXIF rotation."""
     (width, height), orientation = measure(files[min(files)])
     width, height = width * min(files), height * min(files)
     return (height, width) if orientation in EXIF_SIDEWAYS else (width, height)
@@ -254,8 +258,18 @@ def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
     if (kind := deep(path)) is not None:
         return as_bytes(resized(read_deep(path, turn), size, kind.encoding), kind.encoding)
     with readable(path), Image.open(path) as image:
-        upright = ImageOps.exif_transpose(image) if turn else image
-        return np.asarray(eight_bits(upright).resize(size, Image.Resampling.BOX))
+        return np.asarray(srgb_image(image, turn, size))
+
+
+def srgb_image(image: Image.Image, turn: bool, size: Size | None = None) -> Image.Image:
+    """An opened photograph as RGB or RGBA of 8 bits in sRGB, upright if asked, area-averaged down to a size."""
+    colours = colours_of(image)
+    made = ImageOps.exif_transpose(image) if turn else image
+    if made.mode not in ("RGB", "RGBA"):
+        made = colours.to_srgb(made)  # by its own channels
+        colours = colours if made.mode in ("P", "PA") else Colours()
+    made = eight_bits(made)
+    return colours.to_srgb(made if size is None else made.resize(size, Image.Resampling.BOX))
 
 
 def deep(path: Path) -> Kind | None:
@@ -268,15 +282,28 @@ def deep(path: Path) -> Kind | None:
 
 
 def read_deep(path: Path, turn: bool) -> np.ndarray:
-    """All bits of a photograph, RGB or RGBA, upright if asked."""
+    """All bits of a photograph in sRGB, RGB or RGBA, upright if asked."""
     with readable(path):
         values = read_numbers(path)
-        values = np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
+        if values.dtype.kind == "f" and (bad := int((~np.isfinite(values)).any(-1).sum() if values.ndim == 3 else 0)):
+            warnings.warn(f"{path} has {bad:,} pixels that are not finite; they count as black", LumigraphWarning, 2)
+            values = np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+        values = deep_colours(path).deep_to_srgb(np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values)
         return turned(values, measure(path)[1]) if turn else values
 
 
+def deep_colours(path: Path) -> Colours:
+    """Colour description of a file of more than eight bits."""
+    if path.suffix.lower() in TIFF_SUFFIXES:
+        return Colours(profile=bytes(tiff_tags(path).get(ICC_TAG, b"")))
+    if path.suffix.lower() != ".png":
+        return Colours()
+    with Image.open(path) as image:
+        return colours_of(image)
+
+
 def deep_plane(path: Path, turn: bool, identity: str) -> PixelPlane | None:
-    """All bits of a photograph as values of a layer; None where eight hold it."""
+    """All bits of a photograph as values of a layer; None for eight bits."""
     kind = deep(path)
     if kind is None:
         return None
@@ -304,7 +331,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
 def masked(
     make: Callable[[], np.ndarray], shot: Shot, size: Size, turn: bool
 ) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    """Reader of a shot's pixels, whose alpha is multiplied by the silhouette, and of its mask."""
+    """Reader of a shot's pixels, with alpha multiplied by the silhouette, and of its mask."""
 
     def read() -> tuple[np.ndarray, np.ndarray | None]:
         pixels = make()
@@ -339,7 +366,7 @@ def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Context in which any fault that an image library raises for a file becomes one sentence."""
+    """Context that turns any error of an image library for a file into a LumigraphError of one sentence."""
     if path.suffix.lower() in HEIC_SUFFIXES and not reads_heic():
         raise LumigraphError(f"{path} {NO_HEIC}")
     with reading(path, "cannot be read as an image", "restore it, or delete it so that it is skipped"):

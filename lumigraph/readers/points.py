@@ -1,4 +1,4 @@
-"""Sparse points that lie beside photographs: PLY files, COLMAP's points3D.bin, and models in another frame."""
+"""Sparse points in files beside photographs: PLY, COLMAP's points3D.bin, and models in another frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera po
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Positions, colours, and how many photographs saw each; fields of `Capture`."""
+    """Positions, colours, and numbers of sightings; fields of `Capture`."""
 
     points: Float[np.ndarray, "point 3"]
     point_colours: UInt8[np.ndarray, "point 3"]
@@ -29,7 +29,7 @@ class SparsePoints:
 
 
 def read_ply(path: Path) -> SparsePoints:
-    """Vertices with x, y, z and, where they have them, red, green, blue, and sightings (in how many photographs)."""
+    """Vertices with x, y, z and, if present, red, green, blue, and sightings (number of photographs)."""
     vertex = read_vertices(path)["vertex"]
     positions, colours = np.array(columns(vertex, "xyz", np.float64)), colours_of(vertex)
     if colours is None:
@@ -40,7 +40,7 @@ def read_ply(path: Path) -> SparsePoints:
 
 
 def read_vertices(path: Path, *further: str) -> dict[str, np.ndarray]:
-    """Vertices of a PLY file, and further elements where it has them. Raises LumigraphError without x, y and z."""
+    """Vertices of a PLY file, and further elements if any. Raises LumigraphError without x, y and z."""
     header = read_header(path)
     if not {*"xyz"} <= {*header.properties.get("vertex", [])}:
         raise LumigraphError(f"{path} has no vertices with x, y and z; name another file")
@@ -59,7 +59,7 @@ def colours_of(rows: np.ndarray) -> UInt8[np.ndarray, "row 3"] | None:
 
 @reads("is truncated", "restore or remove it")
 def read_points3d(path: Path) -> SparsePoints:
-    """COLMAP's points3D.bin by itself: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
+    """COLMAP's points3D.bin: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
     data = read_bytes(path, free_memory())
     (count,), offset = struct.unpack_from("<Q", data), 8
     positions, colours, sightings = [], [], []
@@ -77,18 +77,21 @@ def read_points3d(path: Path) -> SparsePoints:
 
 
 def similarity(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> np.ndarray | None:
-    """The 4x4 similarity that takes source points onto target points, least squares (Umeyama 1991). None where they do
-    not agree to 2% of their spread, or are too few to tell."""
-    if len(source) < 4:
+    """The 4x4 least-squares similarity from source to target points. None for a residual above 2% of their spread, or
+    too few points."""
+    if len(source) < 4 or min(np.ptp(source), np.ptp(target)) == 0:
         return None
+    matrix = umeyama(source, target)
+    left = ((target - source @ matrix[:3, :3].T - matrix[:3, 3]) ** 2).sum()
+    return matrix if left <= POSITION_TOLERANCE**2 * ((target - target.mean(0)) ** 2).sum() else None
+
+
+def umeyama(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "4 4"]:
+    """The 4x4 least-squares similarity from source to target points (Umeyama 1991)."""
     a, b = source - source.mean(0), target - target.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    spread_a, spread_b = (a**2).sum(), (b**2).sum()
-    if min(spread_a, spread_b) == 0:
-        return None
     matrix = np.eye(4)
-    matrix[:3, :3] = (s * np.diag(sign)).sum() / spread_a * (u @ sign @ vt)
+    matrix[:3, :3] = (s * np.diag(sign)).sum() / (a**2).sum() * (u @ sign @ vt)
     matrix[:3, 3] = target.mean(0) - matrix[:3, :3] @ source.mean(0)
-    left = ((b - a @ matrix[:3, :3].T) ** 2).sum()
-    return matrix if left <= POSITION_TOLERANCE**2 * spread_b else None
+    return matrix

@@ -36,8 +36,8 @@ def poses(folder: Path) -> Iterator[Path]:
 
 
 def read(folder: Path) -> Capture:
-    """Frames whose pose is not finite, because tracking was lost, are left out. Raises LumigraphError for files that
-    hold no matrix."""
+    """The capture in a folder, without frames whose pose is not finite (lost tracking). Raises LumigraphError for files
+    without a matrix."""
     matrix = folder / "camera-intrinsics.txt"
     camera = read_matrix(matrix, 3) if matrix.is_file() else KINECT_INTRINSICS
     lens = Pinhole(

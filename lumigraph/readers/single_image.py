@@ -1,7 +1,7 @@
-"""One image file as a scene: a picture on a wall, and a camera straight before it that sees exactly that picture.
+"""A single image file as a scene: a picture on a wall, and a frontal camera that sees exactly that picture.
 
-The camera takes it twice. One shot is masked to the pixels to learn from, the other to those held out: every second
-pixel, drawn at random. The pixels between are then scored like any held-out view.
+The camera has two shots, one masked to training pixels, the other to held-out ones: a random half. So the held-out
+pixels are scored like any held-out view.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, downscale: int | None = None) -> Capture:
-    """The picture in the plane y = 0, upright, its middle at the origin and its longer side from -1 to 1.
+    """The picture in the plane y = 0, upright, centred at the origin, its longer side from -1 to 1.
 
     downscale: how many times to reduce it; None reduces to at most 512 pixels
     Raises LumigraphError for files that are no image and for pictures that are very small.
@@ -59,7 +59,7 @@ def read(path: Path, downscale: int | None = None) -> Capture:
 
 
 def photograph(path: Path) -> Photograph:
-    """The picture with its alpha, and the camera straight before it, as evidence of the object that it shows."""
+    """The picture with its alpha and a frontal camera, as evidence for a prior."""
     shot = read(path).shots[0]
     assert isinstance(shot.image, np.ndarray)
     pixels = torch.from_numpy(shot.image.astype(np.float32) / 255)

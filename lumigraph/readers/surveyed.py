@@ -1,4 +1,4 @@
-"""Measured geometry as the depth that each photograph sees of it: a LiDAR's cloud, a mesh, depth of another camera."""
+"""Depth of photographs from measured geometry: a LiDAR's cloud, a mesh, another camera's depth."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Surveyed:
 
 
 def with_surveyed(capture: Capture, path: Path) -> Capture:
-    """The capture with the depth that its photographs see of a cloud or a mesh, in place of any other.
+    """The capture with depth rendered from a cloud or a mesh, replacing any other.
 
     Raises LumigraphError for a file that cannot be read, and for one in another frame or unit than the capture.
     """
@@ -77,7 +77,7 @@ def with_surveyed(capture: Capture, path: Path) -> Capture:
 
 @reads("cannot be read as a cloud", "export it once more")
 def read_surveyed(path: Path) -> Surveyed:
-    """Points or triangles of a file. Raises LumigraphError, with what to install where a library is missing."""
+    """Points or triangles of a file. Raises LumigraphError, naming the package to install if a library is missing."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise LumigraphError(f"{path} is neither a cloud nor a mesh; name a file of {', '.join(SUFFIXES)}")
@@ -103,8 +103,8 @@ def read_surveyed(path: Path) -> Surveyed:
 
 
 def read_cloud(path: Path) -> Float[np.ndarray, "point 3"]:
-    """Points of a LiDAR's file, read by `cloud_worker.py` within limits of memory and time that follow from its size.
-    Raises ValueError with the reason where that fails."""
+    """Points of a LiDAR's file, read by `cloud_worker.py` with limits of memory and time by its size. Raises ValueError
+    with the reason if that fails."""
     library, size = LIBRARIES[path.suffix.lower()], path.stat().st_size
     if find_spec(library) is None:
         raise LumigraphError(f"{path} needs {library} to be read; install it: pip install 'lumigraph[lidar]'")
@@ -162,7 +162,7 @@ def is_seen(shot: Shot, points: Float[np.ndarray, "point 3"]) -> bool:
 
 
 def samples(mesh: Surveyed) -> Float[np.ndarray, "point 3"]:
-    """Points on a mesh, evenly by area."""
+    """Points on a mesh, uniformly by area."""
     random, (a, b, c) = np.random.default_rng(0), mesh.points[mesh.faces].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
     chosen = random.choice(len(area), 100_000, p=area / area.sum())
@@ -185,7 +185,7 @@ def size_of(shot: Shot) -> tuple[int, int]:
 
 
 def camera_of(pose: Float[np.ndarray, "3 4"], lens: Lens, size: tuple[int, int]) -> Camera:
-    """A camera at the origin, turned as a photograph's: maps may lie far from theirs."""
+    """A camera at the origin with a photograph's rotation, since map coordinates may be large."""
     turn = torch.from_numpy(np.concatenate([pose[:, :3], np.zeros((3, 1))], 1)).float()
     return Camera(turn[None], lens, torch.tensor([size]))
 
@@ -193,7 +193,7 @@ def camera_of(pose: Float[np.ndarray, "3 4"], lens: Lens, size: tuple[int, int])
 def seen_depth(
     pose: Float[np.ndarray, "3 4"], lens: Lens, size: tuple[int, int], found: Surveyed
 ) -> Float[np.ndarray, "height width"]:
-    """Distance along each pixel's ray of what a photograph sees, NaN where the file has nothing."""
+    """Distance along each pixel's ray to the surveyed geometry, NaN without any."""
     camera = camera_of(pose, lens, size)
     points = torch.from_numpy(found.points - pose[:, 3]).float()
     if len(found.faces) and isinstance(lens, Pinhole):
@@ -216,12 +216,12 @@ def mesh_depth(camera: Camera, points: Float[Tensor, "point 3"], faces: Int[Tens
 
 
 def cloud_depth(camera: Camera, points: Float[Tensor, "point 3"]) -> Float[Tensor, "height width"]:
-    """Distance of the nearest point in each pixel, NaN without one. A point clearly behind the nearest one in its
-    square of pixels, or in a square beside that, is hidden: between points of a cloud one sees through it.
+    """Distance of the nearest point in each pixel, NaN without one. Points behind the nearest one in a neighbourhood of
+    pixel squares are hidden, since a cloud has gaps:
 
         d > d_nearest (1 + 0.03 + SLOPE alpha),    alpha the angle from a square's middle to the end of the next one
 
-    points: about the camera, which is at the origin
+    points: relative to the camera, which is at the origin
     """
     width, height = camera.size[0].tolist()
     middle = camera.size[0] / 2
@@ -242,9 +242,9 @@ def cloud_depth(camera: Camera, points: Float[Tensor, "point 3"]) -> Float[Tenso
 def registered(
     stored: Float[np.ndarray, "height width"], lens: Lens, shot_lens: Lens, size: tuple[int, int], shift: np.ndarray
 ) -> Float[np.ndarray, "height width"]:
-    """Depth along the axis of a depth camera, as the distance that the camera of the colours sees; NaN where unknown.
+    """Reproject depth along the axis of a depth camera to distance of the colour camera; NaN for unknown.
 
-    stored: metres, NaN where nothing was measured; lens: of the depth camera; shift: 3x4, from its frame to the other's
+    stored: metres, NaN for unmeasured; lens: of the depth camera; shift: 3x4, from its frame to the other's
     size:   of the photograph; the result has the resolution of the depth
     """
     height, width = stored.shape

@@ -1,6 +1,6 @@
-"""Tracks beside photographs, for every reader: tracks.json has boxes of rigid things that move.
+"""Tracks of captures of any reader: tracks.json has boxes of moving rigid objects.
 
-It is in the frame and unit of the photographs' poses, with moments in the unit of their times.
+It is in the frame and unit of the photographs' poses, with times in the unit of their times.
 
     {
       "format": "lumigraph tracks 1",
@@ -11,8 +11,8 @@ It is in the frame and unit of the photographs' poses, with moments in the unit 
     }
 
 size: of the box along its own axes, x forward, y to the left, z up. positions: of its centre. rotations: from the box's
-axes to the frame's, quaternions (w, x, y, z). Between two moments a pose is interpolated; before the first and after
-the last the thing is not there. One moment alone holds for all time.
+axes to the frame's, quaternions (w, x, y, z). Between two times a pose is interpolated; before the first and after
+the last the object is absent. A single time is constant.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FORMAT = "lumigraph tracks 1"
 
 @dataclass(frozen=True)
 class TracksRecord:
-    """The file."""
+    """Contents of tracks.json."""
 
     tracks: tuple[BoxTrack, ...]
     format: str = FORMAT
@@ -45,7 +45,7 @@ class TracksRecord:
 
 @reads()
 def read_tracks(path: Path) -> tuple[BoxTrack, ...]:
-    """The tracks in a file. Raises LumigraphError for a file that holds none, and for a track that is none."""
+    """Read the tracks in a file. Raises LumigraphError for an invalid file or track."""
     said = files.read_json(path)
     if not isinstance(said, dict) or said.get("format") != FORMAT:
         raise LumigraphError(f"{path} does not say {FORMAT!r}, as files of tracks do; add that, or rename the file")
@@ -65,16 +65,16 @@ def write_tracks(path: Path, tracks: tuple[BoxTrack, ...]) -> None:
 
 
 def with_tracks(capture: Capture, folder: Path) -> Capture:
-    """The capture with the tracks of its folder's tracks.json, in place of those that its reader found. Raises
-    LumigraphError for a file that is none."""
+    """The capture with the tracks of its folder's tracks.json, instead of the reader's. Raises LumigraphError for an
+    invalid file."""
     path = folder / TRACKS_FILE
     return replace(capture, tracks=read_tracks(path)) if path.is_file() else capture
 
 
 def seen_tracks(capture: Capture, to_scene: Similarity, cameras: Camera) -> tuple[tuple[BoxTrack, ...], list[str]]:
-    """Tracks in the scene's frame whose boxes some photograph to learn from shows, and a sentence about the others.
+    """Tracks in the scene's frame that are visible in some training photograph, and a sentence about the others.
 
-    cameras: of the photographs to learn from. Raises LumigraphError for moments beside photographs without any
+    cameras: of the training photographs. Raises LumigraphError for tracks with times and photographs without
     """
     tracks = tuple(track.transformed(to_scene) for track in capture.tracks)
     moving = next((track.name for track in tracks if len(track.times) > 1), None)
@@ -95,7 +95,7 @@ def seen_tracks(capture: Capture, to_scene: Similarity, cameras: Camera) -> tupl
 
 
 def shows(camera: Camera, track: BoxTrack) -> bool:
-    """True if a place of a track's box projects into a camera's picture at its moment: corners, centres."""
+    """True if a point of a track's box projects into a camera's picture at its time: corners, centres."""
     pose = track.pose(None if camera.time is None else float(camera.time[0]))
     if pose is None:
         return False

@@ -7,7 +7,8 @@ val_filenames.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +23,8 @@ from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, type
 from ..files.reading import reading, reads
 from . import colmap
 from .capture import Capture, PixelPlane, Shot
-from .pictures import find_file, reductions, upright_size, versions
+from .finding import find_named, paired
+from .pictures import reductions, upright_size, versions
 from .points import SparsePoints, read_ply, similarity
 
 RESULT_FILE = "capture.json"  # of a folder that `lumigraph capture` made
@@ -37,20 +39,31 @@ PLANES = {
     "labels": ("labels_file_path", "semantics_path"),
     "normals": ("normals_file_path",),
 }
+WITHOUT_EFFECT = (  # keys of other programs that describe how the file was made, or concern their training
+    "aabb", "applied_scale", "applied_transform", "auto_scale_poses_override", "colmap_im_id", "enable_depth_loading",
+    "from_na", "integer_id", "n_extra_learnable_dims", "n_frames", "offset", "orientation_override", "render_aabb",
+    "sharpness", "white_transparent", "black_transparent", "mask_color", "fix_premult", "is_hdr", "train_file_names",
+)  # fmt: skip
 FACTS = ("exposure", "boxes", "body")  # of a photograph
 BLENDER_EMPTY_DEPTHS = (1e10, 65504.0)  # depth that Blender writes for background pixels, in floats and in halves
+
+WITHOUT_BENDS = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+WITH_BENDS = ("OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
+LARGEST_RADIUS, BEYOND = 4.0, 1.05  # where a lens is fitted, at most; and times the radius of the picture's corner
+RIDGE = 1e-10  # singular values that count as none, of the largest
 
 Json = dict[str, Any]
 Across = Annotated[float, between(1, 1e5)]  # pixels
 Focal = Annotated[float, between(1e-2, 1e7)]  # pixels
 Centre = Annotated[float, between(-1e7, 1e7)]  # pixels
 Bend = Annotated[float, between(-1e4, 1e4)]
+Degrees = Annotated[float, between(1e-4, 179.9)]
 Angle = Annotated[float, between(1e-6, 3.14159)]  # radians
 
 
 @dataclass(frozen=True)
 class Whole:
-    """Contents of a file beside lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
+    """Fields of a file besides lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
 
     frames: list[Json]
     aabb_scale: Positive | None = None
@@ -64,7 +77,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class GpsRecord:
-    """Field `gps` of capture.json: whether the axes point east, north and up, in metres, and of what origin."""
+    """Field `gps` of capture.json: whether the axes point east, north and up, in metres, and their origin."""
 
     used: bool = False
     origin: tuple[float, float, float] | None = None
@@ -72,8 +85,8 @@ class GpsRecord:
 
 @dataclass(frozen=True)
 class Made:
-    """Fields of capture.json: the source of a scene, the name of its making, the messages about it, photographs
-    without a pose with the reason, and its position on Earth."""
+    """Fields of capture.json: source of a scene, method of its creation, warnings, photographs without a pose with the
+    reason, and its position on Earth."""
 
     sources: list[str] = field(default_factory=list)
     key: str = ""
@@ -91,7 +104,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Posed:
-    """A frame, with what the file says of all frames."""
+    """A frame, with the file's fields for all frames as defaults."""
 
     file_path: Name
     transform_matrix: list[Row]
@@ -103,6 +116,10 @@ class Posed:
     fl_y: Focal | None = None
     camera_angle_x: Angle | None = None
     camera_angle_y: Angle | None = None
+    x_fov: Degrees | None = None
+    y_fov: Degrees | None = None
+    fisheye_crop_radius: Across | None = None
+    rolling_shutter: list[Coordinate] | None = None
     cx: Centre | None = None
     cy: Centre | None = None
     k1: Bend | None = None
@@ -147,22 +164,40 @@ def read(folder: Path) -> Capture:
         raise LumigraphError(f'{path}: "up" points nowhere; correct it or remove it')
     cloud = {} if points is None else vars(points)
     made = read_json(folder / RESULT_FILE, Made) if (folder / RESULT_FILE).is_file() else Made()
-    folded = [f"{folder}: {warning}" for warning in made.warnings if "folded" in warning]
+    notes = [f"{folder}: {warning}" for warning in made.warnings if "folded" in warning] + about_dialect(path, plain)
     return Capture(
-        str(folder), shots, missing=missing, reach=reach, up=whole.up, origin=made.origin, notes=folded, **cloud
+        str(folder), shots, missing=missing, reach=reach, up=whole.up, origin=made.origin, notes=notes, **cloud
     )
 
 
+def about_dialect(path: Path, plain: Json) -> list[str]:
+    """Sentences on what a file says and is not used, or has a meaning of one program."""
+    said = set(plain) | {key for frame in plain["frames"] for key in frame}
+    known = {x.name for kind in (Whole, Posed) for x in fields(kind)} | {*FACTS, *WITHOUT_EFFECT}
+    found = []
+    if unknown := sorted(said - known):
+        found.append(f"{path}: passed over: {', '.join(unknown)}")
+    shared = {name: value for name, value in plain.items() if name != "frames"}
+    frames = [typed(Posed, shared | frame, path) for frame in plain["frames"]]
+    if any(means_power(frame) for frame in frames):
+        found.append(
+            f"{path}: k4 without k5 and k6 is read as nerfstudio's, the coefficient of r^8; give all three for OpenCV's"
+        )
+    if any(any(frame.rolling_shutter or []) for frame in frames):
+        found.append(f"{path}: the rolling shutter is not modelled, so each photograph has one pose")
+    return found
+
+
 def read_frames_file(path: Path) -> tuple[Whole, Json]:
-    """Contents of a file: typed for what concerns all of it, and unchanged."""
+    """Contents of a file: parsed fields of the whole file, and raw JSON."""
     plain = read_json(path)
     return typed(Whole, plain, path), plain
 
 
 def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[Shot], list[str]]:
-    """The photographs that a file lists and that exist, and the names of those that do not.
+    """Photographs of a file that exist, and the names of missing ones.
 
-    whole: the file as it stands. What it says of a lens holds for every frame that says nothing else.
+    whole: raw JSON of the file. Its lens fields are defaults for every frame
     """
     folder, shots, missing = path.parent, [], []
     shared = {name: value for name, value in whole.items() if name != "frames"}
@@ -183,7 +218,7 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
                 lens=lens,
                 size=size,
                 image=files,
-                mask=None if about.mask_path is None else folder / about.mask_path,
+                mask=find_named(folder, about.mask_path) if about.mask_path else within_circle(about, lens, size),
                 split=split,
                 time=about.time,
                 planes=read_planes(folder, about, lens, missing),
@@ -193,13 +228,22 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
     return shots, missing
 
 
+def within_circle(about: Posed, lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
+    """Mask of the pixels in the circle that a fisheye's file gives; None without one."""
+    if about.fisheye_crop_radius is None or not isinstance(lens, Fisheye | OpenCV | Pinhole):
+        return None
+    centres = lens.centre[0].tolist()
+    x, y = (np.arange(pixels) + 0.5 - centre for pixels, centre in zip(size, centres, strict=True))
+    return np.hypot(x, y[:, None]) <= about.fisheye_crop_radius
+
+
 def called(frame: Json, number: int = 0) -> str:
-    """A frame's name for people."""
+    """A frame's display name."""
     return f"frame {frame.get('file_path', number)}"
 
 
 def fact(value: Any, name: str, where: str) -> np.ndarray:
-    """Fact of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
+    """Value of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
     with reading(where, f'has "{name}", which is no number and no array of them', "correct it"):
         numbers = np.asarray(value, np.float64)
     if numbers.size > MAX_FACT_NUMBERS:
@@ -208,14 +252,14 @@ def fact(value: Any, name: str, where: str) -> np.ndarray:
 
 
 def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> dict[str, PixelPlane]:
-    """Depth, labels and normals whose files a frame names; what it names and is not there joins `missing`."""
+    """Depth, labels and normals of the files that a frame names; missing ones are added to `missing`."""
     found = {}
     for kind, keys in PLANES.items():
         key = next((key for key in keys if getattr(about, key) is not None), None)
         if key is None:
             continue
         name = getattr(about, key)
-        file = find_file(folder / name)
+        file = find_named(folder, name)
         if not is_file(file):
             missing.append(name)
         elif kind == "depth":
@@ -226,7 +270,7 @@ def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> d
 
 
 def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> PixelPlane:
-    """Depth as nerfstudio stores it, thousandths of a unit unless the file says otherwise, or as instant-ngp does."""
+    """Depth as nerfstudio stores it, thousandths of a unit by default, or as instant-ngp does."""
     stated = about.integer_depth_scale if key == "depth_path" else about.depth_unit_scale_factor
     scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
     along_ray = isinstance(lens, Equirectangular) or bool(about.is_euclidean_depth)
@@ -237,7 +281,7 @@ def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> PixelPlane:
 
 def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
     """Each photograph's own file, and reduced ones where it lies in `images` and there are images_2, images_4..."""
-    files = [find_file(folder / name) for name in names]
+    files = [find_named(folder, name) for name in names]
     found = [{1: path} if is_file(path) else {} for path in files]
     inside = [i for i, path in enumerate(files) if path.parent == folder / "images"]
     for i, more in zip(inside, versions(reductions(folder / "images"), [files[i].name for i in inside]), strict=True):
@@ -255,26 +299,55 @@ def read_pose(about: Posed, where: str) -> np.ndarray:
 
 def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     width, height = size
-    model = "OPENCV_FISHEYE" if about.is_fisheye else about.camera_model.upper()
+    model = model_of(about)
     if model in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Equirectangular(row(width, height))
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV_FISHEYE"):
+    if model not in (*WITHOUT_BENDS, *WITH_BENDS, "OPENCV_FISHEYE"):
+        known = ", ".join((*WITHOUT_BENDS[:2], *WITH_BENDS, "OPENCV_FISHEYE"))
         raise LumigraphError(
-            f"{where} has camera_model {model}; only PINHOLE, OPENCV, OPENCV_FISHEYE and EQUIRECTANGULAR are known, "
-            f"so undistort the photographs first"
+            f"{where} has camera_model {model}; only {known} and EQUIRECTANGULAR are known, so undistort the "
+            "photographs first"
         )
-    focal_x = about.fl_x or focal_from_angle(about.camera_angle_x, width)
+    radians = [None if angle is None else math.radians(angle) for angle in (about.x_fov, about.y_fov)]
+    focal_x = about.fl_x or focal_from_angle(about.camera_angle_x or radians[0], width)
     if focal_x is None:
         raise LumigraphError(f'{where} has neither "fl_x" nor "camera_angle_x"; add the focal length in pixels')
-    focal_y = about.fl_y or focal_from_angle(about.camera_angle_y, height) or focal_x
+    focal_y = about.fl_y or focal_from_angle(about.camera_angle_y or radians[1], height) or focal_x
     centre_x, centre_y = (half if x is None else x for x, half in ((about.cx, width / 2), (about.cy, height / 2)))
     focal, centre = row(focal_x, focal_y), row(centre_x, centre_y)
     if model == "OPENCV_FISHEYE":
         return Fisheye(focal, centre, row(*(getattr(about, f"k{i}") or 0.0 for i in (1, 2, 3, 4))))
     bends = [getattr(about, key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
-    if model == "OPENCV" and any(bends):
-        return OpenCV(focal, centre, row(*bends))
-    return Pinhole(focal, centre)
+    if model in WITHOUT_BENDS or not any(bends):
+        return Pinhole(focal, centre)
+    if means_power(about):
+        corner = math.hypot(max(centre_x, width - centre_x) / focal_x, max(centre_y, height - centre_y) / focal_y)
+        k1, k2, p1, p2, k3, k4, *_ = bends
+        bends = [*rational([k1, k2, k3, k4], (p1, p2), corner)]
+    return OpenCV(focal, centre, row(*bends))
+
+
+def means_power(about: Posed) -> bool:
+    """True where k4 is nerfstudio's, the coefficient of r^8, and not OpenCV's, of the denominator, which has three."""
+    return bool(about.k4) and about.k5 is None and about.k6 is None and model_of(about) in ("OPENCV", "RADIAL")
+
+
+def model_of(about: Posed) -> str:
+    return "OPENCV_FISHEYE" if about.is_fisheye else about.camera_model.upper()
+
+
+def rational(powers: Sequence[float], tangential: tuple[float, float], corner: float) -> tuple[float, ...]:
+    """OpenCV's coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens whose radial factor is 1 + k1 r^2 + ... + k4 r^8.
+
+    corner: the largest radius on the picture, as bent
+    """
+    r = np.linspace(0, LARGEST_RADIUS, 4096)
+    factor = np.polynomial.Polynomial([1, *powers])(r**2)
+    beyond = np.flatnonzero((r * factor > BEYOND * corner) | (np.gradient(r * factor) <= 0))
+    r, factor = (x[: max(beyond[0] if len(beyond) else len(r), 16)] for x in (r, factor))
+    columns = [r**2, r**4, r**6, -factor * r**2, -factor * r**4, -factor * r**6]
+    k1, k2, k3, k4, k5, k6 = np.linalg.lstsq(np.stack(columns, 1) * r[:, None], (factor - 1) * r, rcond=RIDGE)[0]
+    return k1, k2, *tangential, k3, k4, k5, k6
 
 
 def focal_from_angle(angle: float | None, pixels: int) -> float | None:
@@ -296,19 +369,21 @@ def published_splits(whole: Whole) -> dict[str, str]:
 
 
 def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str]) -> SparsePoints | None:
-    """The points a file names, else those of a COLMAP model of the same photographs, turned into this file's frame."""
+    """The points a file names, else those of a COLMAP model of the same photographs, transformed into this file's
+    frame.
+    """
     if (name := whole.ply_file_path) is not None:
-        if is_file(folder / name):
-            return read_ply(folder / name)
+        if is_file(found := find_named(folder, name)):
+            return read_ply(found)
         missing.append(name)
     place = colmap.model_folder(folder)
     if place is None:
         return None
-    positions = {Path(s.name).stem: s.pose[:, 3] for s in shots}
+    positions = {shot.name: shot.pose[:, 3] for shot in shots}
     model = colmap.read_model(place)
-    found = {Path(name).stem: pose[:, 3] for name, pose in colmap.poses_of(model).items()}
-    both = sorted(positions.keys() & found.keys())
-    matrix = similarity(np.array([found[k] for k in both]), np.array([positions[k] for k in both]))
+    poses = colmap.poses_of(model)
+    both = paired(positions, poses)
+    matrix = similarity(np.array([poses[k][:, 3] for k in both.values()]), np.array([positions[k] for k in both]))
     if matrix is None:
         return None
     cloud = colmap.read_points(place, model)

@@ -1,8 +1,8 @@
 """RGB-D captures in the layout of TUM's benchmark (Sturm et al. 2012): rgb.txt, depth.txt and groundtruth.txt.
 
-The lists have a moment in seconds and a file on each line; the trajectory has a moment, a position and a quaternion
-(x, y, z, w) of the colour camera, camera-to-world. Whose moments are nearest belong together. Depth is registered to
-the colours: 16 bits, 5000 to a metre along the optical axis, 0 where nothing was measured.
+The lists have a time in seconds and a file on each line; the trajectory has a time, a position and a quaternion
+(x, y, z, w) of the colour camera, camera-to-world. Entries are matched by nearest times. Depth is registered to the
+colours: 16 bits, 5000 to a metre along the optical axis, 0 for unmeasured.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Photographs without a pose of their moment are left out. Raises LumigraphError for lists that hold no numbers."""
+    """The capture in a folder, without photographs that have no pose at their time. Raises LumigraphError for
+    malformed lists.
+    """
     poses = read_rows(folder / "groundtruth.txt", POSE_COLUMNS)
     moments = np.array([float(row[0]) for row in poses])
     pictures = read_rows(folder / "rgb.txt", 2)
@@ -75,7 +77,7 @@ def read(folder: Path) -> Capture:
 
 
 def read_rows(path: Path, columns: int) -> list[list[str]]:
-    """The words of each line that is no comment."""
+    """Words of each line that is no comment."""
     rows = [line.split() for line in read_text(path).splitlines() if line.strip()[:1] not in ("", "#")]
     for row in rows:
         fault = f"holds {' '.join(row)[:200]!r}, where {columns} columns were looked for"
@@ -111,7 +113,7 @@ def read_lens(folder: Path) -> Lens:
 
 
 def nearest(moments: np.ndarray, moment: float) -> int | None:
-    """Index of the nearest moment, if one is near enough."""
+    """Index of the nearest time, if within the tolerance."""
     if not len(moments):
         return None
     found = int(np.abs(moments - moment).argmin())

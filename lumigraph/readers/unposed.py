@@ -1,4 +1,4 @@
-"""Frames of a depth camera whose poses are to be found: all are at the pose of the first, in a box around it."""
+"""Frames of a depth camera without poses, for tracking: all have the first one's pose, in a box around it."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ TRUE_POSE = "true_pose"  # of `Shot.about`: what the source says, in its own fra
 
 @dataclass(frozen=True)
 class Unposed:
-    """Options of a recording whose poses are to be found.
+    """Options of a recording without poses.
 
     extent: half-size of the box around the first camera, metres; None follows from the first frame's depth
-    frames: number of the first ones that are kept; None for all
+    frames: number of leading frames to use; None for all
     """
 
     extent: Positive | None = None
@@ -35,7 +35,7 @@ class Unposed:
 
 
 def unposed(capture: Capture, options: Unposed) -> Capture:
-    """The frames in order without their poses, which become `true_pose`, for scores alone.
+    """The frames in order without their poses, which become `true_pose`, for evaluation alone.
 
     Raises LumigraphError for frames without depth, and for depth whose unit is not metres.
     """

@@ -1,4 +1,4 @@
-"""Up direction from how people hold cameras, from drones' positions, and from what both see."""
+"""Up direction from camera orientations, drones' positions, and sparse points."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ MIN_MAP_COSINE = 0.5  # between a map's plane and the view: drones look no flatt
 
 
 def find_upright(cameras: Camera, points: Points | None = None) -> Float[np.ndarray, "3 3"]:
-    """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
+    """The rotation of the cameras' common up to +z; the identity if the source already has an axis there."""
     up = common_up(cameras, points)
     return np.eye(3) if up is None else upright_by(up)
 
 
 def upright_by(up: Direction) -> Float[np.ndarray, "3 3"]:
-    """The rotation that brings a direction to +z, or the axis that is close to it."""
+    """The rotation of a direction to +z, or of the axis that is close to it."""
     up = unit(up)
     nearest = np.zeros(3)
     nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
@@ -45,14 +45,15 @@ def upright_by(up: Direction) -> Float[np.ndarray, "3 3"]:
 
 
 def common_up(cameras: Camera, points: Points | None = None) -> Direction | None:
-    """The direction that was up where the photographs were taken, unit length; None if nothing tells.
+    """Up direction of the scene, unit length; None if undetermined.
 
-    Cameras are held level rather than straight ahead, by hand as by a drone's gimbal: up is the direction most at right
-    angles to all pictures' rows. That says nothing where all rows are parallel, and something else where cameras that
-    look one way were also turned about their axes: then up is where the pictures' own is on average, unless they were
-    taken from above. A drone's places lie in a level plane, and tell up where its pictures cannot.
+    Cameras are held level rather than straight ahead, by hand as by a drone's gimbal: up is the direction most
+    orthogonal to all pictures' rows. That is undetermined where all rows are parallel, and wrong where cameras that
+    look one way were
+    also rolled: then up is the pictures' mean up, unless they look down. A drone's positions are in a level plane,
+    which determines up where its pictures cannot.
 
-    points: what the cameras see, in their frame
+    points: sparse points, in the cameras' frame
     """
     rows, downs, forwards = (cameras.pose[:, :, k].double().numpy() for k in range(3))
     places = cameras.position.double().numpy()
@@ -73,10 +74,10 @@ def common_up(cameras: Camera, points: Points | None = None) -> Direction | None
 def from_above(
     places: Float[np.ndarray, "camera 3"], own: Direction, gaze: Direction, points: Points | None
 ) -> Direction | None:
-    """Up, unit length, of cameras that look one way, at a ground from above; None if they look at things ahead.
+    """Up direction, unit length, of cameras that look down at a ground; None if they look ahead.
 
-    They were above if they were turned about their axes, as a drone is that flies to and fro; or if they are spread
-    over what they look at as for a map, which nobody walks. Then the plane of their places is level.
+    They look down if they are rotated about their axes, as on a drone's parallel tracks, or if they are spread over the
+    ground as for a map. Then the plane of their positions is level.
     own, gaze: mean of the pictures' own up, and of the viewing directions
     """
     if np.linalg.norm(gaze) < ALONG_COSINE:
@@ -93,7 +94,7 @@ def from_above(
 
 
 def upwards(axis: Direction, own: Direction, gaze: Direction) -> Direction:
-    """Side of an axis with the pictures' own up; if that is undecided, the side that cameras look from."""
+    """Sign of an axis towards the pictures' own up; if that is undecided, towards the cameras."""
     side = axis @ own
     return axis * np.sign(side if abs(side) > MIN_USABLE_UP else -axis @ gaze)
 

@@ -1,4 +1,4 @@
-"""Scenes with other photographs to learn from: fewer, to see how many a method needs; all; or all at several sizes."""
+"""Scenes with other training photographs: fewer, for few-view experiments; all; or all at several sizes."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from ..metrics import WINDOW
 
 
 def with_fewer_views(scene: Scene, views: int) -> Scene:
-    """The scene with so many photographs in its "train" split, spread evenly over the cameras; see `spread_out`.
+    """The scene with `views` photographs in its "train" split, spread evenly over the cameras; see `spread_out`.
 
-    Held-out photographs, sparse points, and the frame but for its `train_count` stay what all photographs gave, so that
+    Held-out photographs, sparse points, and the frame except `train_count` stay those of all photographs, so that
     scores can be compared.
     Raises LumigraphError for fewer than one, and for more than there are.
     """
@@ -36,22 +36,21 @@ def with_fewer_views(scene: Scene, views: int) -> Scene:
 
 
 def with_all_views(scene: Scene) -> Scene:
-    """The scene with every photograph in its "train" split, those that test as well."""
+    """The scene with every photograph in its "train" split, test photographs included."""
     return with_train(scene, torch.arange(len(scene.cameras)))
 
 
 def with_train(scene: Scene, train: Int[Tensor, " image"]) -> Scene:
-    """The scene with these photographs to learn from."""
+    """The scene with these training photographs."""
     frame = replace(scene.frame, train_count=len(train))
     return replace(scene, frame=frame, splits=scene.splits | {"train": train})
 
 
 def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:
-    """Cameras in an order whose every beginning is spread evenly over all of them.
+    """Order of cameras by farthest-point sampling, every prefix of which is spread evenly (Gonzalez 1985).
 
-    The first is the one nearest the mean, each further one the farthest from those before it (farthest point sampling,
-    Gonzalez 1985). How far apart two are is told by their positions, in units of the positions' deviation, and by where
-    they look. Among equals the first comes first.
+    The first is the one nearest the mean. Distance is that of positions, in units of their deviation, and of viewing
+    directions. Among equals the first comes first.
     """
     position, direction = cameras.position, cameras.pose[:, :, 2]
     centred = position - position.mean(0)
@@ -71,18 +70,18 @@ def distances(points: Float[Tensor, "point axis"], origin: Float[Tensor, " axis"
 
 
 def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path | None = None) -> Scene:
-    """The scene with every photograph `scales` times, each half as large as the one before, as if taken from further
+    """The scene with every photograph `scales` times, each half as large as the previous one, as if taken from further
     away (Barron 2021, Mip-NeRF, section 4.1: trained on and tested together).
 
-    Copies are means over squares of pixels, colours weighted by alpha; rows and columns that fill no square are left
-    out. They are called NAME@1/2, NAME@1/4 and so on, share their photograph's split and image index, and follow behind
-    all photographs as they are. Frame and points stay. Layers follow, as `resized` has it.
+    Copies are means over squares of pixels, colours weighted by alpha; incomplete squares are cropped. They are called
+    NAME@1/2, NAME@1/4 and so on, share their photograph's split and image index, and follow after all originals. Frame
+    and points stay. Layers follow as in `resized`.
 
-    The paper weights each pixel's loss by its footprint. `Scene.sample_rays` draws photographs evenly, and their pixels
-    evenly, so that a pixel of a copy reduced f times is drawn f^2 times as often: the same in expectation, with less
-    variance.
+    The paper weights each pixel's loss by its footprint. `Scene.sample_rays` samples photographs uniformly, and their
+    pixels uniformly, so that a pixel of a copy reduced f times is sampled f^2 times as often: the same in expectation,
+    with less variance.
     memory, cache: as in `open_scene`
-    Raises LumigraphError where the smallest copies would be too small to compare, or trust no pixel.
+    Raises LumigraphError if the smallest copies are too small to compare, or have no trusted pixel.
     """
     if scales == 1:
         return scene
@@ -119,7 +118,7 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
 
 
 def reduced(scene: Scene, index: int, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """A photograph's bytes so many times smaller, and which of them to trust."""
+    """A photograph's bytes reduced by a factor, and a mask of trusted pixels."""
     photograph = scene.photograph(index).reduced(factor)
     channels = [photograph.rgb] if photograph.alpha is None else [photograph.rgb, photograph.alpha[..., None]]
     pixels = torch.cat(channels, -1).mul(255).round().clamp(0, 255).byte().numpy()

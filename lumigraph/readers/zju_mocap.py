@@ -46,7 +46,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder. Raises LumigraphError for damaged files, and where joints at rest are missing."""
+    """The capture in a folder. Raises LumigraphError for damaged files, and without joints at rest."""
     path = folder / "annots.npy"
     said = load_pickled(path)
     with reading(path, "does not hold cameras as ZJU-MoCap's does"):
@@ -93,7 +93,7 @@ def read(folder: Path) -> Capture:
 
 
 def text(name: Any) -> str:
-    """A name, which Python 2 wrote as bytes."""
+    """A name, possibly bytes of Python 2."""
     return name.decode("latin-1") if isinstance(name, bytes) else str(name)
 
 
@@ -131,8 +131,8 @@ def params_file(folder: Path, frame: int) -> Path | None:
 
 
 def skeleton_of(folder: Path, frames: list[int]) -> Skeleton:
-    """The skeleton of the body in the world, at rest where it is at its first frame. Raises LumigraphError where files
-    are missing or damaged."""
+    """The skeleton of the body in the world, at rest where it is in its first frame. Raises LumigraphError for missing
+    or damaged files."""
     files = folder / "lbs" / "joints.npy", folder / "lbs" / "parents.npy"
     if not all(map(is_file, files)):
         raise LumigraphError(

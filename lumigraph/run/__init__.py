@@ -1,4 +1,4 @@
-"""Runs and everything else that opens: folders of training, splat files, compositions."""
+"""Runs and everything else that can be opened: training folders, splat files, compositions."""
 
 from .checkpoint import State as State
 from .folder import Run as Run

@@ -3,8 +3,8 @@
     000800/     weights.safetensors · optimizer.safetensors · state.json
     000800/     weights.packed · state.json     of a run that was compressed
 
-One is written beside the one before and renamed once it is whole; only then is the older one deleted, by way of a name
-that readers skip. So there is a complete state whenever there was one before, however the writer ended.
+A new checkpoint is written beside the previous one and renamed when complete; only then is the previous one deleted,
+after a rename to a name that readers skip. So a complete checkpoint exists at any time, however the writer ends.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class State:
     """Progress of training: completed steps and their seconds; compilation is counted separately.
 
     peak_memory: bytes at most, see `memory.peak_memory`; 0 if unknown
-    passes:      how often everything was learnt from, on average, see `verdict.shares_seen`; 0 if unknown
+    passes:      passes over the training data on average, see `verdict.shares_seen`; 0 if unknown
     """
 
     step: int = 0
@@ -57,7 +57,7 @@ class State:
 
 @dataclass(frozen=True)
 class Sum:
-    """By which a file's bytes are known."""
+    """Checksum of a file."""
 
     bytes: Tally
     crc32: Tally
@@ -65,10 +65,10 @@ class Sum:
 
 @dataclass(frozen=True)
 class Saved:
-    """state.json: how far training had come, as in `State`; what all files should sum to; and the optimizers' state.
+    """Contents of state.json: progress as in `State`, checksums of all files, and the optimizers' state.
 
-    files:      by name; the optimizers' state is summed up under the name of its entry
-    optimizers: see `flatten`; their tensors lie beside
+    files:      checksums by name; that of the optimizers' state is under the name of its entry
+    optimizers: see `flatten`; their tensors are in a file of their own
     """
 
     method: str
@@ -130,7 +130,7 @@ class Checkpoints:
                     os.replace(path, aside / path.name)
 
     def save_packed(self, state: State, weights: bytes) -> None:
-        """Write the state of a run that was compressed, in which there is nothing yet. weights: see `packing.write`"""
+        """Write the checkpoint of a newly compressed run. weights: see `packing.write`"""
         with files.replacing_folder(self.folder / f"{state.step:06d}") as new:
             (new / PACKED_FILE).write_bytes(weights)
             self._write_state(new, state, {PACKED_FILE: checksum(weights)}, [])
@@ -147,7 +147,7 @@ class Checkpoints:
         return packed if files.is_file(packed) else self.latest / WEIGHTS_FILE
 
     def load_weights(self, method: Method) -> None:
-        """Give a method the latest state's weights."""
+        """Load the latest state's weights into a method."""
         checkpoint = self.latest
         tensors = self._read_tensors(checkpoint, self.weights.name)
         with reading(checkpoint, f"does not fit the method {self.method}"):
@@ -156,7 +156,7 @@ class Checkpoints:
             method.load_state_dict(tensors)
 
     def load_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
-        """Give optimizers and random numbers the latest state."""
+        """Load the latest state into optimizers and a random generator."""
         checkpoint = self.latest
         if self.weights.name == PACKED_FILE:
             raise LumigraphError(
@@ -200,7 +200,7 @@ class Checkpoints:
 
 
 def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Give parameters and buffers the sizes that saved ones have, where their module says that they grow.
+    """Resize parameters and buffers to the saved shapes, where their module declares them as growing.
 
     Tables grow by rows, grids by cells, and all of one module alike; raises RuntimeError where they do not.
     """
@@ -221,15 +221,15 @@ def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
 
 
 def check_kinds(own: dict[str, Tensor], saved: dict[str, Tensor]) -> None:
-    """Raise RuntimeError for a saved tensor of another kind of numbers than the method's own of that name."""
+    """Raise RuntimeError for a saved tensor whose dtype kind differs from the method's own."""
     for name, tensor in saved.items():
         if name in own and tensor.is_floating_point() != own[name].is_floating_point():
             raise RuntimeError(f"{name} holds {tensor.dtype}, not {own[name].dtype}")
 
 
 def check_moments(optimizer: torch.optim.Optimizer) -> None:
-    """Raise ValueError unless what an optimizer remembers of each parameter fits it: a number, or one for each of its
-    rows or elements. Compiled loops rely on it."""
+    """Raise ValueError for an optimizer state that does not fit its parameter: a number, or one for each of its rows or
+    elements. Compiled loops rely on it."""
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             for name, value in optimizer.state.get(parameter, {}).items():
@@ -239,7 +239,7 @@ def check_moments(optimizer: torch.optim.Optimizer) -> None:
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> Sum:
-    """Write a safetensors file; gives its checksum."""
+    """Write a safetensors file. Returns its checksum."""
     data = safetensors.torch.save({name: x.detach().cpu().contiguous().clone() for name, x in tensors.items()})
     path.write_bytes(data)
     return checksum(data)

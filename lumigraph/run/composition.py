@@ -85,7 +85,7 @@ Keep = Literal["inside", "outside"]
 
 @dataclass(frozen=True)
 class CompositionPart:
-    """A part as the file says it. source, probes, mask: paths as they stand there; the rest: see above."""
+    """A part as in the file. source, probes, mask: paths as in the file; the rest: see above."""
 
     source: str
     place: Similarity
@@ -98,18 +98,18 @@ class CompositionPart:
 
 @dataclass(frozen=True)
 class Nesting:
-    """Compositions around a part, and everything that was opened for them, by its resolved path."""
+    """Compositions that contain a part, and all opened parts by resolved path."""
 
     above: tuple[Path, ...] = ()
     opened: dict[Path, Opened] = field(default_factory=dict)
 
 
 class Composition(Opened):
-    """A composition's file, opened with all its parts, each path once. Raises LumigraphError for one that cannot be.
+    """A composition's file, opened with all its parts, each path once. Raises LumigraphError for an invalid one.
 
-    open_part: opens what a part names
-    within:    what this one is a part of
-    count:     of its parts, those of its compositions counted as often as they are named
+    open_part: opens the source of a part
+    within:    nesting of this composition in others
+    count:     number of parts, those of nested compositions counted each time
     """
 
     count: int
@@ -144,7 +144,7 @@ class Composition(Opened):
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
     def _open(self, part: CompositionPart, open_part: Callable[[Path, Nesting], Opened], inner: Nesting) -> Opened:
-        """The scene or mesh that a part names; each scene is opened once."""
+        """Open the scene or mesh of a part; each scene is opened once."""
         place = self.path.parent / files.expanded(part.source)
         if not files.exists(place):
             raise LumigraphError(
@@ -164,7 +164,7 @@ class Composition(Opened):
         return replace(read_mask(self.path.parent / files.expanded(part.mask)), outside=part.keep == "outside")
 
     def method(self, device: torch.device | str = "cpu") -> Method:
-        """All parts in one picture. A source that is named several times is held once.
+        """All parts in one picture. A source used several times is loaded once.
 
         Raises LumigraphError where its clouds, one for each part, do not fit into memory."""
         built: dict[Path, Method] = {}
@@ -184,7 +184,7 @@ class Composition(Opened):
         return (LitComposition if lit else compose)(self.frame, placed).to(device)
 
     def _edited(self, method: Method, part: CompositionPart, opened: Opened) -> Method:
-        """The part's method after the part's edits. Raises LumigraphError for one that is no scene graph."""
+        """The part's method with the part's edits. Raises LumigraphError for one without a scene graph."""
         if not part.edits.edits:
             return method
         if TrackEdits not in method.takes:

@@ -1,7 +1,7 @@
-"""Runs made of runs: records of compressions, conversions and inferences; runs that a prior makes; picked Gaussians.
+"""Derived runs: records of compressions, conversions and inferences; runs that a prior creates; selected Gaussians.
 
-compress.json, convert.json    results, in the run that was made
-config.json                    `converted`, `inferred`: how the run began
+compress.json, convert.json    results, in the derived run
+config.json                    `converted`, `inferred`: origin of the run
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LearntFrom = Literal["photographs", "renderings of the source"]
 
 @dataclass(frozen=True)
 class Record:
-    """A file in the folder of a run that was made of another."""
+    """A record file in the folder of a derived run."""
 
     file: ClassVar[str]
 
@@ -56,17 +56,17 @@ class Record:
 
 @dataclass(frozen=True)
 class Origin:
-    """An entry of config.json: how the run began."""
+    """Origin of a run, an entry of config.json."""
 
     key: ClassVar[str]
 
     def within(self, settings: Settings) -> Settings:
-        """Settings with this entry."""
+        """Add this entry to settings."""
         return replace(settings, said=settings.said | {self.key: asdict(self)})
 
     @classmethod
     def of(cls, settings: Settings, file: Path) -> Any:
-        """Read from settings; None for a run that began otherwise. file: to name what is damaged in it"""
+        """Origin in settings; None for a run of another origin. file: named in faults"""
         entry = settings.said.get(cls.key)
         return None if entry is None else typed(cls, entry, f"{file}: {cls.key}")
 
@@ -75,12 +75,12 @@ class Origin:
 class Compressed(Record):
     """A run before and after compression.
 
-    source:       the run it was made of
+    source:       the original run
     bytes_before, bytes_after: of the model's weights
     folder_before, folder_after: of the whole runs
-    psnr_before, psnr_after: of held-out views in dB; before is None where there are renderings alone to compare with
+    psnr_before, psnr_after: of held-out views in dB; before is None where the references are renderings
     compared_with: reference of the held-out views and of the tuning
-    pruned:       share of importance that went;  codebook, apart, coarser: see `packing.Recipe`
+    pruned:       pruned share of importance;  codebook, apart, coarser: see `packing.Recipe`
     steps, seconds: of tuning
     """
 
@@ -111,11 +111,11 @@ class Compressed(Record):
 
 @dataclass(frozen=True)
 class ConversionStart(Origin):
-    """A conversion that is under way, as `converted` in config.json.
+    """A conversion in progress, as `converted` in config.json.
 
     source:      the run or file that is converted
     learnt_from: data of the student's further training
-    taking_over: seconds that beginning as the teacher took
+    taking_over: seconds of the student's initialisation from the teacher
     """
 
     key = "converted"
@@ -129,9 +129,9 @@ class ConversionStart(Origin):
 class MeasuredModel:
     """Teacher or student of a conversion.
 
-    bytes:   of the model, as it is stored
-    seconds: that rendering a view took
-    psnr:    of held-out views against their photographs, in dB; None where these are not at hand
+    bytes:   size of the stored model
+    seconds: rendering time of a view
+    psnr:    of held-out views against their photographs, in dB; None without photographs
     """
 
     method: Name
@@ -145,7 +145,7 @@ class Converted(Record):
     """Teacher and student of a conversion.
 
     source, learnt_from, taking_over: see `ConversionStart`
-    how:     by the teacher's field, its Gaussians, the depth that it shows, or its pictures alone
+    how:     transfer by the teacher's field, its Gaussians, its depth, or its pictures alone
     psnr:    of the student's held-out views against the teacher's, in dB
     steps, seconds: of further training
     """
@@ -166,8 +166,9 @@ class Converted(Record):
 
 @dataclass(frozen=True)
 class Inferred(Origin):
-    """prior: the run that made it; views: photographs or shapes in use; seconds: that it took; seed: of the random code
-    of a run without evidence"""
+    """Origin of a run inferred by a prior. prior: run of the prior; views: photographs or shapes used; seconds: of
+    inference;
+    seed: of the random code of a generated object"""
 
     key = "inferred"
 
@@ -181,10 +182,10 @@ class Inferred(Origin):
 def infer(
     made_by: Run, prior: Prior, data: Dataset, output: Path, options: dict[str, Any], evidence: Any = None
 ) -> Run:
-    """The run of one scene or shape, in a new or empty folder, that a prior makes of what is known of it.
+    """Infer the run of one scene or shape with a prior, in a new or empty folder.
 
-    options:  what `open_dataset` was told of the data, to open them again
-    evidence: what the prior is given, where that is not the data themselves
+    options:  of `open_dataset` for the data, to open them again
+    evidence: input of the prior, where that is not the data
     """
     check_new(output)
     begin = time.perf_counter()
@@ -195,7 +196,7 @@ def infer(
 
 
 def draw(made_by: Run, prior: Prior, seed: int, output: Path) -> Run:
-    """The run of an object drawn from the prior, in a new or empty folder. seed: of its random code"""
+    """Generate an object with a prior, as a run in a new or empty folder. seed: of its random code"""
     check_new(output)
     begin = time.perf_counter()
     method = prior.draw(seed)
@@ -206,7 +207,7 @@ def draw(made_by: Run, prior: Prior, seed: int, output: Path) -> Run:
 
 @dataclass(frozen=True)
 class Drawn:
-    """The Dataset that a drawn object has learnt from: none."""
+    """Empty Dataset of a generated object."""
 
     kind: ClassVar[str] = "a random code"
 
@@ -221,7 +222,7 @@ class Drawn:
 
 
 class Pictured(Drawn):
-    """The Dataset of a shape of which a picture alone is known."""
+    """Dataset of a shape reconstructed from a single picture."""
 
     kind: ClassVar[str] = "a picture"
 
@@ -229,7 +230,7 @@ class Pictured(Drawn):
 def kept(
     output: Path, method: Method, data: Dataset, seed: int, said: Inferred, options: dict[str, Any] | None = None
 ) -> Run:
-    """The run of a method that a prior has made, and what config.json says of how; whole, or not there."""
+    """Write the run of a method created by a prior, with its origin in config.json, atomically."""
     with whole_run(output) as folder:
         run = Run.create(folder, method, data, seed=seed, options=options)
         run.settings = said.within(run.settings)
@@ -240,7 +241,7 @@ def kept(
 
 @contextlib.contextmanager
 def whole_run(output: Path) -> Iterator[Path]:
-    """A folder to fill with a run, which is whole when it takes its place, or not there."""
+    """Temporary folder for a run that replaces `output` when complete."""
     for leftover in output.iterdir() if output.is_dir() else ():
         files.remove(leftover)  # of a killed process, as `check_new` has made sure of
     with files.replacing_folder(output) as folder:
@@ -248,8 +249,8 @@ def whole_run(output: Path) -> Iterator[Path]:
 
 
 def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """Raises LumigraphError unless what is picked may go there: to a file, see `files.claim`, or of a run to a new
-    folder."""
+    """Check the output path of selected Gaussians. Raises LumigraphError unless it is a file that may be written (see
+    `files.claim`), or a new folder for a run."""
     if not names_splats(output):
         if not isinstance(opened, Run):
             raise LumigraphError(
@@ -262,12 +263,12 @@ def check_output(opened: Opened, output: Path, overwrite: bool | None = None, re
 
 
 def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, why: dict[str, Any]) -> None:
-    """Write the Gaussians that a mask picks of something that opens; the order is that of its method's `gaussians()`.
+    """Write the selected Gaussians of an opened model; a mask in the order of its method's `gaussians()`.
 
-    output: a splat file in the source's frame, or a folder for a run at the same step, for `resume`: its settings,
-            cameras and history, its optimizers' state of the Gaussians left
-    why:    what the run's config.json says about it, under "cleaned"
-    Raises LumigraphError as `check_output` does, and for a method that cannot learn on with fewer.
+    output: a splat file in the source's frame, or a folder for a run at the same step, for `resume`: with settings,
+            cameras and history, and the optimizers' state of the Gaussians left
+    why:    entry "cleaned" of the new run's config.json
+    Raises LumigraphError as `check_output` does, and for a method that cannot continue with fewer Gaussians.
     """
     check_output(opened, output)
     if names_splats(output):

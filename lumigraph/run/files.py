@@ -1,4 +1,4 @@
-"""Files that open like runs: splat files, moving ones and folders of SNeRG's viewer, with cameras around them."""
+"""Files that open like runs: splat files, moving clouds and SNeRG viewer folders, with cameras around them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .. import methods
 from ..composition import PlayedCloud
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..exchange import fourdgs, read_gaussians, snerg
+from ..exchange import read_gaussians, read_moving, snerg
 from ..exchange.baked import Atlas
 from ..files.ranges import changed
 from ..gaussians import Gaussians
@@ -53,11 +53,11 @@ class SplatFile(Opened):
 
 
 class MovingFile(Opened):
-    """A moving cloud in a file, with a ring of cameras around it."""
+    """A moving cloud in a file or a folder, with a ring of cameras around it."""
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
-        self.moving = fourdgs.read_moving(self.path)
+        self.moving = read_moving(self.path)
         self.frame = replace(frame_of(self.moving.at(0.0)), times=(0.0, self.moving.duration))
 
     def method(self, device: torch.device | str = "cpu") -> Method:
@@ -66,7 +66,7 @@ class MovingFile(Opened):
 
 
 def frame_of(gaussians: Gaussians) -> Frame:
-    """The frame of a scene whose source are the axes of a file."""
+    """Frame of a splat file: the source's axes are those of the file."""
     return Frame(reach=64.0, near=0.01, source_from_scene=upright_similarity(gaussians).inverse.rows)
 
 
@@ -116,14 +116,14 @@ class SnergFolder(Opened):
 
 
 def reach_of(atlas: Atlas, places: Int[Tensor, "voxel 3"]) -> float:
-    """The least power of two with which rays go as far as what lies in these voxels of contracted coordinates."""
+    """Smallest power of two as reach of a frame that holds these voxels of contracted coordinates."""
     radius = float((atlas.low + atlas.voxel * (places + 0.5)).norm(dim=-1).amax())
     farthest = 1 / max(2 - radius, 0.5 * atlas.voxel)
     return min(64.0, max(2.0, 2.0 ** math.ceil(math.log2(farthest / (2 * math.sqrt(3))))))
 
 
 def within_reach(corners: Float[Tensor, "2 3"]) -> Similarity:
-    """The way back from where a box lies in [-1, 1]^3: as it is if it lies there, else shrunk and moved."""
+    """Similarity from a box scaled into [-1, 1]^3 back to the box; the identity if it lies there already."""
     low, high = corners.double()
     if float(corners.abs().max()) <= 1 + VOXEL_MARGIN:
         return Similarity.make(1.0)

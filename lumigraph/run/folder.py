@@ -1,14 +1,14 @@
-"""A run is a folder that explains itself: what was trained on what, its latest state, and what was measured.
+"""A run: a self-describing folder with the training settings, the latest state, and measurements.
 
     config.json     method and its numbers, frame, scene, seed, budget, versions: see `settings`
-    cameras.json    where the photographs were taken from, so that films need no photographs; where there are any
+    cameras.json    cameras of the photographs, if any, so that films need no photographs
     checkpoints/    the latest complete state, in a folder named after its step: see `checkpoint`
     metrics.jsonl   one line every few steps
-    previews/       one view as it came to be
+    previews/       one view during training
     photographs.json, photographs.png: findings on its photographs, and the five worst
-    eval.json, eval.png, renders/, report.html: what the commands made of it
+    eval.json, eval.png, renders/, report.html: results of commands
 
-Nothing in it runs code when opened: a method's file runs only as the user has loaded it before.
+Nothing in it is executed when opened: a method's file is executed only if the user has loaded it before.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from ..files.marks import MARKS_FILE
 from ..files.partials import PARTIAL_NAME
 from ..files.plain import alike, understood
 from ..files.ranges import check
+from ..geometry import Similarity
 from ..method import Method
 from ..opening import KINDS, open_dataset
 from ..readers import Before
@@ -49,9 +50,9 @@ from .settings import Settings, Source, check_memory
 
 
 class Run(Trained):
-    """A run's folder. `Run.create` makes one, `Run(folder)` opens one; LumigraphError if it is not one of ours.
+    """A run's folder. `Run.create` makes one, `Run(folder)` opens one; LumigraphError for any other folder.
 
-    settings: what was trained on what
+    settings: method, dataset and budget
     """
 
     def __init__(self, folder: Path | str):
@@ -83,9 +84,9 @@ class Run(Trained):
         options: dict[str, Any] | None = None,
         budget: dict[str, Any] | None = None,
     ) -> Run:
-        """Begin a run in a new or empty folder.
+        """Create a run in a new or empty folder.
 
-        options: what open_dataset was told besides the source, to open the same dataset again
+        options: of `open_dataset` besides the source, to open the same dataset again
         budget:  {"steps": n} or {"seconds": s}
         """
         folder = Path(folder)
@@ -117,25 +118,32 @@ class Run(Trained):
 
     @contextlib.contextmanager
     def kept_if_learnt(self) -> Iterator[None]:
-        """A block in which a new run is trained. Where a fault ends it before anything was kept, the run is taken
-        back, so that the same command may name the same folder again."""
+        """Block in which a new run is trained. If it fails before the first checkpoint, the run is removed, so that the
+        same command can use the same folder again."""
         with taken_back(self.folder, lambda: not self.has_state):
             yield
 
     def held(self) -> AbstractContextManager[None]:
-        """A block in which no other process trains this run. Raises LumigraphError that says who does, and for links in
-        the run, which would lead its files elsewhere."""
+        """Block with a lock on this run against training by other processes. Raises LumigraphError, naming the process,
+        if it is locked, and for symbolic links in the run, which would write elsewhere."""
         files.refuse_links(self.folder)
         return held(self.folder, "trained")
 
     def set_budget(self, **budget: Any) -> None:
-        """Remember another budget, as `Budget.to_json` says it."""
+        """Set another budget in config.json, as `Budget.to_json` gives it."""
         self.settings = replace(self.settings, budget=budget)
         self.settings.write(self._config)
 
     def set_scale(self, scale: float) -> None:
         """Remember the unit of exports. scale: see `Frame.scale`"""
-        self.frame = replace(self.frame, scale=scale)
+        self._remember(scale=scale, world_from_source=None)
+
+    def set_world(self, world: Similarity) -> None:
+        """Remember the frame of exports. world: see `Frame.world_from_source`"""
+        self._remember(scale=world.scale, world_from_source=world.rows)
+
+    def _remember(self, **numbers: Any) -> None:
+        self.frame = replace(self.frame, **numbers)
         self.settings = replace(self.settings, frame=self.frame)
         self.settings.write(self._config)
 
@@ -150,7 +158,7 @@ class Run(Trained):
         return self.settings.method
 
     def new_method(self, device: torch.device | str = "cpu") -> Method:
-        """The run's method as it was before the first step."""
+        """The run's method, untrained."""
         if not methods.known_again(self.method_name, file := self.settings.method_file):
             raise LumigraphError(
                 f"{self.folder} is a run of {self.method_name}, a method that is not installed; "
@@ -175,7 +183,7 @@ class Run(Trained):
 
     @property
     def photographed(self) -> bool:
-        """True if it was trained on photographs, so that there are cameras."""
+        """True if it was trained on photographs, and so has cameras."""
         return self.kind in (Scene.kind, BlockWorld.kind)
 
     @property
@@ -187,9 +195,9 @@ class Run(Trained):
         return None if self.photographed else f"learnt from {self.kind}, so it has no colours that could be taken over"
 
     def dataset(self, source: str | None = None) -> Dataset:
-        """Open its dataset again. source: its present path, if it has moved.
+        """Open the training dataset again. source: its present path, if it has moved
 
-        Raises LumigraphError if it gives another frame than the run was trained in.
+        Raises LumigraphError if its frame differs from the run's.
         """
         source = source or self.settings.scene.source
         if self.kind not in KINDS:
@@ -214,7 +222,7 @@ class Run(Trained):
         return data
 
     def scene(self, source: str | None = None) -> Scene:
-        """The photographs again, of a run that learnt from photographs; see `dataset`."""
+        """Open the training photographs again; see `dataset`."""
         data = self.dataset(source)
         if not isinstance(data, Scene):
             raise LumigraphError(f"{self.folder} learnt from {self.kind}; it has no photographs")
@@ -237,7 +245,7 @@ class Run(Trained):
         return self.photographed and read_cameras(self._cameras).masked
 
     def digests(self) -> dict[str, str]:
-        """Sizes and hashes of the photographs' files by name, as they were in training; see `Scene.digests`."""
+        """Sizes and hashes of the photographs' files by name, at the time of training; see `Scene.digests`."""
         said = read_cameras(self._cameras)
         return dict(zip(said.names, said.digests, strict=False))
 
@@ -256,7 +264,7 @@ class Run(Trained):
 
     @property
     def has_state(self) -> bool:
-        """True if it has a checkpoint, so that it renders and resumes."""
+        """True if it has a checkpoint, to render or to resume."""
         return bool(self._checkpoints)
 
     @property
@@ -270,7 +278,7 @@ class Run(Trained):
 
     @property
     def model_bytes(self) -> int:
-        """Size of the trained weights, which are all that rendering needs."""
+        """Size of the trained weights, sufficient for rendering."""
         return self._checkpoints.weights.stat().st_size
 
     def save(
@@ -280,14 +288,14 @@ class Run(Trained):
         self._checkpoints.save(state, method, optimizers, generator)
 
     def restore_weights(self, method: Method) -> State:
-        """Give a method the latest state's weights. Without any state, leaves it as it is."""
+        """Load the latest state's weights into a method; no change without a state."""
         if not self.has_state:
             return State()
         self._checkpoints.load_weights(method)
         return self.state
 
     def restore_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
-        """Give optimizers and random numbers the latest state. Without any state, leaves them as they are."""
+        """Load the latest state into optimizers and a random generator; no change without a state."""
         if self.has_state:
             self._checkpoints.load_training(optimizers, generator)
 
@@ -300,11 +308,11 @@ class Run(Trained):
             file.write(json.dumps(row) + "\n")
 
     def metrics(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; what is damaged, as one that a kill cut short, is left out."""
+        """The lines of metrics.jsonl; damaged ones, such as a truncated last line, are left out."""
         return read_rows(self.folder / "metrics.jsonl")
 
     def forget_after(self, step: int) -> None:
-        """Drop lines and previews of steps after the saved state: they will be taken again."""
+        """Drop lines and previews of steps after the saved state: these steps will be repeated."""
         rows = [json.dumps(row) for row in self.metrics() if row["step"] <= step]
         files.write_bytes(self.folder / "metrics.jsonl", "".join(row + "\n" for row in rows).encode(), ours=True)
         for preview, path in self.previews().items():
@@ -312,7 +320,7 @@ class Run(Trained):
                 files.remove(path)
 
     def previews(self) -> dict[int, Path]:
-        """One view at the steps at which it was taken."""
+        """Previews of one view by step."""
         found = sorted((self.folder / "previews").glob("*.png"))
         return {int(path.stem): path for path in found if re.fullmatch("[0-9]{6,12}", path.stem)}
 
@@ -320,10 +328,10 @@ class Run(Trained):
 def build(
     kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int, learning: bool = False
 ) -> Method:
-    """A fresh method whose initial weights depend on the seed alone.
+    """Build a method whose initial weights depend on the seed alone.
 
-    learning: whether it is to learn, which takes more memory than looking
-    Raises LumigraphError for numbers beyond their ranges, and where memory does not hold it.
+    learning: for training, which takes more memory than rendering
+    Raises LumigraphError for numbers out of range, and where memory is too small.
     """
     check(config, methods.name_of(kind))
     check_memory(kind, frame, config, device, learning)
@@ -335,7 +343,7 @@ def build(
 
 @contextlib.contextmanager
 def taken_back(folder: Path, useless: Callable[[], bool]) -> Iterator[None]:
-    """A block after whose fault, such as a full disk or want of memory, nothing of a useless run is left."""
+    """Block that removes the run on an exception, such as a full disk, if `useless()` holds."""
     try:
         yield
     except Exception:
@@ -358,7 +366,7 @@ def is_block_run(folder: Path) -> bool:
 
 
 def check_new(folder: Path) -> None:
-    """Raise LumigraphError unless a run may begin here, saying how to go on with one that lies here."""
+    """Raise LumigraphError unless a run can begin in a folder, naming the command to continue an existing one."""
     if (folder / "config.json").exists():
         raise LumigraphError(
             f"{folder} already holds a run; go on with it by `lumigraph resume {folder}`, or choose another --output"
@@ -371,13 +379,13 @@ def check_new(folder: Path) -> None:
 
 
 def is_leftover(path: Path) -> bool:
-    """True for leftovers of a run that was killed before its first step."""
+    """True for files that a killed process left before its first step."""
     own = path.name in (LOCK_FILE, MARKS_FILE) or PARTIAL_NAME.fullmatch(path.name) is not None
     return own or marks.is_ours(path, "file")
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the platform and the packages that results depend on, by name."""
+    """Versions of Python, the platform and the packages that affect results, by name."""
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for package in ("lumigraph", "torch", "numba", "triton"):
         try:

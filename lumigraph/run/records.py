@@ -1,4 +1,4 @@
-"""Files of a run: cameras.json, the poses of its photographs, so that films need no photographs; the lines of
+"""Record files of a run: cameras.json, poses of its photographs, so that films need no photographs; the lines of
 metrics.jsonl; the contents of eval.json and related files."""
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Protocol:
 
 
 def compared_kind(protocol: dict[str, Any]) -> str:
-    """The kind of what an evaluation has compared."""
+    """Kind of the compared items of an evaluation."""
     return next(kind for kind in COMPARED if kind in protocol)
 
 
@@ -112,7 +112,7 @@ class EvaluationRecord(Means):
 
 @reads()
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The lines of metrics.jsonl; those that are damaged, as one that a kill cut short, are passed over."""
+    """The lines of metrics.jsonl; damaged ones, such as a truncated last line, are skipped."""
     if not path.exists():
         return []
     rows = []
@@ -165,7 +165,7 @@ def cameras_json(scene: Scene) -> dict[str, Any]:
 
 
 def warn_of_changes(known: Mapping[str, str], data: Scene, run: Path) -> None:
-    """Warn where photographs are not the ones that a run has learnt from. known: digests by name"""
+    """Warn of photographs that differ from the training photographs. known: digests by name"""
     own = dict(zip(data.names, data.digests, strict=False))
     if changed := [name for name, digest in known.items() if digest and own.get(name, digest) not in ("", digest)]:
         more = f" and {len(changed) - MAX_NAMES} more" if len(changed) > MAX_NAMES else ""
@@ -194,9 +194,9 @@ def read_cameras(path: Path) -> CamerasRecord:
 
 
 def cameras_of(path: Path, photographs: int) -> dict[str, Camera]:
-    """Cameras by split. photographs: how many there are; further cameras took smaller copies of the same ones.
+    """Cameras by split. photographs: their number; further cameras belong to reduced copies of the same ones
 
-    Raises LumigraphError, naming the file, for what are no cameras.
+    Raises LumigraphError, naming the file, for invalid cameras.
     """
     said = read_cameras(path)
     lens = Lens.from_json(said.lens, path)

@@ -1,9 +1,10 @@
-"""Settings of a run in config.json, read and written here alone; and the memory that a Config needs."""
+"""Settings of a run, in config.json; and the memory that a Config needs."""
 
 from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,13 +60,13 @@ class Settings:
     """Settings of a run: method, dataset and budget.
 
     method:    as the user types it
-    config:    the method's numbers by name, as the run was written with; see `method_config`
+    config:    the method's numbers by name, as written with the run; see `method_config`
     splits:    number of photographs or shapes by purpose
     seed:      of all random choices
-    budget:    {"steps": n} or {"seconds": s}, and what else `Budget.to_json` says
-    device:    that it began on;  processor: what kind of machine that was
-    method_file: the Python file of a method from elsewhere, see `methods.load`; nothing runs it unasked
-    said:      the file as it was read. What a newer version has added to it is kept when it is written again
+    budget:    {"steps": n} or {"seconds": s}, and further fields of `Budget.to_json`
+    device:    of the start of training;  processor: its hardware name
+    method_file: the Python file of an external method, see `methods.load`; never executed without consent
+    said:      the file's contents as read. Fields of newer versions are preserved when it is written again
     """
 
     method: str
@@ -109,26 +110,56 @@ class Settings:
     def method_config(self, kind: type[Method], file: Path) -> Any:
         """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
         its range"""
-        return typed(kind.Config, without_constants(self.config, kind.Config, file), file, closed=True)
+        return typed(kind.Config, of_this_version(self.config, kind.Config, file), file, closed=True)
 
 
-def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
-    """JSON of a Config without options of older versions that are constants now: they have the option's name in
-    capitals, in the module of the dataclass. Warns of one that had another value."""
-    if not (isinstance(said, dict) and is_dataclass(kind)):
-        return said
-    known, module, kept = hints(kind), vars(sys.modules[kind.__module__]), {}  # type: ignore[arg-type]
-    for name, value in said.items():
-        if name in known or name.upper() not in module:
-            kept[name] = without_constants(value, known.get(name), file)
-        elif msgspec.to_builtins(constant := module[name.upper()]) != value:
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
+def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
+    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. Options
+    that are constants now, by their names in capitals beside the Config or a part of it, are left out, with a warning
+    of another value."""
+    parts, made = [*parts_of(kind)], dict[str, Any]()
+    places = {name: (*path, name) for path, part in parts for name in hints(part)}
+    modules = [vars(sys.modules[part.__module__]) for _, part in parts]
+    for path, value in leaves(said):
+        name = path[-1]
+        constants = [module[name.upper()] for module in modules if name.upper() in module]
+        if name in places or not constants:
+            put(made, places.get(name, path), value)
+        elif value not in map(msgspec.to_builtins, constants):
+            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constants[0])} now"
             warnings.warn(text, LumigraphWarning, stacklevel=2)
-    return kept
+    return made
+
+
+def parts_of(kind: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """A dataclass and those that it holds, each after its path."""
+    yield path, kind
+    for name, part in hints(kind).items():
+        if is_dataclass(part):
+            yield from parts_of(part, (*path, name))
+
+
+def leaves(said: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Values of nested JSON that are no dictionaries, each after its path."""
+    for name, value in said.items():
+        if isinstance(value, dict):
+            yield from leaves(value, (*path, name))
+        else:
+            yield (*path, name), value
+
+
+def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
+    """Set a value at a path of nested JSON, unless something else than a dictionary is on the way."""
+    inner: Any = made
+    for name in path[:-1]:
+        inner = inner.setdefault(name, {})
+        if not isinstance(inner, dict):
+            return
+    inner[path[-1]] = value
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
-    """Raise LumigraphError where a method would not fit into the memory that is free, naming what to make smaller."""
+    """Raise LumigraphError for a method that exceeds free memory, naming the numbers to reduce."""
 
     def needed(config: Any) -> int:
         return bytes_of(kind, frame, config, learning)
@@ -148,9 +179,9 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
 
 
 def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> int:
-    """Bytes of a method's parameters, with all that learning keeps of each, of its buffers, and `further_bytes`.
+    """Bytes of a method's parameters with gradients and optimizer state, its buffers, and `further_bytes`.
 
-    The method is built of tensors without memory. Where it looks at their values, and so cannot be built that way, only
+    The method is built on the meta device. Where its constructor reads values, which that does not allow, only
     `further_bytes` is known.
     """
     further = kind.further_bytes(frame, config, learning)
@@ -167,7 +198,7 @@ def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> i
 
 
 def halved(config: Any) -> list[tuple[str, Any]]:
-    """A Config with each of its whole numbers at half its value, or at the least that its range allows, by name."""
+    """Copies of a Config with one of its whole numbers halved, or at its range's minimum, by name."""
     found = []
     for name, kind in hints(config.__class__).items():
         if is_dataclass(inner := getattr(config, name)):

@@ -23,12 +23,13 @@ MIN_PURITY = 0.3  # share of a point's weight in the view that is under the stro
 class Selection:
     """A part of a method's scene, marked by strokes.
 
+    method: the method of the scene
     points: features and places; see `distil_features`
     strokes: in the order in which they were made
     """
 
     def __init__(self, method: Any, points: Distilled, numbers: GrowthNumbers = GrowthNumbers()):
-        self.points, self.numbers = points, numbers
+        self.method, self.points, self.numbers = method, points, numbers
         self._weigher: Weigher = weigher_of(method)
         self._seeds: list[tuple[np.ndarray, np.ndarray]] = []
         self._seen = points.is_seen

@@ -1,7 +1,7 @@
 """Agreement of a model with the matches of its photographs.
 
-Mapping takes what fits and discards the rest, so a wrong model has a small error too. But it contradicts matches of two
-photographs, each of which one motion explains.
+Mapping keeps inliers and discards the rest, so a wrong model has a small error too. But it contradicts verified matches
+of two photographs.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ MAX_EPIPOLAR_ERROR = 0.003  # distance from the epipolar line, of a photograph's
 
 @dataclass(frozen=True)
 class Agreement:
-    """Numbers of matches: all among the photographs that matches connect with a model's, and those whose epipolar line
-    the model confirms. Matches of photographs without a place are not confirmed."""
+    """Numbers of matches: all in the model's connected component, and those within the model's epipolar error. Matches
+    of unregistered photographs are not confirmed."""
 
     matches: int
     confirmed: int
 
     @property
     def share(self) -> float:
-        """Confirmed share of the matches; 1 where there are none."""
+        """Confirmed share of the matches; 1 without matches."""
         return self.confirmed / self.matches if self.matches else 1.0
 
 
 def agreement(model: pycolmap.Reconstruction, database: Path, matched: Matches) -> Agreement:
-    """Agreement of a model of flat photographs with the matches in COLMAP's database. matched: what was read of it"""
+    """Agreement of a model of perspective photographs with the matches in COLMAP's database. matched: contents of
+    the database
+    """
     placed = {image.name: image for image in model.images.values() if image.has_pose}
     near = {name for group in matched.groups() if not group.isdisjoint(placed) for name in group}
     matches = confirmed = 0

@@ -52,7 +52,7 @@ class Coverage:
 
 
 def use_of(degrees: float, ends: Sequence[str] | None) -> str:
-    """Views that an angle around the subject suffices for, and the place of photographs for others.
+    """Views possible with an angle around the subject, and positions of photographs for others.
 
     ends: see `Coverage`
     """

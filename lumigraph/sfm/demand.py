@@ -31,7 +31,7 @@ MIN_SIDE, MIN_FEATURES = 400, 512  # pixels and features that a capture is reduc
 
 @dataclass(frozen=True)
 class Demand:
-    """Numbers of a capture, from which its memory and time follow.
+    """Parameters of a capture that determine its memory and time.
 
     size:     (width, height) of the largest photograph
     max_size: longer side in pixels for feature detection
@@ -61,12 +61,12 @@ class Demand:
 
     @property
     def memory(self) -> float:
-        """Bytes at most."""
+        """Peak memory in bytes."""
         return PROCESS_BYTES + max(self.threads * self.detection, self.mapping)
 
     @property
     def pairs(self) -> int:
-        """Number of pairs to match, at most."""
+        """Largest number of pairs to match."""
         if self.matching == "exhaustive" or self.count <= SEQUENTIAL_NEIGHBOURS:
             return len(exhaustive(self.count))
         if self.matching == "sequential":
@@ -75,7 +75,7 @@ class Demand:
 
     @property
     def seconds(self) -> float:
-        """Duration on this many cores, if nothing else uses them."""
+        """Duration in seconds on idle cores."""
         cores = min(os.cpu_count() or 1, MAX_THREADS)
         reading = READING_SECONDS * self.count * math.prod(self.size) / 1e6
         comparing = self.pairs * (PAIR_SECONDS + PRODUCT_SECONDS * self.features**2)
@@ -84,7 +84,7 @@ class Demand:
         return detecting + (reading + comparing) / cores + mapping
 
     def say(self) -> str:
-        """Sentence before work begins."""
+        """Sentence with memory and time, shown before the start."""
         width, height = self.size
         side = min(self.max_size, max(self.size))
         kinds = {"exhaustive": "all", "sequential": "neighbours", "retrieval": "those that look alike"}
@@ -103,8 +103,8 @@ def reduced_pixels(size: tuple[int, int], max_size: int) -> float:
 
 
 def fitted(asked: Demand, free: float) -> tuple[Demand, list[str]]:
-    """The demand that fits into so many free bytes, and sentences on what is less than asked for: threads first, then
-    the size of photographs, then features. Raises LumigraphError where even the least does not fit."""
+    """The demand reduced to fit into free bytes, and sentences on the reductions: threads first, then the size of
+    photographs, then features. Raises LumigraphError where even the minimum does not fit."""
     room, found, cuts = FREE_SHARE * free - PROCESS_BYTES, asked, []
     threads = int(room // found.detection)
     found = replace(found, threads=max(1, min(asked.threads, threads)))

@@ -1,4 +1,4 @@
-"""Report the outcome for each photograph and the reliability of the result, with what to do next."""
+"""Diagnosis of a capture: outcome for each photograph, reliability of the result, and advice."""
 
 from __future__ import annotations
 
@@ -41,27 +41,27 @@ Homography = tuple[Float[np.ndarray, "3 3"], tuple[int, int], tuple[int, int]]  
 
 @dataclass(frozen=True)
 class Matches:
-    """Matches of photographs: for each pair of names the number of inliers of one motion, and COLMAP's verdict."""
+    """Verified matches: number of inliers of each pair of names, and COLMAP's two-view geometry."""
 
     features: dict[str, int]
     shared: dict[tuple[str, str], int]
     turned: int  # pairs that a turn of the camera alone explains
 
     def best(self, name: str) -> tuple[str, int]:
-        """The photograph that shares most with this one, and how many details; 0 and no name if none does."""
+        """The photograph with most matches to this one, and their number; 0 and no name without any."""
         found = [(n, b if a == name else a) for (a, b), n in self.shared.items() if name in (a, b)]
         most = max(found, default=(0, ""))
         return most[1], most[0]
 
     def are_turned(self, share: float = ROTATION_SHARE) -> bool:
-        """True if a turn of the camera alone explains more than a share of the pairs."""
+        """True if pure rotation explains more than a share of the pairs."""
         return self.turned > share * max(len(self.shared), 1)
 
     def between(self, a: str, b: str) -> int:
         return self.shared.get((a, b)) or self.shared.get((b, a)) or 0
 
     def groups(self) -> list[set[str]]:
-        """Photographs connected by matches, the largest group first."""
+        """Connected components of the photographs, the largest first."""
         number = {name: i for i, name in enumerate(self.features)}
         pairs = np.array([(number[a], number[b]) for a, b in self.shared], int).reshape(-1, 2)
         graph = coo_array((np.ones(len(pairs)), pairs.T), (len(number), len(number)))
@@ -88,10 +88,10 @@ def read_matches(database: Path) -> Matches:
 
 
 def count_turns(homographies: Sequence[Homography]) -> int:
-    """Number of homographies between two pictures that a turn explains, and no plane: K R K⁻¹ with one focal length.
+    """Number of homographies explained by a rotation and not by a plane: K R K⁻¹ with one focal length.
 
-    Each with the widths and heights of its pictures. A plane before a camera that moves gives R + t nᵀ, which is no
-    rotation by as much as it moves; so the deviation from a rotation is measured in terms of the motion.
+    Each with the widths and heights of its pictures. A plane seen by a moving camera gives R + t nᵀ, which deviates
+    from a rotation in proportion to the motion; so the deviation is measured relative to the motion.
     """
     if not homographies:
         return 0
@@ -100,8 +100,8 @@ def count_turns(homographies: Sequence[Homography]) -> int:
 
 
 def deviation_from_turn(homographies: Sequence[Homography]) -> tuple[Float[np.ndarray, " pair"], float]:
-    """Deviation of some of the homographies from a turn, in terms of its motion, and the focal length that makes it
-    least, in terms of the longer side."""
+    """Deviation of some of the homographies from a rotation, relative to their motion, and the focal length that
+    minimises it, in terms of the longer side."""
     some, ratios = evenly(homographies, TURN_SAMPLES), np.geomspace(*FOCAL_RATIOS)
     worst = np.empty((len(some), len(ratios)))
     for row, (homography, *sizes) in zip(worst, some, strict=True):
@@ -126,18 +126,18 @@ def calibration(size: tuple[int, int], ratios: Float[np.ndarray, " ratio"]) -> F
 class Diagnosis:
     """Outcome of a capture.
 
-    given:        how many files there were;  used: those that cameras were looked for
-    registered:   names of the photographs whose cameras were found
-    left_out:     name and reason of each that was not used or not found
-    blurred:      name and reason, of those that are used all the same
+    given:        number of files;  used: number of photographs in the reconstruction
+    registered:   names of the registered photographs
+    left_out:     name and reason of each unused or unregistered one
+    blurred:      name and reason, of blurred ones that are used
     duplicates:   name, and the name of the one it repeats
-    other_models: photographs that hang together but not with the rest
-    error:        mean distance between details and where the model has them, pixels
-    points, track_length: how many points, and how many photographs show each on average
-    angle:        between the outermost rays to a point, in the middle, degrees
-    filled:       share of a picture that its points span, on average
-    coverage:     None where cameras do not look at one subject
-    warnings:     sentences on what may spoil the result, and what to do
+    other_models: photographs of other connected models
+    error:        mean reprojection error, pixels
+    points, track_length: number of points, and mean number of photographs of each
+    angle:        median triangulation angle, degrees
+    filled:       mean share of a picture that its points span
+    coverage:     None for cameras without a common subject
+    warnings:     sentences on possible faults of the result, with advice
     """
 
     given: int
@@ -159,7 +159,7 @@ class Diagnosis:
 def diagnose(
     intake: Intake, used: Sequence[Photo], model: pycolmap.Reconstruction, others: list[list[str]], matches: Matches
 ) -> Diagnosis:
-    """used: the photographs that cameras were looked for; others: names in other models; the model stands upright."""
+    """Diagnose a model. used: photographs in the reconstruction; others: names in other models; the model is upright"""
     placed = poses_of(model)
     registered = [photo.name for photo in used if photo.name in placed]
     poses = np.stack([placed[name] for name in registered])
@@ -217,7 +217,7 @@ APART = "in another group of {}, which shares too little with the rest: another 
 def why_not(
     name: str, registered: Sequence[str], others: Sequence[Sequence[str]], matches: Matches, blurred: bool
 ) -> str:
-    """Why no camera was found for a photograph, in a few words."""
+    """Reason in a few words why a photograph was not registered."""
     features = matches.features.get(name, 0)
     if features < MIN_FEATURES:
         fault = "blurred" if blurred and features else "blank, dark or out of focus"
@@ -235,7 +235,7 @@ def why_not(
 
 
 def triangulation_angle(model: pycolmap.Reconstruction, seed: int = 0) -> float:
-    """Median over points of the angle between the outermost rays that meet there, degrees."""
+    """Median triangulation angle of the points, between outermost rays, degrees."""
     centres = {number: image.projection_center() for number, image in model.images.items() if image.has_pose}
     numbers = np.array(sorted(model.points3D.keys()))
     chosen = np.random.default_rng(seed).permutation(len(numbers))[:ANGLE_SAMPLES]
@@ -266,7 +266,7 @@ def filled(model: pycolmap.Reconstruction) -> float:
 def folds(
     names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"], matches: Matches, in_order: bool
 ) -> list[tuple[int, float]]:
-    """The jumps of a capture, where its order tells anything."""
+    """Jumps of a capture whose order is meaningful."""
     if not (in_order or in_steps(poses[:, :, 3])):
         return []
     return jumps(
@@ -275,7 +275,9 @@ def folds(
 
 
 def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
-    """Photographs more than 1.5 stops from their neighbours, or where there is no order, from the median of all."""
+    """Warnings of photographs more than 1.5 stops from their neighbours, or without an order, from the median of
+    all.
+    """
     found = [photos[i].name for i in exposure_jumps([photo.brightness for photo in photos], in_order)]
     if not found:
         return []

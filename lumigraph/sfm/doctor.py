@@ -1,4 +1,4 @@
-"""Findings: faulty photographs of a capture or a run, the evidence, and what to do next."""
+"""Findings: faulty photographs of a capture or a run, with evidence and advice."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ..files import read_json
 from ..geometry import evenly
 from ..readers import colmap
 from ..readers.capture import Capture, Shot
+from ..readers.finding import paired
 from ..readers.oddities import fold, in_steps
 from ..readers.pictures import eight_bits
 from ..readers.points import similarity
@@ -72,7 +73,7 @@ class Residual:
 
     psnr:     dB, after a gain and an offset per colour
     mirrored: the same of the mirrored photograph
-    floating: share of its rendered surface that other cameras see past
+    floating: share of its rendered surface that other cameras see through (floaters)
     """
 
     photograph: str
@@ -84,13 +85,13 @@ class Residual:
 
 @dataclass(frozen=True)
 class TrackAgreement:
-    """Agreement of a photograph with the sparse points that it shows.
+    """Agreement of a photograph with its sparse points.
 
-    count:    features of reliable points; the rest is measured from 20 on, and NaN below
-    error:    median distance between a feature and its projected point, pixels of a picture 1000 wide
-    share:    of its features beyond the allowed distance of 4 of these pixels
+    count:    features of reliable points; the other fields are NaN below 20
+    error:    median reprojection error, pixels of a picture 1000 wide
+    share:    of its features with an error above 4 of these pixels
     likeness: correlation of its pixels with the colours of the points;  mirrored: the same of the mirrored photograph;
-              NaN where no file holds it
+              NaN without a file
     """
 
     count: int
@@ -107,12 +108,12 @@ def findings(
     residuals: Sequence[Residual] = (),
     judged: Sequence[Photo] = (),
 ) -> list[Finding]:
-    """Faults of a capture's photographs, those of one kind together, then directions that lack photographs.
+    """Faults of a capture's photographs, grouped by kind, then directions that lack photographs.
 
     left_out:  name and reason of photographs without a pose; None to read them from the folder's capture.json
-    upright:   the rotation that brings up to +z; None for poses that stand upright
-    residuals: of a run that learnt from them
-    judged:    photographs whose pixels were judged before; the others' files are read
+    upright:   the rotation to +z up; None for upright poses
+    residuals: of a run trained on them
+    judged:    photographs whose pixels were judged already; the others' files are read
     Raises LumigraphError for a damaged COLMAP model or capture.json beside the photographs.
     """
     capture = replace(capture, shots=[replace(shot, name=label(shot.name)) for shot in capture.shots])
@@ -135,18 +136,18 @@ def findings(
 
 
 def label(name: str) -> str:
-    """Name of a photograph for people, without the folder that all are in."""
+    """Display name of a photograph, without the common folder."""
     return name.removeprefix("images/")
 
 
 def said_left_out(folder: Path) -> dict[str, str]:
-    """Photographs without a pose, and why, as `lumigraph capture` wrote them; empty for other folders."""
+    """Photographs without a pose, and the reasons, from capture.json; empty for other folders."""
     path = folder / "capture.json"
     return read_json(path, Made).left_out if path.is_file() else {}
 
 
 def leave_out(shot: Shot) -> str:
-    """Advice with the command that takes a photograph out of its folder. Readers go on without it."""
+    """Advice with the command that moves a photograph out of its folder. Readers ignore missing ones."""
     if not isinstance(shot.image, dict):
         return "leave it out"
     moves = [shlex.join(["mv", str(path), f"{path}.out"]) for path in shot.image.values()]
@@ -154,7 +155,7 @@ def leave_out(shot: Shot) -> str:
 
 
 def find_again(shot: Shot, folder: Path) -> str:
-    """Advice with the command that finds the poses of all photographs anew; by another mapper, if we have found them.
+    """Advice with the command that reconstructs all poses again; by another mapper, if they came from ours.
 
     shot: one of them
     """
@@ -165,7 +166,7 @@ def find_again(shot: Shot, folder: Path) -> str:
 
 
 def of_folds(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"], folder: Path) -> list[Finding]:
-    """A leap of the cameras between two photographs in a row that show the same."""
+    """Findings of jumps of the camera between consecutive photographs with the same view."""
     if (found := fold(shots, poses)) is None:
         return []
     evidence = (
@@ -176,7 +177,7 @@ def of_folds(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"], folde
 
 
 def of_pixels(shots: Sequence[Shot], before: Mapping[str, Photo]) -> list[Finding]:
-    """Blurred photographs, and jumps of the exposure, from their files; nothing for pictures without files.
+    """Findings of blurred photographs, and of jumps of the exposure, from their files.
 
     before: photographs that were judged already, by name
     """
@@ -217,32 +218,36 @@ def judged_file(shot: Shot) -> Judgement | None:
 def tracks_of(capture: Capture) -> dict[str, TrackAgreement]:
     """Agreement of photographs, by name, with the tracks of the COLMAP model beside them; empty without a model.
 
-    Points are moved into the capture's frame by the similarity of both sets of camera positions, so poses that were
-    changed after the reconstruction are found too. Points that fewer than three photographs show do not count.
+    Points are transformed into the capture's frame by the similarity of both sets of camera positions, so poses changed
+    after the reconstruction are found too. Points with fewer than three photographs do not count.
     """
     place = colmap.model_folder(Path(capture.source))
     if place is None:
         return {}
     model = colmap.read_model(place)
-    shots = {Path(shot.name).stem: shot for shot in capture.shots}
-    images = {Path(i.name).stem: i for i in model.images.values() if i.has_pose and Path(i.name).stem in shots}
-    poses = {Path(name).stem: pose[:, 3] for name, pose in colmap.poses_of(model).items()}
-    matrix = similarity(np.array([poses[k] for k in images]), np.array([shots[k].pose[:, 3] for k in images]))
+    shots = {shot.name: shot for shot in capture.shots}
+    by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    images = {name: by_name[other] for name, other in paired(shots, by_name).items()}
+    poses = colmap.poses_of(model)
+    matrix = similarity(
+        np.array([poses[image.name][:, 3] for image in images.values()]),
+        np.array([shots[k].pose[:, 3] for k in images]),
+    )
     if matrix is None:
         return {}
     reliable = {k: p for k, p in model.points3D.items() if p.track.length() >= MIN_TRACK_LENGTH}
     found: dict[str, TrackAgreement] = {}
     measured: list[tuple[Shot, np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]] = []
-    for stem, image in images.items():
+    for name, image in images.items():
         seen = [(p.xy, reliable[p.point3D_id]) for p in image.get_observation_points2D() if p.point3D_id in reliable]
-        found[shots[stem].name] = TrackAgreement(len(seen))
+        found[name] = TrackAgreement(len(seen))
         if len(seen) < MIN_OBSERVATIONS:
             continue
         features, points = zip(*evenly(seen, MAX_OBSERVATIONS), strict=True)
         camera, there = model.cameras[image.camera_id], np.array([p.xyz for p in points])
         there = there @ matrix[:3, :3].T + matrix[:3, 3]
         colours = np.array([p.color for p in points], np.float64)
-        measured.append((shots[stem], np.array(features), there, colours, (camera.width, camera.height)))
+        measured.append((shots[name], np.array(features), there, colours, (camera.width, camera.height)))
 
     def agreement(i: int) -> TrackAgreement:
         shot, features, points, colours, size = measured[i]
@@ -257,8 +262,7 @@ def tracks_of(capture: Capture) -> dict[str, TrackAgreement]:
 def reprojection(
     shot: Shot, features: Float[np.ndarray, "point 2"], points: Float[np.ndarray, "point 3"], size: tuple[int, int]
 ) -> Float[np.ndarray, " point"]:
-    """Distance of features from their points through the shot's camera, pixels of a picture 1000 wide; infinity for
-    points that its lens does not see.
+    """Reprojection errors, pixels of a picture 1000 wide; infinity for invalid projections.
 
     features: pixels of a picture of `size`;  points: in the frame of the shot's pose
     """
@@ -272,8 +276,8 @@ def reprojection(
 def likeness(
     shot: Shot, features: Float[np.ndarray, "point 2"], colours: Float[np.ndarray, "point 3"], size: tuple[int, int]
 ) -> tuple[float, float]:
-    """Correlation of a photograph's pixels at its features with the colours of their points, as it is and mirrored.
-    NaN where no file holds it or nothing varies."""
+    """Correlation of a photograph's pixels at its features with the colours of their points, and the same when
+    mirrored. NaN without a file or without variation."""
     if not isinstance(shot.image, dict):
         return np.nan, np.nan
     try:
@@ -292,7 +296,7 @@ def likeness(
 def of_tracks(
     shots: Sequence[Shot], tracks: Mapping[str, TrackAgreement], folder: Path, blurred: Collection[str] = ()
 ) -> list[Finding]:
-    """Photographs whose pose or pixels contradict the sparse points that they show.
+    """Findings of photographs whose pose or pixels contradict their sparse points.
 
     blurred: names of photographs whose pixels are no evidence
     """
@@ -328,9 +332,9 @@ def of_tracks(
 
 
 def of_residuals(residuals: Sequence[Residual], shots: Sequence[Shot], named: set[str]) -> list[Finding]:
-    """Photographs that a run renders far worse than the others of their split, or with floating surfaces.
+    """Findings of photographs that a run renders far worse than the others of their split, or with floaters.
 
-    named: photographs that have a finding; a residual adds the evidence of the run
+    named: photographs with a finding; a residual adds the evidence of the run
     """
     by_name, found = {shot.name: shot for shot in shots}, []
     for split in dict.fromkeys(r.split for r in residuals):
@@ -359,14 +363,14 @@ def of_residuals(residuals: Sequence[Residual], shots: Sequence[Shot], named: se
 
 
 def deviations(values: Array, least: float) -> Array:
-    """Deviations below the median, in standard deviations by the median absolute deviation, at least `least`."""
+    """Deviations below the median, in robust standard deviations (median absolute deviation), at least `least`."""
     below = np.median(values) - values
     return below / max(1.4826 * float(np.median(np.abs(below))), least)
 
 
 def grouped(found: Sequence[Finding]) -> dict[str, list[str]]:
     """Lines for display, by fault; photographs with the same evidence and advice in one line. Evidence on the whole
-    capture that the line before has given is not repeated."""
+    capture is not repeated."""
     lines: dict[str, dict[Finding, list[str]]] = {}
     for finding in found:
         alike = lines.setdefault(finding.fault, {})

@@ -33,7 +33,7 @@ FRUSTUM_DEPTH = 0.05  # as a share of the drawing's extent
 
 @dataclass(frozen=True)
 class Sketch:
-    """Geometry to draw, in a frame with +z up: corners are each camera's eye and the four corners of its picture.
+    """Geometry to draw, in a frame with +z up. corners: each camera's eye and the four corners of its picture
 
     lacking: positions for photographs that would fill gaps
     """
@@ -46,7 +46,7 @@ class Sketch:
 
 
 def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosis, keep_axes: bool = False) -> None:
-    """Write a picture of an upright model. keep_axes: whether x goes right in it, as where x is east."""
+    """Draw an upright model. keep_axes: whether x goes right, as where x is east"""
     sketch = sketch_of(model, diagnosis.registered, keep_axes, diagnosis.coverage.places if diagnosis.coverage else [])
     low, high = interesting(sketch)
     extent = high - low
@@ -98,7 +98,7 @@ def sketch_of(
 
 
 def longest_first(eyes: Float[np.ndarray, "photo 3"]) -> Float[np.ndarray, "3 3"]:
-    """A turn about +z that brings the horizontal direction in which cameras spread most to x."""
+    """Rotation about +z of the cameras' principal horizontal direction to x."""
     flat = eyes[:, :2] - eyes[:, :2].mean(0)
     _, vectors = np.linalg.eigh(flat.T @ flat)
     x, y = vectors[:, 1]
@@ -106,7 +106,7 @@ def longest_first(eyes: Float[np.ndarray, "photo 3"]) -> Float[np.ndarray, "3 3"
 
 
 def interesting(sketch: Sketch) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """The box to show: all cameras, and most points, unless those are far off."""
+    """Box to draw: all cameras, and most points, without far outliers."""
     shown = np.concatenate([sketch.eyes, sketch.lacking])
     low, high = shown.min(0), shown.max(0)
     if len(sketch.points):
@@ -156,14 +156,14 @@ def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size
 
 
 def typical_gap(eyes: Float[np.ndarray, "photo 3"]) -> float:
-    """Distance to the nearest other camera, in the middle, at least a fiftieth of their spread."""
+    """Median distance to the nearest other camera, at least a fiftieth of their spread."""
     apart = np.linalg.norm(eyes[:, None] - eyes, axis=-1)
     np.fill_diagonal(apart, np.inf)
     return float(max(2 * np.median(apart.min(1)), 0.02 * np.ptp(eyes, axis=0).max()))
 
 
 def ramp_at(share: float) -> str:
-    """Dark and cool for the first, bright and warm for the last, without the pale end, which does not show on paper."""
+    """Colour of the ramp, without its pale end, which is invisible on paper: dark first, bright last."""
     place = torch.tensor(1 - share * (len(RAMP) - 2) / (len(RAMP) - 1), dtype=torch.float64)
     return f"#{bytes((255 * ramp(place)).round().byte().tolist()).hex()}"
 

@@ -1,4 +1,4 @@
-"""A scene's folder: photographs, COLMAP's model and transforms.json, as other programs expect them."""
+"""A scene's folder: photographs, COLMAP's model and transforms.json, in other programs' layout."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ NAMES = {
 
 
 def claim(folder: Path, sources: Sequence[Path]) -> Path:
-    """Make or recognise the folder of these photographs' scene; gives the folder to work in. Raises LumigraphError for
-    a folder that holds something else."""
+    """Create or recognise the folder of these photographs' scene. Returns the working folder. Raises LumigraphError for
+    a folder with other contents."""
     work, wanted = folder / WORK_FOLDER, [str(path.resolve()) for path in sources]
     for path in sources:
         if (path / WORK_FOLDER / SOURCES_FILE).is_file():
@@ -72,14 +72,14 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
 
 
 def claim_results(folder: Path) -> None:
-    """Raise LumigraphError unless everything that a capture results in may be written into its folder."""
+    """Raise LumigraphError unless all results of a capture may be written into its folder."""
     for name in WRITTEN_FILES:
         claim_file(folder / name, "capture")
     claim_folder(folder / "sparse", "capture")
 
 
 def copy_photographs(photos: Sequence[Photo], images: Path, track: Track) -> None:
-    """Copies with their sources' dates; those that are there already stay, and other copies that were made go."""
+    """Copy photographs with their dates; existing copies stay, obsolete copies are deleted."""
     remove_copies(images, {photo.name for photo in photos})
     for photo in track(photos, "Copying photographs", len(photos)):
         target = images / photo.name
@@ -89,16 +89,16 @@ def copy_photographs(photos: Sequence[Photo], images: Path, track: Track) -> Non
 
 
 def remove_copies(folder: Path, kept: Container[str]) -> None:
-    """Delete what an earlier capture has put into a folder, but not names to keep, nor what others have put there."""
+    """Delete an earlier capture's files in a folder, except names to keep and others' files."""
     for name in list_images(folder):
         if name not in kept and is_ours(folder / name, "capture"):
             remove(folder / name)
 
 
 def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | None:
-    """Masks as COLMAP reads them: image.jpg.png, black and white, of the photographs' size. None where there are none.
+    """Write masks for COLMAP: image.jpg.png, black and white, of the photographs' size. None without masks.
 
-    Raises LumigraphError for a mask that has not its photograph's shape.
+    Raises LumigraphError for a mask of another aspect ratio than its photograph.
     """
     having = [photo for photo in photos if photo.mask is not None]
     if not having:
@@ -126,10 +126,10 @@ def stamp(path: Path) -> tuple[int, int]:
 def write_model(
     folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo], z_up: bool, moving: bool = False
 ) -> None:
-    """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`.
+    """Write sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`.
 
-    z_up:   whether +z is known to be up, by more than how cameras were held
-    moving: whether frames get the times of their photographs, in seconds from the first on
+    z_up:   whether +z is reliably up, not only by camera orientations
+    moving: whether to write times of frames, in seconds from the first on
     """
     with replacing_folder(folder / "sparse", "capture") as partial:
         (partial / "0").mkdir(parents=True)

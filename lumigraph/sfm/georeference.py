@@ -1,4 +1,6 @@
-"""Up direction, metric scale and position on Earth from GPS; without it, only up, from how cameras are held."""
+"""Georeferencing by GPS: up direction, metric scale and position on Earth; without GPS only up, from camera
+orientations.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +27,10 @@ MIN_INLIER_SHARE = 0.5  # of the positions
 class Georeference:
     """Georeference of a model by GPS.
 
-    new_from_old: the similarity that turns the model to metres east, north and up of the origin; None where GPS cannot
-    say:          what was done, or why not, in a sentence
+    new_from_old: similarity of the model to metres east, north and up of the origin; None if undetermined
+    say:          sentence on the result, or on the reason for none
     origin:       latitude and longitude in degrees, altitude in metres
-    error:        typical distance between cameras and what GPS says, metres
+    error:        typical distance between cameras and GPS positions, metres
     """
 
     new_from_old: pycolmap.Sim3d | None
@@ -38,7 +40,7 @@ class Georeference:
 
 
 def gps_positions(photos: Sequence[Photo]) -> Float[np.ndarray, "photo 3"]:
-    """Metres east, north and up of where most photographs were taken; NaN for those whose file does not say."""
+    """Metres east, north and up of the median position; NaN for photographs without GPS."""
     return local(photos, middle(photos)) if any(p.gps for p in photos) else np.full((len(photos), 3), np.nan)
 
 
@@ -95,7 +97,7 @@ def georeference(centres: Float[np.ndarray, "photo 3"], photos: Sequence[Photo])
 def upright(
     poses: Float[np.ndarray, "photo 3 4"], points: Float[np.ndarray, "point 3"] | None = None
 ) -> pycolmap.Sim3d:
-    """The rotation that brings up to +z, as far as the way that people hold cameras tells; poses: camera-to-world."""
+    """Rotation to +z up from camera orientations. poses: camera-to-world"""
     count = len(poses)
     lens = Pinhole(torch.ones(count, 2), torch.ones(count, 2))
     up = common_up(Camera(torch.from_numpy(poses).float(), lens, torch.ones(count, 2, dtype=torch.long)), points)

@@ -24,9 +24,9 @@ MIN_SAME_SIZE_SHARE = 0.5  # of the photographs of unknown device; from it on on
 def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "auto") -> list[list[Photo]]:
     """Photographs in groups that share a lens.
 
-    auto: those of one device and size do. Where files name no device, a video's frames do, and photographs if most have
-    one size; pictures out of many hands seldom do.
-    Raises LumigraphError where one lens is asked for and sizes differ, and for a panorama that is not 2:1.
+    auto: by device and size. If files name no device, frames of a video share one, and photographs if most have one
+    size; collections from many cameras seldom do.
+    Raises LumigraphError where one lens is requested and sizes differ, and for a panorama that is not 2:1.
     """
     if sharing in ("single", "spherical") and len({p.size for p in photos}) > 1:
         raise LumigraphError(
@@ -59,7 +59,7 @@ def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "a
 
 
 def prior(group: Sequence[Photo]) -> tuple[float, bool]:
-    """The focal length in pixels to begin with, and whether it is more than a guess: the median of what files say."""
+    """Initial focal length in pixels, and whether it is reliable: the median of the files' values."""
     known = sorted(p.focal for p in group if p.focal)
     return (known[len(known) // 2], True) if known else (DEFAULT_FOCAL * max(group[0].size), False)
 

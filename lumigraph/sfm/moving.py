@@ -1,4 +1,4 @@
-"""Left out of matching: what moves, by the residuals of its matches against epipolar geometry."""
+"""Removal of moving features from matching, by epipolar residuals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_MOVING_SHARE = 0.6  # of the features; above it nothing is still enough to f
 
 @dataclass(frozen=True)
 class MovingFeatures:
-    """Features found to move, of those that could be judged."""
+    """Number of features found to move, among those with enough matches."""
 
     moving: int
     judged: int
@@ -35,11 +35,11 @@ class MovingFeatures:
 
 
 def leave_out_moving(database: Path) -> MovingFeatures:
-    """Delete matches of features that move from the verified pairs of a database.
+    """Delete matches of moving features from the verified pairs of a database.
 
-    A match is an inlier of its pair where both features lie within COLMAP's error of each other's epipolar line. The
-    pair's geometry is that of most matches, of what stands still. A feature that is matched in MIN_PAIRS pairs or more,
-    and an inlier of fewer than half of them, moves.
+    A match is an inlier of its pair if both features lie within COLMAP's error of each other's epipolar line. The
+    pair's geometry is that of most matches, the static ones. A feature with matches in MIN_PAIRS pairs or more, and an
+    inlier of fewer than half of them, moves.
     """
     with closing(pycolmap.Database.open(database)) as opened:
         count = {image.image_id: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
@@ -69,7 +69,7 @@ def leave_out_moving(database: Path) -> MovingFeatures:
 
 
 def check_still(source: str, found: MovingFeatures) -> None:
-    """Raise LumigraphError where so much moves that no camera can be found by the rest."""
+    """Raise LumigraphError if too few static features remain to find cameras."""
     if found.moving > MAX_MOVING_SHARE * found.judged:
         raise LumigraphError(
             f"{source}: {100 * found.moving / found.judged:.0f} % of what is seen again moves, so nothing is still "
@@ -78,7 +78,7 @@ def check_still(source: str, found: MovingFeatures) -> None:
 
 
 def check_times(source: str, photos: Sequence[Photo]) -> None:
-    """Raise LumigraphError where photographs lack the time that a moving scene needs."""
+    """Raise LumigraphError for photographs without the time that a dynamic scene needs."""
     if without := [photo.name for photo in photos if photo.time is None]:
         raise LumigraphError(
             f"{source}: {counted(len(without), 'photograph')} have no time of exposure, {without[0]} first; name a "

@@ -1,4 +1,4 @@
-"""Pairs of photographs to match: all, neighbours in time, or those that look alike."""
+"""Pairs of photographs to match: all, neighbours in time, or similar ones."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def sequential(count: int, neighbours: int = SEQUENTIAL_NEIGHBOURS) -> set[Pair]
 
 
 def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1) -> set[Pair]:
-    """Each photograph with the `most` that are most like it, among those at least `apart` places away.
+    """Pairs of each photograph with the `most` most similar ones, among those at least `apart` places away.
 
     vectors: of each, see `aggregated`
     """
@@ -69,10 +69,10 @@ def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1)
 def aggregated(
     descriptors: Callable[[int], np.ndarray], count: int, seed: int = 0
 ) -> Float[np.ndarray, "photo number"]:
-    """A vector for each photograph, by its features; the product of two is how alike they are, 1 at most.
+    """Global descriptor of each photograph (VLAD); the product of two is their similarity, 1 at most.
 
-    VLAD (Jégou 2010) over a vocabulary that is learnt from the photographs themselves. For each word the residuals of
-    the descriptors nearest to it are added up; each sum is normalised (Arandjelović 2013), then the whole.
+    VLAD (Jégou 2010) over a vocabulary learnt from the photographs themselves: sums over each word of the residuals of
+    its nearest descriptors; each sum is normalised (Arandjelović 2013), then the whole.
     descriptors: reads those of a photograph, (feature, 128); called twice for each
     """
 
@@ -97,7 +97,7 @@ def aggregated(
 
 
 def near(positions: Float[np.ndarray, "photo 3"], most: int = SEQUENTIAL_NEIGHBOURS) -> set[Pair]:
-    """Each photograph with the `most` taken nearest to it; NaN where unknown."""
+    """Pairs of each photograph with the `most` nearest ones; NaN for unknown positions."""
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
         return set()
@@ -109,10 +109,10 @@ def near(positions: Float[np.ndarray, "photo 3"], most: int = SEQUENTIAL_NEIGHBO
 def choose_pairs(
     matching: Matching, names: Sequence[str], database: Path, positions: Float[np.ndarray, "photo 3"]
 ) -> list[Pair]:
-    """The pairs to compare, by number, in an order that asks for few photographs' features at a time.
+    """Pairs to match, by number, in an order that needs few photographs' features at a time.
 
     names:     in order of exposure or by name
-    database:  COLMAP's, with features; looked into only where likeness matters
+    database:  COLMAP's, with features; read only for similarity
     positions: by GPS, in metres; NaN where unknown
     """
     count = len(names)

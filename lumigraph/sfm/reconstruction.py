@@ -1,4 +1,4 @@
-"""Reconstruction: from bare photographs or a video to a folder with poses, stage by stage."""
+"""Reconstruction: from photographs or a video to a folder with poses, in stages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 from collections.abc import Container, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -53,8 +53,9 @@ from .folder import (
     write_model,
 )
 from .georeference import Georeference, georeference, gps_positions, upright
-from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, Sharing, group_by_lens, prior, write_database
+from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, SPHERE, group_by_lens, prior, write_database
 from .moving import MovingFeatures, check_still, check_times, leave_out_moving
+from .options import MotionOptions
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .photos import Intake, Photo, gather
 from .photos.photo import Track, untracked
@@ -65,7 +66,6 @@ from .stitching import stitch
 MIN_VIEWS = 3  # photographs of a model
 MIN_PARALLAX = 0.3  # degrees, median over points: below it photographs that turned have no depth
 BLACK = -10.5  # mean log2 of the luminance, below which a photograph is black: 2 of 255
-MAX_SIDE = 1600  # pixels of the longer side for feature detection
 MAX_FEATURES = 8192
 FEATURE_BUDGETS = ((80, MAX_FEATURES), (200, 4096))  # most photographs, and features of each; matching is quadratic
 MIN_FEATURE_BUDGET = 2048
@@ -85,36 +85,16 @@ UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at
 OUTPUT_VERSION = 4  # another number makes all outputs be written again
 
 
-@dataclass(frozen=True)
-class MotionOptions:
-    """Options of a reconstruction.
-
-    frames:   how many to take of a video; None: by its length
-    mapper:   one photograph after the other, or all at once
-    matching: which photographs are compared; auto: neighbours for a video, all up to 80 photographs, else those alike
-    camera:   which photographs share a lens; spherical: they are panoramas of 360 by 180 degrees
-    max_size: longer side in pixels to which photographs are reduced when details are looked for
-    moving:   whether things move: they are left out of matching, and each photograph gets its time
-    """
-
-    frames: int | None = None
-    mapper: Literal["incremental", "global"] = "incremental"
-    matching: Matching = "auto"
-    camera: Sharing = "auto"
-    max_size: int = MAX_SIDE
-    moving: bool = False
-
-
 def reconstruct(
     sources: Sequence[Path], folder: Path, options: MotionOptions | None = None, track: Track = untracked
 ) -> dict[str, Any]:
-    """Find the cameras of bare photographs and write a scene's folder; gives what its capture.json holds.
+    """Find the cameras of photographs and write a scene's folder. Returns the contents of its capture.json.
 
     sources: a folder, a list of image files, or one video; they are only read
-    folder:  where the scene goes: images, sparse/0, transforms.json, points.ply, capture.json, two pictures, and a
-             folder `work`, not needed afterwards. What lies there of an earlier call for the same sources is used
-    Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else or
-    that another process works in.
+    folder:  output: images, sparse/0, transforms.json, points.ply, capture.json, two pictures, and a folder `work`, not
+             needed afterwards. Results of an earlier call for the same sources are reused
+    Raises LumigraphError if there are too few photographs, if none can be registered, and for a folder with other
+    contents or in use by another process.
     """
     options = options or MotionOptions()
     check(options)
@@ -164,7 +144,7 @@ def check(options: MotionOptions) -> None:
 
 
 def with_safe_names(intake: Intake) -> Intake:
-    """The intake with names that COLMAP can hold in its lists."""
+    """The intake with names that COLMAP's lists allow."""
     new: dict[str, str] = {}
     for photo in intake.photos:
         name = UNSAFE_CHARACTERS.sub("_", photo.name)
@@ -181,14 +161,14 @@ def with_safe_names(intake: Intake) -> Intake:
 
 
 def intake_identity(intake: Intake) -> list[Any]:
-    """All of the intake that the result depends on, as JSON."""
+    """Everything in the intake that the result depends on, as JSON."""
     photos = [[p.name, *stamp(p.path), p.device, p.focal, p.gps, round(p.brightness, 3)] for p in intake.photos]
     raw = [asdict(Remembered(intake.raw))] if intake.raw else []
     return [photos, intake.in_order, intake.blurred, intake.duplicates, intake.unreadable, *raw]
 
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
-    """Result of an earlier call that finished with the same inputs; None if there is none."""
+    """Result of an earlier finished call with the same inputs, or None."""
     needed = ("transforms.json", "sparse/0/images.bin", "images", RESULT_FILE)
     if not all((folder / name).exists() for name in needed):
         return None
@@ -198,7 +178,7 @@ def finished(folder: Path, key: str) -> dict[str, Any] | None:
 
 @dataclass
 class Reconstruction:
-    """One run through the stages: copies, features, matching, mapping, writing."""
+    """One run of all stages: copies, features, matching, mapping, writing."""
 
     sources: Sequence[Path]
     folder: Path
@@ -229,7 +209,7 @@ class Reconstruction:
         self.keys = self.make_keys()
 
     def fit(self, free: int) -> None:
-        """Choose numbers that fit into so many free bytes, and announce memory and time."""
+        """Choose sizes that fit into free memory (bytes), and print memory and time."""
         asked = demand_of(self.photos, self.matching, self.max_size, self.features)
         chosen, cuts = fitted(asked, free)
         self.max_size, self.features = chosen.max_size, chosen.features
@@ -238,7 +218,7 @@ class Reconstruction:
             tell(sentence)
 
     def make_keys(self) -> dict[str, str]:
-        """For each stage a name of everything that its result depends on."""
+        """Hash of the inputs of each stage."""
         features = key_of(
             pycolmap.__version__,
             [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
@@ -280,8 +260,8 @@ class Reconstruction:
     def detect(
         self, description: str, database: Path, names: list[str], max_size: int, features: int, contrast: float
     ) -> None:
-        """Detect features of photographs that have none in a database, as large as memory allows; contrast: of COLMAP's
-        threshold."""
+        """Detect features of photographs without any in a database, at the largest size that memory allows. contrast:
+        factor on COLMAP's threshold"""
         asked = replace(demand_of(self.photos, self.matching, max_size, features), count=len(names))
         chosen, _ = fitted(asked, free_memory())
         area = PIXELS_PER_FEATURE * features
@@ -312,7 +292,7 @@ class Reconstruction:
             self.match(self.database)
 
     def leave_out(self, key: str) -> None:
-        """Leave what moves out of the matches, if the capture is of a moving scene."""
+        """Delete matches of moving features, for a dynamic scene."""
         if not self.options.moving:
             return
         if not self.stages.is_done("moving", key):
@@ -321,11 +301,11 @@ class Reconstruction:
         check_still(self.intake.source, self.found_to_move())
 
     def found_to_move(self) -> MovingFeatures:
-        """Features that `leave_out` has found to move."""
+        """Moving features found by `leave_out`."""
         return typed(MovingFeatures, read_json(self.work / MOVING_FILE), self.work / MOVING_FILE)
 
     def match(self, database: Path, among: Container[str] | None = None) -> None:
-        """Match the chosen pairs; with `among`, those that have one of these photographs."""
+        """Match the chosen pairs; with `among`, those that include one of these photographs."""
         with counting("Choosing pairs"):
             pairs = choose_pairs(self.matching, self.names, database, gps_positions(self.photos))
         named = [(self.names[i], self.names[j]) for i, j in pairs]
@@ -337,11 +317,11 @@ class Reconstruction:
         self.colmap(description, len(named), database, stage="matching", pairs=str(listed), since=since)
 
     def place(self, key: str) -> None:
-        """Place photographs by the mapper that was asked for. Where many matches contradict its model, or it finds
-        none, try the other one and other first pairs, until a model agrees. The one that most matches confirm is kept.
+        """Register photographs by the requested mapper. If many matches contradict its model, or it finds none, try the
+        other mapper and other initial pairs, until a model agrees. The one that most matches confirm is kept.
 
-        One by one needs a first pair that tells depth, which a walk straight ahead may lack, and a poor one leads to a
-        wrong model; all at once needs focal lengths and many pairs.
+        Incremental mapping needs an initial pair with parallax, which a walk straight ahead may lack, and a poor one
+        leads to a wrong model; global mapping needs focal lengths and many pairs.
         """
         if self.stages.is_done("mapping", key) and self.models.is_dir() and largest(self.models) >= MIN_VIEWS:
             return
@@ -369,15 +349,15 @@ class Reconstruction:
                     break
 
     def agreement(self, models: Path, matches: Matches) -> Agreement:
-        """Agreement of the largest of some models with the matches. Panoramas are taken as they are."""
+        """Agreement of the largest model with the matches. Panoramas count as agreeing."""
         found = read_models(models)
         if not found or found[0].num_reg_images() < MIN_VIEWS:
             return Agreement(matches=1, confirmed=0)
         return Agreement(0, 0) if self.spherical else agreement(found[0], self.database, matches)
 
     def unfold(self, key: str) -> None:
-        """If the model leaps between neighbours, make another from what near neighbours share alone. Far ones that
-        merely look alike, as the two sides of a can do, fold a model."""
+        """If the model jumps between neighbours, rebuild it from matches of near neighbours alone. Far photographs that
+        merely look similar, as two sides of a can do, fold a model."""
         if self.stages.is_done("unfolding", key):
             return
         with self.stages.working("unfolding", key):
@@ -392,10 +372,10 @@ class Reconstruction:
                     self.map(self.near, partial, "incremental")
 
     def complete(self, key: str) -> None:
-        """Join models that stand apart, then place the photographs that were left out in a second pass.
+        """Join separate models, then register the remaining photographs in a second pass.
 
-        Their features are detected at the size and the contrast that the first pass has left out, they are compared
-        once more, and mapping continues from the largest model.
+        Their features are detected at the sizes and contrasts that the first pass left out, they are matched again, and
+        mapping continues from the largest model.
         """
         if self.stages.is_done("completing", key) and self.completed.is_dir():
             return
@@ -421,9 +401,9 @@ class Reconstruction:
                 self.map(self.second, again, "incremental", best)
 
     def match_again(self, left: set[str], database: Path) -> None:
-        """Make the database of the second pass: other features of the photographs without a place, and matches.
+        """Create the database of the second pass: new features of the unregistered photographs, and matches.
 
-        Photographs that had as many features as there may be, at their full size, keep theirs."""
+        Photographs that had the maximum number of features, at full size, keep theirs."""
         copy_database(database, self.second)
         found = read_matches(database).features
         full = {p.name for p in self.photos if max(p.size) <= self.max_size and found[p.name] >= MAX_FEATURES}
@@ -437,7 +417,7 @@ class Reconstruction:
             leave_out_moving(self.second)
 
     def refine(self, key: str) -> None:
-        """The lens with all its coefficients, where photographs left out of its adjustment agree better."""
+        """Refine the lens with all its coefficients, if that reduces the error of held-out points."""
         if self.stages.is_done("lenses", key) and self.refined.is_dir():
             return
         with self.stages.working("lenses", key):
@@ -502,7 +482,7 @@ class Reconstruction:
                 pass
 
     def write(self, key: str) -> dict[str, Any]:
-        """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
+        """Write the largest model as the scene. capture.json is last: if it exists, the rest is complete."""
         database = self.second if self.second.is_file() else self.database
         matches = read_matches(database)
         found, told, chosen = self.choose(matches)
@@ -531,7 +511,7 @@ class Reconstruction:
             )
         if place is not None and not known:
             told.append(place.say)
-        diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
+        diagnosis = replace(diagnosis, warnings=[*self.intake.remarks, *diagnosis.warnings, *told])
         written, photos = model, self.photos
         if self.spherical:
             written, photos = flat_views(model, photos, self.folder, self.masks, self.track)
@@ -548,7 +528,7 @@ class Reconstruction:
         return read_json(self.folder / RESULT_FILE)
 
     def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
-        """Turn a model so that +z is up; by GPS, which also gives metres and the origin, where that can tell."""
+        """Rotate a model to +z up; by GPS if possible, which also gives metres and the origin."""
         poses = poses_of(model)
         photos = [photo for photo in self.photos if photo.name in poses]
         stacked = np.stack([poses[photo.name] for photo in photos])
@@ -578,10 +558,12 @@ class Reconstruction:
             "key": key,
             "source": self.intake.source,
             "sources": [str(path.resolve()) for path in self.sources],
-            "options": asdict(self.options) | {"matching": self.matching, "features": self.features},
+            "options": {x.name: getattr(self.options, x.name) for x in fields(MotionOptions)}
+            | {"matching": self.matching, "features": self.features},
             **asdict(diagnosis),
             "cameras": cameras,
             "gps": gps,
+            "film": self.intake.film and asdict(self.intake.film) | {"tags": str(self.intake.film)},
             "seconds": self.stages.seconds(),
         }
 
@@ -593,15 +575,15 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
 
 
 def made_otherwise(first: float, mapper: str, seed: int, share: float) -> str:
-    """Sentence on a model that was made in another way than was asked for. first, share: share of the matches that the
-    first model and this one confirm"""
+    """Sentence on a model made by other means than requested. first, share: share of the matches confirmed by the first
+    model and by this one"""
     why = f"the first model contradicted {1 - first:.0%} of the matches" if first else "there was no model at first"
     how = f"{WAYS[mapper]}, from another pair" if seed else WAYS[mapper]
     return f"{why}, so photographs were placed {how}; this one contradicts {1 - share:.0%}"
 
 
 def registered(model: pycolmap.Reconstruction) -> set[str]:
-    """Names of the photographs whose cameras a model has."""
+    """Names of the registered photographs of a model."""
     return {image.name for image in model.images.values() if image.has_pose}
 
 
@@ -611,7 +593,7 @@ def largest(folder: Path) -> int:
 
 
 def remove_database(path: Path) -> None:
-    """Delete a database and what SQLite keeps beside it."""
+    """Delete a database and SQLite's files beside it."""
     for ending in ("", "-journal", "-wal", "-shm"):
         remove(path.with_name(path.name + ending))
 
@@ -639,7 +621,7 @@ def delete_features(path: Path, names: Container[str]) -> None:
 
 
 def keep_near(path: Path, names: Sequence[str], reach: int) -> None:
-    """Delete the matches of photographs that are more than so many places apart."""
+    """Delete the matches between photographs more than `reach` places apart."""
     place = {name: i for i, name in enumerate(names)}
     shared = read_matches(path).shared
     with closing(pycolmap.Database.open(path)) as database:
@@ -665,7 +647,7 @@ def also_repeated(intake: Intake) -> str:
 
 
 def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches, panorama: Path | None = None) -> str:
-    """Why no model came about, in a sentence. panorama: of all of them, made instead"""
+    """Sentence on the reason for no model. panorama: of all of them, made instead"""
     poor = sum(matches.features.get(photo.name, 0) < MIN_FEATURES for photo in photos)
     if poor > len(photos) / 2:
         why = f"{poor} of {len(photos)} show too few details, being blank, dark or out of focus"

@@ -1,4 +1,4 @@
-"""Rigs: a folder of videos, one for each camera that stands still, filmed at once, becomes a scene with times."""
+"""Rigs: a folder of synchronised videos of static cameras becomes a scene with times."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ import numpy as np
 from ..errors import LumigraphError
 from ..files import claim_folder, is_file, read_json, replacing_folder, write_json
 from .folder import POINTS_FILE
+from .options import MotionOptions
 from .photos.copies import save
+from .photos.film import Tags, is_video, opened, tags_of
 from .photos.photo import Track, untracked
-from .photos.video import duration, is_video, opened, picked, speed, upright
-from .reconstruction import MIN_VIEWS, MotionOptions, reconstruct
+from .photos.video import picked
+from .reconstruction import MIN_VIEWS, reconstruct
 
 CLOCKS_FILE = "clocks.json"  # seconds after the first camera at which each video begins, by its name
 MAX_MOMENTS = 120  # taken by default
@@ -25,7 +27,7 @@ SAME_RATE, SAME_LENGTH = 0.01, 0.05  # relative, and seconds: differences that a
 
 @dataclass(frozen=True)
 class RigVideo:
-    """A video of a rig. begin: seconds at which it begins, on the clock of all;  rate: frames per second"""
+    """A video of a rig. begin: its start in seconds, on the common clock;  rate: frames per second"""
 
     path: Path
     begin: float
@@ -37,13 +39,13 @@ class RigVideo:
         return self.begin + self.seconds
 
     def numbers(self, moments: Sequence[float]) -> list[int]:
-        """The frame nearest to each moment."""
+        """Number of the nearest frame at each time."""
         last = max(round(self.seconds * self.rate) - 1, 0)
         return [min(max(round((moment - self.begin) * self.rate), 0), last) for moment in moments]
 
 
 def is_rig(path: Path) -> bool:
-    """True for a folder that has several videos."""
+    """True for a folder with several videos."""
     return path.is_dir() and len(list_videos(path)) > 1
 
 
@@ -52,7 +54,7 @@ def list_videos(folder: Path) -> list[Path]:
 
 
 def films_of(folder: Path) -> list[RigVideo]:
-    """The videos of a folder, with their clocks. Raises LumigraphError for clocks that name none of them."""
+    """The videos of a folder, with their clocks. Raises LumigraphError for clocks without matching names."""
     clocks: dict[str, float] = {}
     if is_file(folder / CLOCKS_FILE):
         clocks = read_json(folder / CLOCKS_FILE, dict[str, float])
@@ -62,14 +64,14 @@ def films_of(folder: Path) -> list[RigVideo]:
     found = []
     for path in videos:
         with opened(path) as film:
-            found.append(RigVideo(path, clocks.get(path.name, 0.0), duration(film), speed(film)))
+            found.append(RigVideo(path, clocks.get(path.name, 0.0), film.seconds, film.rate))
     return found
 
 
 def common_moments(films: Sequence[RigVideo], count: int | None) -> tuple[list[float], list[str]]:
-    """Moments that all videos show, evenly spread, and what was done about lengths and rates that differ.
+    """Times common to all videos, evenly spaced, and remarks on lengths and rates that differ.
 
-    Raises LumigraphError where there are none.
+    Raises LumigraphError if there are none.
     """
     begin, end = max(film.begin for film in films), min(film.end for film in films)
     if end <= begin:
@@ -103,17 +105,20 @@ def capture_rig(
     source: Path, folder: Path, options: MotionOptions, track: Track = untracked
 ) -> tuple[dict[str, Any], list[str]]:
     """Write a scene of a rig's videos: images/CAMERA/0000.jpg and transforms.json with times. Returns numbers of
-    cameras and moments, and remarks.
+    cameras and times, and remarks.
 
-    Poses are those of a transforms.json beside the videos, whose frames name them, or found by the first moment.
+    Poses are those of a transforms.json beside the videos, whose frames name them, or reconstructed at the first time.
     """
     films = films_of(source)
     moments, said = common_moments(films, options.frames)
     claim_folder(folder, "capture")
     folder.mkdir(parents=True, exist_ok=True)
     with replacing_folder(folder / "images", "capture") as partial:
-        for film in track(films, "Taking frames", len(films)):
-            take(film, moments, partial / film.path.stem)
+        tags = [tags_of(film.path) for film in films]
+        said += [f"{film.path.name}: {own.fault}" for film, own in zip(films, tags, strict=True) if own.fault]
+        brightest = max(one.peak for one in tags)  # one tone curve for all cameras
+        for film, own in track(list(zip(films, tags, strict=True)), "Taking frames", len(films)):
+            take(film, moments, partial / film.path.stem, replace(own, peak=brightest))
     lens: dict[str, Any] = {}
     poses, found = given_poses(source, films), ""
     if poses is None:
@@ -136,11 +141,12 @@ def step_of(moments: Sequence[float]) -> str:
     return f"{1000 * (moments[1] - moments[0]):.0f} ms apart" if len(moments) > 1 else "of one frame"
 
 
-def take(film: RigVideo, moments: Sequence[float], folder: Path) -> None:
-    """Write the frame of each moment. Raises LumigraphError where the video ends before its last one."""
+def take(film: RigVideo, moments: Sequence[float], folder: Path, tags: Tags) -> None:
+    """Write the frame of each moment. tags: as in `opened`. Raises LumigraphError where the video ends before its last
+    one."""
     folder.mkdir(parents=True)
     numbers = film.numbers(moments)
-    pictures = {number: upright(frame) for number, frame, _ in picked(film.path, sorted(set(numbers)))}
+    pictures = {number: picture for number, picture, _ in picked(film.path, sorted(set(numbers)), tags)}
     if missing := [number for number in numbers if number not in pictures]:
         raise LumigraphError(f"{film.path} has no frame {missing[0]}, which its length promises; record it again")
     for i, number in enumerate(numbers):
@@ -148,8 +154,8 @@ def take(film: RigVideo, moments: Sequence[float], folder: Path) -> None:
 
 
 def given_poses(source: Path, films: Sequence[RigVideo]) -> dict[str, dict[str, Any]] | None:
-    """Frames of the transforms.json beside videos, by the videos' names without endings, each with the lens that the
-    file gives for all; None without one. Raises LumigraphError where a video has no pose."""
+    """Frames of the transforms.json beside videos, by the videos' names without suffixes, each with the file's common
+    lens; None without one. Raises LumigraphError for a video without a pose."""
     path = source / "transforms.json"
     if not is_file(path):
         return None
@@ -164,7 +170,7 @@ def given_poses(source: Path, films: Sequence[RigVideo]) -> dict[str, dict[str, 
 def found_poses(
     films: Sequence[RigVideo], folder: Path, options: MotionOptions, track: Track
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Poses by the pictures of the first moment, and the lens that all share."""
+    """Poses reconstructed from the pictures at the first time, and the common lens."""
     if len(films) < MIN_VIEWS:
         raise LumigraphError(
             f"{films[0].path.parent} has {len(films)} videos, and poses of fewer than {MIN_VIEWS} cameras cannot be "

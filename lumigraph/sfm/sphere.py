@@ -1,4 +1,4 @@
-"""Flat views of 360-degree panoramas whose cameras were found, so that every method learns from them."""
+"""Perspective views of 360-degree panoramas with poses, so that every method can train on them."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ TURNS = {
 
 
 def side_of(width: int) -> int:
-    """Pixels of a view's side, as fine in its middle as a panorama of that width."""
+    """Side of a view in pixels, at the panorama's resolution in its centre."""
     return round(width / math.pi)
 
 
 def views_of(photo: Photo) -> dict[str, str]:
-    """Names of a panorama's views, by the name of their direction."""
+    """Names of a panorama's views, by direction."""
     return {view: f"{stem(photo.name)}_{view}.jpg" for view in TURNS}
 
 
 def flat_views(
     model: pycolmap.Reconstruction, photos: Sequence[Photo], scene: Path, masks: Path | None, track: Track
 ) -> tuple[pycolmap.Reconstruction, list[Photo]]:
-    """A model of panoramas as a model of flat views of 90 degrees, and the views, whose pictures and masks are written
-    to a scene's folder.
+    """Convert a model of panoramas to a model of perspective views of 90 degrees; write their pictures and masks to a
+    scene's folder.
 
-    masks: those of the panoramas, as COLMAP reads them
+    masks: those of the panoramas, in COLMAP's layout
     """
     placed = {image.name for image in model.images.values() if image.has_pose}
     photos = [photo for photo in photos if photo.name in placed]
@@ -73,7 +73,7 @@ def flat_views(
 
 
 def cut(path: Path, mode: str) -> dict[str, Image.Image]:
-    """The flat views of a panorama, read between its pixels. mode: L or RGB"""
+    """Perspective views of a panorama, interpolated. mode: L or RGB"""
     with Image.open(path) as image:
         pixels = torch.from_numpy(np.array(image.convert(mode))).float()
     height, width = pixels.shape[:2]
@@ -88,7 +88,7 @@ def cut(path: Path, mode: str) -> dict[str, Image.Image]:
 
 @lru_cache(len(TURNS))
 def directions(view: str, width: int, height: int) -> Float[Tensor, "1 side side 2"]:
-    """Place of each pixel of a view, from -1 to 1, on a panorama with one more column at either end."""
+    """Coordinates of each pixel of a view, from -1 to 1, on a panorama padded by one column on both sides."""
     side = side_of(width)
     step = (torch.arange(side) + 0.5) * 2 / side - 1
     y, x = torch.meshgrid(step, step, indexing="ij")
@@ -98,7 +98,7 @@ def directions(view: str, width: int, height: int) -> Float[Tensor, "1 side side
 
 
 def flattened(model: pycolmap.Reconstruction, photos: Sequence[Photo]) -> pycolmap.Reconstruction:
-    """The cameras, details and points of a model of panoramas, through the lens that all flat views share."""
+    """The cameras, features and points of a model of panoramas, with the views' common lens."""
     flat, width = pycolmap.Reconstruction(), photos[0].size[0]
     side, lens = side_of(width), Equirectangular(torch.tensor([photos[0].size], dtype=torch.float32))
     flat.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, MODEL, side / 2, side, side))

@@ -23,7 +23,7 @@ DONE = "done\n"  # the worker's line at the end of a job
 
 
 def key_of(*parts: Any) -> str:
-    """A short name for values of JSON: the same values give the same name, others another one."""
+    """Short hash of JSON values."""
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
@@ -37,7 +37,7 @@ class StageMark:
 
 
 class Stages:
-    """Marks in a folder's stages.json: which stages were begun and done, from what, and in how many seconds."""
+    """Marks in a folder's stages.json: stages begun and done, with hashes of their inputs and durations."""
 
     def __init__(self, folder: Path):
         self.path = folder / "stages.json"
@@ -53,12 +53,12 @@ class Stages:
         return stage in self.marks and self.marks[stage].key == key
 
     def seconds(self) -> dict[str, float]:
-        """Seconds that each stage took, without interruptions."""
+        """Duration of each stage, without interruptions."""
         return {stage: mark.seconds for stage, mark in self.marks.items()}
 
     @contextmanager
     def working(self, stage: str, key: str) -> Iterator[None]:
-        """Mark a stage as begun, and once the block ends well, as done."""
+        """Mark a stage as begun, and after the block without an exception as done."""
         spent = self.marks[stage].seconds if self.was_begun(stage, key) else 0.0
         self.mark(stage, key, False, spent)
         begun = time.perf_counter()
@@ -74,8 +74,8 @@ class Stages:
         write_json(self.path, {name: asdict(mark) for name, mark in self.marks.items()}, ours=True)
 
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
-        """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does. Leaving
-        the iterator early ends the work. Raises LumigraphError if COLMAP gives up."""
+        """Run a job of `worker.py`; yields the number of finished items out of `total`. Closing the generator early
+        ends the work. Raises LumigraphError if COLMAP fails."""
         worker = self.worker = self.worker or start_worker(self.log)
         assert worker.stdin and worker.stdout
         told = 0
@@ -98,7 +98,7 @@ class Stages:
         yield from range(told + 1, total + 1)
 
     def close(self) -> None:
-        """End the worker, whatever it is doing. Another job starts one again."""
+        """End the worker. Another job starts a new one."""
         if self.worker:
             self.worker.kill()
             self.worker.wait()

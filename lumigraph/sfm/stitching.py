@@ -1,4 +1,4 @@
-"""Panorama of photographs that were taken from one place: there is no depth to find, but all that was seen.
+"""Panorama of photographs from a single position, which have no parallax.
 
 Photographs differ by a rotation, K R K⁻¹ between their pixels (Szeliski 2006, "Image Alignment and Stitching"). The
 rotations follow from the strongest pairs and are then adjusted together with the focal length.
@@ -36,7 +36,7 @@ JPEG_QUALITY = 92
 
 @dataclass(frozen=True)
 class TurnedPair:
-    """Two photographs by their numbers, the pixels of what both show, and the homography between them."""
+    """Two photographs by their numbers, pixels of their matches, and their homography."""
 
     first: int
     second: int
@@ -45,8 +45,8 @@ class TurnedPair:
 
 
 def stitch(database: Path, images: Path, target: Path) -> int:
-    """Write a panorama of the photographs in a database, an equirectangular JPEG cut to what they cover. Returns the
-    number of photographs in it; 0, and nothing is written, where fewer than two fit together."""
+    """Write a panorama of the photographs in a database, an equirectangular JPEG cropped to their coverage. Returns the
+    number of photographs in it; 0, and nothing is written, if fewer than two fit together."""
     names, sizes, pairs = turned_pairs(database)
     if not pairs:
         return 0
@@ -62,7 +62,7 @@ def stitch(database: Path, images: Path, target: Path) -> int:
 
 
 def turned_pairs(database: Path) -> tuple[list[str], list[tuple[int, int]], list[TurnedPair]]:
-    """Names and sizes of photographs, and the pairs that a homography relates."""
+    """Names and sizes of photographs, and the pairs with a homography."""
     with closing(pycolmap.Database.open(database)) as opened:
         images, cameras = opened.read_all_images(), {c.camera_id: c for c in opened.read_all_cameras()}
         place = {image.image_id: i for i, image in enumerate(images)}
@@ -79,7 +79,7 @@ def turned_pairs(database: Path) -> tuple[list[str], list[tuple[int, int]], list
 
 
 def chained(pairs: Sequence[TurnedPair], sizes: Sequence[tuple[int, int]], ratio: float) -> dict[int, np.ndarray]:
-    """Rotations, camera-to-world, of the largest group of photographs, along its strongest pairs."""
+    """Rotations, camera-to-world, of the largest connected component, chained along its strongest pairs."""
     ratios, between = np.array([ratio]), {}
     for pair in pairs:
         first, second = (calibration(sizes[i], ratios)[0] for i in (pair.first, pair.second))
@@ -105,14 +105,13 @@ def chained(pairs: Sequence[TurnedPair], sizes: Sequence[tuple[int, int]], ratio
 def adjust(
     rotations: dict[int, np.ndarray], pairs: Sequence[TurnedPair], sizes: Sequence[tuple[int, int]], ratio: float
 ) -> float:
-    """Adjust rotations, in place, and the focal length, so that rays of matches agree. Returns the focal length in
-    terms of the longer side."""
+    """Bundle-adjust rotations, in place, and the focal length. Returns the focal length in terms of the longer side."""
     place = {number: i for i, number in enumerate(rotations)}
     inside = [pair for pair in pairs if pair.first in place]
     chosen = [evenly(range(len(pair.pixels[0])), PAIR_MATCHES) for pair in inside]
 
     def one_side(numbers: Sequence[int], pixels: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """For each match the place of its photograph, and its pixel from the middle in terms of the longer side."""
+        """Index of the photograph of each match, and its pixel from the centre in terms of the longer side."""
         scaled = [
             (p[k] - np.array(sizes[i]) / 2) / max(sizes[i]) for p, k, i in zip(pixels, chosen, numbers, strict=True)
         ]
@@ -147,8 +146,8 @@ def adjust(
 
 
 def level(rotations: dict[int, np.ndarray]) -> None:
-    """Turn all, in place, so that photographs are level on average, and the middle of them is ahead: x right, y down,
-    z ahead in the world too."""
+    """Rotate all, in place, so that photographs are level on average, and their mean direction is ahead: x right, y
+    down, z ahead in the world too."""
     stacked = np.stack(list(rotations.values()))
     down = np.linalg.eigh(np.einsum("nij,nkj->ik", stacked[:, :, :1], stacked[:, :, :1]))[1][:, 0]
     down *= 1.0 if down @ stacked[:, :, 1].sum(0) > 0 else -1.0
@@ -162,7 +161,7 @@ def level(rotations: dict[int, np.ndarray]) -> None:
 
 
 def blended(turns: Mapping[Path, np.ndarray], ratio: float, width: int) -> np.ndarray:
-    """Photographs on a sphere that is `width` pixels around, cut to what they cover: uint8 (height, width, 3)."""
+    """Photographs blended on a sphere `width` pixels around, cropped to their coverage: uint8 (height, width, 3)."""
     height, density = width // 2, width / (2 * math.pi)  # pixels per radian
     total, weight = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     for path, turn in turns.items():

@@ -1,4 +1,4 @@
-"""Stages of COLMAP in a process of their own: Ctrl-C ends it at once, and its memory and messages stay outside.
+"""COLMAP in a separate process: Ctrl-C ends it at once, and its memory and messages stay outside.
 
 Run as a script with jobs on its standard input, a line of JSON each. It imports nothing of the package, so it starts in
 half a second. Progress goes to standard output, a number to a line, and at the end of a job "done"; COLMAP's messages
@@ -46,12 +46,11 @@ JOIN_TOLERANCE = 0.05  # distance of two points that count as one, of the median
 
 
 def find_features(job: dict[str, Any]) -> None:
-    """Scale-invariant features (Lowe 2004), as root-SIFT, where masks allow them; photographs that have theirs are
-    passed over.
+    """Detect scale-invariant features (Lowe 2004), as root-SIFT, outside masks, of photographs without any.
 
-    COLMAP keeps the largest features up to the number asked for. The octave of twice a photograph's size takes three
-    quarters of the work, and where the other octaves have so many features, it adds none. So `coarse` photographs,
-    which are large enough for that, are tried without it, unless a sample of them has too few.
+    COLMAP keeps the largest features up to the requested number. The octave of twice a photograph's size takes three
+    quarters of the time; where the other octaves have enough features, it adds none. So `coarse` (large) photographs
+    are tried without it first, unless a sample of them has too few.
     """
     known = described(job["database"])
     coarse = [name for name in job["coarse"] if name not in known]
@@ -68,7 +67,9 @@ def evenly(names: list[str], count: int) -> list[str]:
 
 
 def add_coarse(job: dict[str, Any], names: list[str]) -> int:
-    """Add the features of the photographs that have enough without the octave of twice their size; their number."""
+    """Add the features of the photographs that have enough without the octave of twice their size. Returns their
+    number.
+    """
     if not names:
         return 0
     with tempfile.TemporaryDirectory(dir=os.path.dirname(job["database"])) as place:
@@ -93,7 +94,7 @@ def described(database: str) -> set[str]:
 
 
 def extract(database: str, job: dict[str, Any], names: list[str], first_octave: int) -> None:
-    """Detect features of photographs that have none in a database. first_octave: -1 is twice a photograph's size"""
+    """Detect features of photographs without any in a database. first_octave: -1 is twice a photograph's size"""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = job["max_size"], job["threads"]
     options.sift.max_num_features, options.sift.first_octave = job["features"], first_octave
@@ -112,7 +113,7 @@ def extract(database: str, job: dict[str, Any], names: list[str], first_octave: 
 
 
 def match(job: dict[str, Any]) -> None:
-    """Compare listed pairs and keep what one motion between two views explains; pairs that are done are passed over."""
+    """Match listed pairs with geometric verification; finished pairs are skipped."""
     options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
     options.num_threads = job["threads"]
     pairing.match_list_path, pairing.block_size = job["pairs"], BLOCK_PAIRS
@@ -133,8 +134,8 @@ def incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOpti
 
 def place_one_by_one(job: dict[str, Any]) -> None:
     """Incremental structure from motion (Schönberger and Frahm 2016), from the start or from a model, to which
-    photographs are added with fewer inliers: the model is there to contradict them. seldom: adjust all of it at larger
-    steps of its growth, which spares most of the time of large models"""
+    photographs are added with fewer inliers, since the model verifies them. seldom: run global bundle adjustment at
+    larger steps of growth, which saves most of the time of large models"""
     options, placed = incremental_options(job), 2
     options.snapshot_path, options.snapshot_frames_freq = job["snapshots"], job["snapshot_every"]
     if job["model"]:
@@ -164,13 +165,13 @@ def place_one_by_one(job: dict[str, Any]) -> None:
 
 
 def keep_newest(folder: str) -> None:
-    """Delete the snapshots of a model but for the last two."""
+    """Delete all snapshots of a model but the last two."""
     for name in sorted(os.listdir(folder))[:-2]:
         shutil.rmtree(os.path.join(folder, name), ignore_errors=True)
 
 
 def place_all_at_once(job: dict[str, Any]) -> None:
-    """Global structure from motion (GLOMAP, Pan 2024). Focal lengths that are guesses are first found from pairs."""
+    """Global structure from motion (GLOMAP, Pan 2024). Unknown focal lengths are first estimated from pairs."""
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = job["threads"], job["seed"]
     options.min_model_size = MIN_MODEL_VIEWS
@@ -180,10 +181,11 @@ def place_all_at_once(job: dict[str, Any]) -> None:
 
 
 def refine_lenses(job: dict[str, Any]) -> None:
-    """Four distortion coefficients and two focal lengths instead of one of each, where held-out tracks agree better.
+    """Refine lenses with four distortion coefficients and two focal lengths instead of one of each, if held-out tracks
+    agree better.
 
     Every tenth point is left out of two bundle adjustments, one with each lens. Then it is triangulated with the
-    cameras found; the lens with the smaller reprojection error stays.
+    resulting cameras; the lens with the smaller reprojection error is kept.
     """
     model = pycolmap.Reconstruction(job["model"])
     views = Counter(image.camera_id for image in model.images.values() if image.has_pose)
@@ -217,8 +219,8 @@ def set_full(model: pycolmap.Reconstruction, lenses: list[int]) -> None:
 
 
 def held_out_error(model: pycolmap.Reconstruction, lenses: list[int], held: list[int]) -> tuple[float, bool]:
-    """Mean reprojection error in pixels of points that did not take part in the adjustment, and whether the lenses are
-    plausible: focal lengths that agree to 5 percent, and no coefficient above 1."""
+    """Mean reprojection error in pixels of held-out points, and whether the lenses are plausible: focal lengths that
+    agree to 5 percent, and no coefficient above 1."""
     model = pycolmap.Reconstruction(model)
     tracks = [(model.point3D(number).xyz.copy(), model.point3D(number).track.elements) for number in held]
     tracks = [(xyz, [(e.image_id, e.point2D_idx) for e in elements]) for xyz, elements in tracks]
@@ -249,7 +251,7 @@ def adjust(model: pycolmap.Reconstruction, points_alone: bool = False) -> None:
 
 
 def join(job: dict[str, Any]) -> None:
-    """One model of several, where a similarity maps the points that two of them share onto each other.
+    """Join several models, where a similarity aligns the points that two of them share.
 
     Two points are shared if a feature of a photograph in both models sees them, or if two matched features do.
     """
@@ -269,7 +271,7 @@ def join(job: dict[str, Any]) -> None:
 
 
 def similarity_of(source: pycolmap.Reconstruction, target: pycolmap.Reconstruction, pairs: list) -> Any:
-    """The similarity that maps points of one model onto those of another; None unless enough of the shared agree."""
+    """Similarity between points of two models; None unless enough of the shared ones agree."""
     shared = set()
     for number, pair in pairs:
         a, b = pycolmap.pair_id_to_image_pair(number)
@@ -333,7 +335,7 @@ def tell(line: int | str) -> None:
 
 
 def listen(jobs: queue.SimpleQueue[str]) -> None:
-    """Hand on jobs. The end of the input ends the process, also in the middle of a job."""
+    """Pass on jobs. The end of the input ends the process, also in the middle of a job."""
     for line in sys.stdin:
         jobs.put(line)
     os._exit(1)
@@ -363,7 +365,7 @@ def do(job: dict[str, Any]) -> None:
 
 @contextmanager
 def counting(database: str, table: str, since: str) -> Iterator[None]:
-    """Meanwhile another process reports how many rows a table has; see `counter.watch`."""
+    """Context in which another process reports the number of rows of a table; see `counter.watch`."""
     command = [sys.executable, "-P", str(COUNTER), database, table, since]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=REPORT, stderr=subprocess.DEVNULL) as counter:
         try:

@@ -56,4 +56,14 @@ class KernelLocator(UserWideCacheLocator):
         return super().from_function(function, file)
 
 
-CacheImpl._locator_classes = [KernelLocator, *CacheImpl._locator_classes]
+class LastLocator(KernelLocator):
+    """The same folder where Numba has none: neither the package nor the user's home can be written."""
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> KernelLocator | None:
+        if cls.package not in Path(file).parents:
+            return None
+        return super(KernelLocator, cls).from_function(function, file)
+
+
+CacheImpl._locator_classes = [KernelLocator, *CacheImpl._locator_classes, LastLocator]

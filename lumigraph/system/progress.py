@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -19,6 +20,27 @@ INTERVAL_GROWTH = 1.5  # factor from one interval between lines to the next
 MAX_INTERVAL = 60.0  # seconds between two lines
 
 T = TypeVar("T")
+Listener = Callable[[str, int, int | None], object]  # of a stage's description, items done, all of them if known
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def heard_by(listener: Listener | None) -> Iterator[None]:
+    """A block in which a function hears of each stage and of each step of training.
+
+    What it raises ends the work, and true as its result does by KeyboardInterrupt. No file is left half written.
+    """
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+def report(description: str, count: int, total: int | None) -> None:
+    """Tell the listener of the block, if there is one. Raises KeyboardInterrupt if it ends the work."""
+    if (listener := _listener.get()) is not None and listener(description, count, total):
+        raise KeyboardInterrupt
 
 
 def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
@@ -38,6 +60,7 @@ def counting(description: str, total: int | None = None) -> Iterator[Callable[[i
     """
     stage = ProgressStage(description, total)
     try:
+        stage.done(0)
         yield stage.done
     except BaseException:
         stage.end(well=False)
@@ -60,6 +83,7 @@ class ProgressStage:
 
     def done(self, count: int) -> None:
         self.count = count
+        report(self.description, count, self.total)
 
     def end(self, well: bool) -> None:
         """Stop watching. well: whether the work came to its end"""

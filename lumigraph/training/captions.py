@@ -1,8 +1,8 @@
-"""A small text-and-image model that learns from captions of procedural scenes: guidance without anybody's weights.
+"""A small CLIP trained on captions of procedural scenes: guidance without downloaded weights.
 
-CLIP's architecture and contrastive loss (Radford 2021, section 2.3) at small size. Pictures stand before random
-backgrounds, and are perturbed against the model while it learns (Madry 2018), so that its gradients look like things
-(Santurkar 2019). A head that names the things of a picture helps while it learns, and is dropped."""
+CLIP's architecture and contrastive loss (Radford 2021, section 2.3) at small size. Pictures have random backgrounds and
+adversarial perturbations (Madry 2018), so that the model's gradients look like objects (Santurkar 2019). An auxiliary
+head classifies the objects of a picture; it is dropped after training."""
 
 from __future__ import annotations
 
@@ -52,7 +52,9 @@ class CaptionNumbers:
 
 @dataclass(frozen=True)
 class Learned:
-    """A model, and the share of pictures of held-out pairs that it gives their caption, among those of all pairs."""
+    """Trained model, and its accuracy: share of held-out pictures whose own caption scores best among those of all
+    pairs.
+    """
 
     network: Clip
     tokenizer: Tokenizer
@@ -60,7 +62,7 @@ class Learned:
 
 
 def new_model(n: CaptionNumbers) -> tuple[Clip, Tokenizer]:
-    """A model that has learnt nothing, with a token for each word of the captions."""
+    """An untrained model, with a token for each word of the captions."""
     words = sorted({word for thing in captions.THINGS for word in captions.caption((thing, thing)).split()})
     tokenizer = Tokenizer.of_words(words, CONTEXT)
     vision = ResnetSizes(n.width, (1, 1, 1, 1), max(1, 8 * EXPANSION * n.width // HEAD_WIDTH))
@@ -72,10 +74,11 @@ def new_model(n: CaptionNumbers) -> tuple[Clip, Tokenizer]:
 
 
 def learn_captions(n: CaptionNumbers) -> Learned:
-    """A model of the captions of procedural scenes.
+    """Train a model on captions of procedural scenes.
 
-    Three things make it learn shapes beside colours. Each picture is compared with captions of no picture in the batch
-    too; a linear head, dropped afterwards, names its things; backgrounds become textured by and by.
+    Three measures make it learn shapes beside colours: each picture is also contrasted with captions of no picture in
+    the batch; an auxiliary linear head, dropped afterwards, classifies its objects; backgrounds gradually become
+    textured.
     """
     random, generator = np.random.default_rng(n.seed), torch.Generator().manual_seed(n.seed)
     groups = list(captions.training_groups(random, n.pictures))
@@ -119,10 +122,10 @@ def learn_captions(n: CaptionNumbers) -> Learned:
 
 
 def different(same: Int[Tensor, " picture"], count: int, generator: torch.Generator) -> Int[Tensor, " chosen"]:
-    """Random pictures, at most one of each group of things. same: number of each picture's group
+    """Random pictures, at most one of each group of objects. same: group number of each picture
 
-    Groups are drawn by their number of pictures: if each were as likely, groups of three things, of which there are
-    most, would fill the batch, and their shapes are the smallest.
+    Groups are sampled in proportion to their size. Sampled evenly, groups of three objects, of which there are most,
+    would fill the batch, and their shapes are the smallest.
     """
     order = torch.randperm(len(same), generator=generator)[: 2 * count]
     last = torch.full((int(same.max()) + 1,), -1)
@@ -136,8 +139,8 @@ def contrast(
 ) -> Tensor:
     """The symmetric contrastive loss (Radford 2021, figure 3) of embeddings.
 
-    seen: of pictures, then of pictures that no caption describes
-    said: of captions, then of captions of no picture here; the first `count` of both belong together
+    seen: of pictures, then of pictures without a caption
+    said: of captions, then of captions without a picture; the first `count` of both are pairs
     """
     logits = network.scale * seen @ said.T
     own = torch.arange(count, device=logits.device)
@@ -147,10 +150,10 @@ def contrast(
 def distorted(
     pictures: Float[Tensor, "picture 3 side side"], generator: torch.Generator
 ) -> Float[Tensor, "picture 3 side side"]:
-    """Pictures in wrong colours, each channel another one or inverted; a quarter of them cut into quarters that change
-    places instead, a quarter lying on a side.
+    """Negative examples: pictures with permuted or inverted colour channels; a quarter of them instead cut into
+    quarters that are permuted, a quarter rotated by 90 degrees.
 
-    Without them a model may take a colour that no thing has, cyan, for any of them.
+    Without them a model may take a colour that no object has, such as cyan, for any of them.
     """
     count, half = len(pictures), pictures.shape[-1] // 2
     channels = torch.stack([torch.randperm(3, generator=generator) for _ in range(count)])
@@ -164,9 +167,10 @@ def distorted(
 
 
 def thing_loss(logits: Float[Tensor, "picture thing"], there: Bool[Tensor, "picture thing"]) -> Tensor:
-    """Cross entropy of each thing in a picture against those that may be there instead.
+    """Cross entropy of each object in a picture against absent objects.
 
-    Things that would make a held-out pair are left out, so that none is learnt to be wrong because of its neighbours.
+    Absent objects that would form a held-out pair with a present one are excluded, so that those are not learnt as
+    wrong.
     """
     never = torch.zeros(2 * [len(captions.THINGS)])
     for pair in captions.held_out():
@@ -185,7 +189,7 @@ def perturbed(
     most: float,
     generator: torch.Generator,
 ) -> Float[Tensor, "picture 3 size size"]:
-    """Pictures changed against the model by one step from a random start (Wong 2020). most: change of a colour"""
+    """Adversarial pictures: one gradient step from a random start (Wong 2020). most: largest change of a colour"""
     start = most * (2 * torch.rand(pictures.shape, generator=generator) - 1)
     changed = (pictures + start).requires_grad_()
     (gradient,) = torch.autograd.grad(contrast(network, network.of_pictures(changed), said, len(changed)), changed)
@@ -196,7 +200,7 @@ def perturbed(
 def augmented(
     rgba: UInt8[Tensor, "picture side side 4"], size: int, generator: torch.Generator, textured: float = 0.5
 ) -> Float[Tensor, "picture 3 size size"]:
-    """Pictures mirrored, cropped, before random backgrounds, with noise. textured: share of the backgrounds"""
+    """Pictures mirrored, cropped, over random backgrounds, with noise. textured: share of textured backgrounds"""
     count = len(rgba)
     turn = torch.zeros(count, 2, 3)
     zoom = 1 + MAX_ZOOM * (2 * torch.rand(count, generator=generator) - 1)
@@ -219,7 +223,7 @@ def premultiplied(rgba: UInt8[Tensor, "picture side side 4"]) -> Float[Tensor, "
 def before_random(
     rgba: Float[Tensor, "picture 4 side side"], generator: torch.Generator, textured: float = 0.5
 ) -> Float[Tensor, "picture 3 side side"]:
-    """Premultiplied pictures before random backgrounds: plain, or a share of those of Dream Fields."""
+    """Premultiplied pictures over random backgrounds: plain, or for a share textured as in Dream Fields."""
     behind = torch.rand(len(rgba), 3, 1, 1, generator=generator).expand(len(rgba), 3, *rgba.shape[2:]).clone()
     chosen = torch.randperm(len(rgba), generator=generator)[: round(textured * len(rgba))]
     if len(chosen):
@@ -229,7 +233,7 @@ def before_random(
 
 @torch.no_grad()
 def recognised(network: Clip, tokenizer: Tokenizer, seed: int) -> float:
-    """Share of pictures of held-out pairs whose caption is the best among those of all pairs."""
+    """Accuracy: share of held-out pictures whose own caption scores best among those of all pairs."""
     pairs = captions.pairs()
     shown = [pair for pair in captions.held_out() for _ in range(HELD_OUT_PICTURES)]
     traced = torch.from_numpy(captions.pictures(shown, network.sizes.picture, seed))

@@ -13,7 +13,7 @@ PICTURE_BYTES = 120  # per pixel of a photograph, while a method learns from it 
 
 
 def about_memory(method: Method, data: Dataset) -> str:
-    """Sentence on the memory of photographs, of the method with its optimizer state, and of one picture at a time."""
+    """Sentence on the memory of photographs, of the method with its optimizer state, and of one picture."""
     own = bytes_of(type(method), method.frame, method.config, learning=True) + method.growth_bytes()
     parts = [f"{methods.name_of(method)} up to {gigabytes(own)} with its optimizer state"]
     if isinstance(data, Scene):

@@ -46,9 +46,9 @@ class Bar(Progress):
 
 
 class TrainingDisplay:
-    """Training data, then progress, size of the method and remaining time.
+    """Display of training: data, then progress, size of the method and remaining time.
 
-    PSNR is that of the photographs learnt from, smoothed; it says little of held-out ones.
+    PSNR is that of the training photographs, smoothed; it says little about held-out ones.
     """
 
     def __init__(self, show: bool = True):
@@ -86,7 +86,7 @@ class TrainingDisplay:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Inside this block the bar makes room for that of a stage ahead of the first step."""
+        """Block in which the bar is hidden for that of a stage before the first step."""
         if not self._live:
             yield
             return
@@ -113,11 +113,11 @@ class TrainingDisplay:
 
     @property
     def due(self) -> bool:
-        """True if the figures of the next step are to be shown."""
+        """True if the next step's figures are due."""
         return time.perf_counter() >= self._next
 
     def update(self, step: int, seconds: float, budget: Budget, batch: Lesson, row: dict[str, Any]) -> None:
-        """Note a step and what it learnt from. row: its figures, empty for most steps."""
+        """Record a step and its batch. row: its figures, empty for most steps"""
         self._count += len(batch)
         self._unit = batch.unit
         if not row:
@@ -137,7 +137,7 @@ class TrainingDisplay:
             self._next = time.perf_counter() + (REFRESH if self._live else min(max(LINE_SHARE * seconds, least), most))
 
     def _quality(self) -> list[str]:
-        """The PSNR of what was learnt from; the loss, of methods that have none."""
+        """PSNR of the training batches; the loss for methods without one."""
         if self.psnr is not None:
             return [f"PSNR of training photographs {self.psnr:.2f} dB"]
         return [] if self._loss is None else [f"loss {short(self._loss)}"]
@@ -155,7 +155,7 @@ class TrainingDisplay:
         self._show(budget.progress(step, seconds), f"about {clock(left)} left", parts)
 
     def done(self, step: int, seconds: float, progress: float) -> None:
-        """The last word."""
+        """Show the final line."""
         self._show(progress, f"{clock(seconds)} trained", [f"step {step:,}", *self._quality()])
 
     def _show(self, progress: float, time: str, parts: list[str]) -> None:
@@ -165,7 +165,7 @@ class TrainingDisplay:
             self._line(" · ".join([f"{share}  {time}", *parts]))
 
     def _line(self, line: str) -> None:
-        """A line that stays; on a terminal, above the bar."""
+        """Print a permanent line; on a terminal, above the bar."""
         if self._live:
             self.console.print(line, soft_wrap=True)
         elif self.show:
@@ -179,7 +179,7 @@ def sizes(statistics: dict[str, float]) -> list[str]:
 
 
 def time_left(budget: Budget, step: int, seconds: float, begun: tuple[int, float]) -> float:
-    """Seconds of training to come: what is left of them, or of steps that go on as they went in this sitting."""
+    """Remaining seconds of training: of a budget in seconds, or of the remaining steps at this session's speed."""
     if budget.steps is None:
         return max(budget.total - seconds, 0.0)
     return (budget.total - step) * (seconds - begun[1]) / max(step - begun[0], 1)
@@ -207,20 +207,20 @@ def pixel_sizes(of: Int[Tensor, "photograph 2"]) -> str:
 
 
 def learner(name: str, method: Any) -> str:
-    """A method's name and how large it is."""
+    """A method's name and size."""
     count, unit = extent(method)
     return f"{name}, {count:,} {unit}"
 
 
 def extent(method: Any) -> tuple[int, str]:
-    """Number of Gaussians, or of numbers that a method learns, and their name."""
+    """Number of Gaussians, or of parameters, and their name."""
     if can(method, HasGaussians):
         return len(method.gaussians()), "Gaussians"
     return sum(x.numel() for x in method.parameters() if x.requires_grad), "numbers to learn"
 
 
 def machine(device: torch.device) -> str:
-    """A device; on a CPU how many threads compute."""
+    """Name of a device; on a CPU with its number of threads."""
     if device.type == "cuda":
         return f"on {torch.cuda.get_device_name(device)} ({device})"
     return f"on the CPU with {threads.description()}"

@@ -1,4 +1,4 @@
-"""fit(): the loop that every method is trained by."""
+"""fit(): the training loop of all methods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..figures import save_picture
 from ..method import Lesson, Method
 from ..run import Run, State, check_memory
 from ..system.memory import peak_memory
-from ..system.progress import counting
+from ..system.progress import counting, report
 from ..system.signals import Interrupt
 from ..system.work import at_work
 from .demand import about_memory
@@ -53,18 +53,18 @@ class Outcome:
 
 @runtime_checkable
 class Watch(Protocol):
-    """Somebody who looks on while a method learns, from other threads: the viewer. It may hold training up between
-    steps, which does not count as training, and changes nothing of what is learnt."""
+    """Observer of training on other threads: the viewer. It may pause training between steps, which does not count as
+    training time, and changes nothing of the result."""
 
     @property
     def asked(self) -> bool:
-        """True if training is to yield before the next step. Asked before each step, so it must be quick."""
+        """True if training is to pause before the next step. Read before each step, so it must be fast."""
 
     def give_way(self, stopping: Callable[[], object]) -> None:
         """Render, in eval mode; return at once where stopping() is true."""
 
     def note(self, step: int, progress: float, row: dict[str, Any]) -> bool | None:
-        """So many steps are done. row: the line of metrics.jsonl, empty for most steps. Returns true to end training
+        """Report a completed step. row: the line of metrics.jsonl, empty for most steps. Returns true to end training
         as a first Ctrl-C does."""
 
 
@@ -87,19 +87,19 @@ def fit(
 ) -> Outcome:
     """Train a method on a dataset until its steps are done or its seconds are spent.
 
-    run:        where the state is kept; training goes on from the state it holds. None keeps nothing
-    steps, seconds: the whole budget, earlier sittings included; exactly one of them, or
-    budget:     one that says more, such as that of a run that was extended
+    run:        folder of the state; training continues from its state. None saves nothing
+    steps, seconds: the whole budget, earlier sessions included; exactly one of them, or
+    budget:     a Budget, such as that of an extended run
     seed:       of all random choices
     pause_at:   stop at this step as if interrupted; the schedule still follows the whole budget
-    save_every: seconds of training between states
-    watch:      who looks on meanwhile
-    rehearsal:  whether a step on a copy compiles all kernels ahead of the clock; tests that time nothing do without
-    Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
-    counted apart.
-    Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
+    save_every: seconds of training between checkpoints
+    watch:      observer, such as the viewer
+    rehearsal:  compile all kernels by a step on a copy before the clock starts; tests without timing skip it
+    Seconds are those of training alone; compiling kernels before it, saving, and pauses for the observer are counted
+    apart.
+    Ctrl-C and SIGTERM finish the current step, save and return; a second one aborts.
     Raises LumigraphError for a dataset of another kind than the method learns from, for a run that another process
-    trains, and when a loss or gradient is not finite, with the last good state saved.
+    trains, and for a loss or gradient that is not finite, after saving the last good state.
     """
     budget = budget or Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
@@ -157,6 +157,7 @@ def fit(
             display.update(step, clock.seconds, budget, batch, row)
             if watch:
                 ended = bool(watch.note(step, progress, row))
+            report("Training", step, budget.steps)
             if logged:
                 losses.clear()
             if run and logged:
@@ -203,11 +204,11 @@ def advance(
 
 
 class Descent:
-    """The trainer's part of one step, which `Method.step` is handed as `descend`: gradients of the summed terms, a look
-    whether they are finite, and the optimizers' step.
+    """Descent of one step, passed to `Method.step` as `descend`: gradients of the summed terms, a check that they are
+    finite, and the optimizers' step.
 
-    thorough: look at all gradients, see `find_fault`
-    refuse:   told what is not finite; it raises
+    thorough: check all gradients, see `find_fault`
+    refuse:   raises, with a description of what is not finite
     """
 
     def __init__(
@@ -223,7 +224,7 @@ class Descent:
         self.thorough, self.refuse = thorough, refuse
 
     def __call__(self, terms: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer] | None = None) -> None:
-        """One step downhill, by some of the optimizers or by all."""
+        """Take one step with some of the optimizers, or with all."""
         chosen = self.optimizers if optimizers is None else optimizers
         for optimizer in chosen:
             optimizer.zero_grad(set_to_none=True)
@@ -240,9 +241,8 @@ class Descent:
 def record(
     step: int, seconds: float, terms: dict[str, Tensor], method: Method, losses: Sequence[float], passes: float
 ) -> dict[str, Any]:
-    """A line of metrics.jsonl: the loss and its terms, the method's figures, and the PSNR of what the step learnt from
-    where the method reports a squared error of colours; the mean loss since the line before, and how often everything
-    was learnt from by now."""
+    """A line of metrics.jsonl: the loss and its terms, the method's figures, PSNR of the batch where the method reports
+    a squared error of colours, the mean loss since the previous line, and the passes over the data so far."""
     own = {name: value.item() for name, value in terms.items()}
     statistics = {name: float(value) for name, value in method.statistics().items()}
     row: dict[str, Any] = {"step": step, "seconds": round(seconds, 4)}
@@ -263,7 +263,7 @@ def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rates: dict[s
 
 
 class Clock:
-    """Seconds of training. It runs from the moment it is made, except during pauses."""
+    """Stopwatch of training seconds. It runs from construction on, except during pauses."""
 
     def __init__(self, seconds: float = 0.0):
         self._begin, self.pauses = time.perf_counter() - seconds, 0.0
@@ -281,7 +281,7 @@ class Clock:
 
 
 class Previews:
-    """One view as it comes to be: that of the dataset's preview camera, small. None where it has no such camera."""
+    """Small previews of one view during training, by the dataset's preview camera. None without such a camera."""
 
     def __init__(self, run: Run | None, method: Method, data: Dataset, progress: float):
         camera = data.preview() if run else None
@@ -293,7 +293,7 @@ class Previews:
         return bool(self.next) and progress >= self.next[0]
 
     def take(self, step: int, progress: float) -> None:
-        """Render and keep the view if it is due."""
+        """Render and save a preview if it is due."""
         if not self.run or self.camera is None or not self.due(progress):
             return
         self.next = [share for share in self.next if share > progress]
@@ -303,7 +303,7 @@ class Previews:
 
 
 def give_way(watch: Watch, method: Method, clock: Clock, interrupt: Interrupt) -> float:
-    """Let somebody look, who has asked. Returns the seconds it took."""
+    """Pause training while the viewer renders. Returns the seconds of the pause."""
     before = clock.pauses
     with clock.paused():
         method.eval()
@@ -313,7 +313,7 @@ def give_way(watch: Watch, method: Method, clock: Clock, interrupt: Interrupt) -
 
 
 def rehearse(method: Method, data: Dataset, step: int) -> float:
-    """One step on a copy, so that all kernels are compiled before the clock starts. Returns the seconds it took."""
+    """Compile all kernels by one step on a copy, before the clock starts. Returns the seconds it took."""
     begin = time.perf_counter()
     double = copy.deepcopy(method).train()
     optimizers = double.optimizers()
@@ -324,9 +324,9 @@ def rehearse(method: Method, data: Dataset, step: int) -> float:
 
 
 def find_fault(method: Method, terms: dict[str, Tensor], batch: Lesson, step: int, thorough: bool) -> str | None:
-    """The loss term that is not finite, or whose gradient is not; None if all is well.
+    """Name the loss term that is not finite, or whose gradient is not; None if all are finite.
 
-    thorough: look at all gradients. Small ones, which everything flows through, are always looked at.
+    thorough: check all gradients. Small ones, through which all others flow, are always checked.
     """
     for name, value in terms.items():
         if not math.isfinite(value.item()):
@@ -350,7 +350,7 @@ def finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def stop(fault: str, step: int, run: Run | None, method: Method, save) -> str:
-    """Keep the last good state, and say in one sentence what happened and where that state is."""
+    """Save the last good state. Returns one sentence on the fault and the state's location."""
     if run is None:
         return f"Training stopped at step {step} because {fault}; try a lower learning rate"
     if finite(method.parameters()):

@@ -1,4 +1,4 @@
-"""Verdict: what training has come to, measured: how often everything was seen, and whether it still got better."""
+"""Verdict on a finished training: passes over the data, and whether the loss was still falling."""
 
 from __future__ import annotations
 
@@ -22,19 +22,18 @@ FALL_DEVIATIONS = 2.0  # of its own error that a fall must exceed
 
 
 def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
-    """A function that tells how much of what there is to learn from one lesson shows: 1 for all of it once, 0 where
-    there is no end of it."""
+    """Function for the share of the training data in one lesson: 1 for all of it, 0 for unlimited data."""
     photographs, pixels = len(data.splits["train"]), data.pixels("train") if isinstance(data, Scene) else math.inf
     return lambda lesson: 1 / photographs if isinstance(lesson, Photograph) else len(lesson) / pixels
 
 
 @dataclass(frozen=True)
 class Trend:
-    """Trend of the loss over the second half of training, or over the part of it with photographs of the final size.
+    """Trend of the loss over the second half of training, or over its part with photographs of full size.
 
-    fall:  from its beginning to its end, as a share of the loss; negative where it rose
-    error: one standard deviation of that
-    share: of training that it spans
+    fall:  relative decrease of the loss from its beginning to its end; negative for an increase
+    error: standard deviation of `fall`
+    share: share of training that it spans
     """
 
     fall: float
@@ -47,11 +46,11 @@ class Trend:
 
 
 def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
-    """Trend of the loss from the lines of metrics.jsonl; None where there are too few lines.
+    """Trend of the loss from the lines of metrics.jsonl; None for too few lines.
 
-    A straight line through its logarithm, by least squares; the scatter around it tells the error. Some photographs are
-    harder than others: where a step learns from one (by_photograph), points on the line are means over at least a whole
-    pass, in which each photograph has its turn once, so that only what was learnt is left.
+    Least-squares line through the logarithm of the loss; its scatter gives the error. Some photographs are harder than
+    others: where a step learns from one (by_photograph), points on the line are means over at least a whole pass, in
+    which each photograph occurs once, so that only progress is left.
     """
     found = [row for row in rows if "mean_loss" in row]
     half = [row for row in of_final_size(found) if row["step"] > found[-1]["step"] / 2]
@@ -72,7 +71,8 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
 
 
 def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
-    """Displacement of the training cameras by a method, each against all of them; None where it learns no
-    poses. cameras: those of training photographs as they were given"""
+    """Displacement of the training cameras by a method, each relative to all of them; None for a method that optimises
+    no
+    poses. cameras: the given ones of training photographs"""
     refined = method.refined(cameras)
     return None if refined is cameras else moves(cameras, refined, method.frame)

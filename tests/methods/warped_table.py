@@ -48,7 +48,7 @@ class WarpedTable(FieldMethod):
 
     @classmethod
     def smallest(cls):
-        return Config(TINY_TABLE, ProposalNumbers(16, 16), 2e-2)
+        return Config(TINY_TABLE, learning_rate=2e-2)
 
     def code(self, rays):
         return self.moments(rays)[:, None]

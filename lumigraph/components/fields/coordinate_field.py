@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,6 +80,11 @@ class CoordinateField(Field):
         shape = numbers.depth, hidden_width, numbers.skip_layer
         self.network = CoordinateNetwork(*inputs, *shape, not numbers.bfloat16, head)  # type: ignore[arg-type]
 
+    @classmethod
+    def twice(cls, *arguments: Any, **named: Any) -> CoordinateField:
+        """A field, with another of the same sizes for the coarse pass."""
+        return cls(*arguments, **named | {"coarse": cls(*arguments, **named)})
+
     def encodings(self, keep_input: bool) -> tuple[nn.Module, FrequencyEncoding]:
         """Encodings of places and of directions."""
         n = self.numbers
@@ -99,6 +104,10 @@ class CoordinateField(Field):
     def activated(self, raw: Float[Tensor, "place 3"]) -> Float[Tensor, "place 3"]:
         """sRGB-encoded colour of the network's output."""
         return raw.sigmoid()
+
+    def optimizers_at(self, learning_rate: float, groups: Iterable[dict[str, Any]] = ()) -> list[torch.optim.Optimizer]:
+        """Adam for the networks of both passes (Mildenhall 2020's release). groups: further groups of parameters"""
+        return [torch.optim.Adam([{"params": list(self.parameters())}, *groups], learning_rate, eps=1e-7)]
 
     # At places on rays: density per unit of the coordinates
 

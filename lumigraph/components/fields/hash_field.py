@@ -22,6 +22,7 @@ from .layers import MLP, truncated_exp
 
 OPEN_RATE = 0.5  # of the table's learning rate, for networks in the open: at 1, one seed in three never learns a hue
 CODES_RATE = 0.25  # of the learning rate, that of codes beside a hash table
+DENSITY_LAYERS = 1  # hidden layers of the density network, section 5.4
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 
 Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves; None where all count fully
@@ -65,14 +66,13 @@ class TableNumbers:
 class HashNumbers(TableNumbers):
     """The same with numbers of the networks behind the table (section 5.4)."""
 
-    density_layers: Layers = 1  # hidden layers of the density network, section 5.4; more cost time
     colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4; more cost time
     geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
     sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands, section 5.4; 1: no view dependence
 
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
         """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""
-        return 4 * samples * (self.width + hidden_width * (self.density_layers + self.colour_layers))
+        return 4 * samples * (self.width + hidden_width * (DENSITY_LAYERS + self.colour_layers))
 
 
 # Tables for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
@@ -112,7 +112,7 @@ class HashField(Field):
         self.extent, finer = (1.0, OPEN_RESOLUTION) if space.is_open else (reach, reach)
         self.levels = n.levels_of(finer)
         self.table = new_table(self.levels)
-        self.density_network = MLP(n.width, *[hidden_width] * n.density_layers, n.geometry_features)
+        self.density_network = MLP(n.width, *[hidden_width] * DENSITY_LAYERS, n.geometry_features)
         self.colour_network = MLP(n.geometry_features + n.sh_bands**2 + code, *[hidden_width] * n.colour_layers, 3)
 
     def encode(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:

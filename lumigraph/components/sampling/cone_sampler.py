@@ -11,7 +11,7 @@ from torch.nn.functional import max_pool1d, pad
 
 from ...camera.rays import Rays, Samples
 from ..fields.coordinate_field import Places
-from .hierarchical_sampler import HierarchicalSampler
+from .hierarchical_sampler import RESAMPLE_PADDING, HierarchicalSampler
 from .sampling import inverse_transform, stratified
 from .spaces import Space
 
@@ -19,14 +19,13 @@ from .spaces import Space
 class ConeSampler(HierarchicalSampler):
     """Two passes of a `FrustumField`. Places along rays are edges of frustums; the second pass has its own.
 
-    resample_padding: weight that every frustum has at least (alpha of eq. 17)
-    sampled_share:    share of each ray, around `sampled_from`, that is sampled in training (Niemeyer 2022, eq. 10)
-    sampled_from:     share of the way along each ray
+    sampled_share: share of each ray, around `sampled_from`, that is sampled in training (Niemeyer 2022, eq. 10)
+    sampled_from:  share of the way along each ray
     """
 
-    def __init__(self, *arguments: Any, resample_padding: float = 0.01, **named: Any):
+    def __init__(self, *arguments: Any, **named: Any):
         super().__init__(*arguments, **named)
-        self.resample_padding, self.sampled_share, self.sampled_from = resample_padding, 1.0, 0.5
+        self.sampled_share, self.sampled_from = 1.0, 0.5
 
     def coarse_shares(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "ray edge"]:
         count = self.numbers.coarse_samples
@@ -38,7 +37,7 @@ class ConeSampler(HierarchicalSampler):
         self, shares: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], generator: torch.Generator | None
     ) -> tuple[Float[Tensor, "ray fine_edge"], None]:
         again = stratified(len(shares), self.numbers.fine_samples + 1, generator, shares.device)
-        return inverse_transform(shares, blurred(weights) + self.resample_padding, again), None
+        return inverse_transform(shares, blurred(weights) + RESAMPLE_PADDING, again), None
 
     def places(self, shares: Float[Tensor, "ray edge"], rays: Rays) -> tuple[Samples, Places, Float[Tensor, " sample"]]:
         samples, means, variances = frustums_between(shares, rays, self.space)

@@ -19,6 +19,7 @@ from .occupancy import MaskNumbers, OccupancyMask
 from .sampling import inverse_transform, midpoints, stratified
 from .spaces import Space
 
+RESAMPLE_PADDING = 0.01  # alpha, least weight of a frustum of a cone (Barron 2021, eq. 17)
 RAYS_WITH_FEATURES = 1024  # rays that are rendered at once where the features of all their samples are kept
 
 
@@ -50,6 +51,7 @@ class HierarchicalSampler(Sampler):
     mask:                    of empty space, where the field is not evaluated
     learns_coarse:           whether colours of the coarse pass are learnt from; otherwise it only guides the fine pass
     transmittance_threshold: at which a ray terminates, by the coarse pass; 0: never
+    rays_per_chunk:          rays that are rendered at once
     """
 
     def __init__(
@@ -59,12 +61,14 @@ class HierarchicalSampler(Sampler):
         mask: MaskNumbers = MaskNumbers(),
         learns_coarse: bool = True,
         transmittance_threshold: float = 0.0,
+        rays_per_chunk: int = Sampler.rays_per_chunk,
     ):
         super().__init__()
+        self.rays_per_chunk = rays_per_chunk
         self.space, self.numbers, self.learns_coarse = space, numbers, learns_coarse
         self.transmittance_threshold = transmittance_threshold
         self.batch_size = self.expected_rays = numbers.rays_per_step
-        self.empty = OccupancyMask(mask.occupancy_resolution, mask.occupancy_threshold)
+        self.empty = OccupancyMask(mask.occupancy_resolution)
 
     def sample(
         self, rays: Rays, field: Any, code: RayCodes | None = None, generator: torch.Generator | None = None

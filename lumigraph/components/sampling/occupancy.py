@@ -16,7 +16,7 @@ from ... import kernels
 from ...camera import PIXEL_RADIUS, Camera
 from ...camera.rays import Rays, Samples
 from ...datasets.scene import Scene
-from ...files.ranges import Cells, NonNegative
+from ...files.ranges import Cells
 from ...geometry import evenly
 from ...method import Part
 from .spaces import Space
@@ -211,6 +211,7 @@ class OccupancyGrid(nn.Module):
         return torch.stack([low, high]).to(self.box)
 
 
+OCCUPANCY_THRESHOLD = 0.01  # optical thickness of a cell below which it is empty
 BEGINS = 0.1  # share of the budget before the grid rules anything out: a young network is thin everywhere
 EVERY, DECAY = 16, 0.95  # steps between looks at the grid, and what it remembers of the last one
 LOOKS = 1 << 15  # at the grid, each time
@@ -222,7 +223,6 @@ class MaskNumbers:
     """A Config's numbers of the mask of empty space."""
 
     occupancy_resolution: Cells = 0  # cells per axis of the occupancy grid; 0: no grid, samples everywhere
-    occupancy_threshold: NonNegative = 0.01  # optical thickness of a cell below which it is empty; higher skips more
 
 
 class OccupancyMask(Part):
@@ -234,7 +234,7 @@ class OccupancyMask(Part):
 
     known: Tensor
 
-    def __init__(self, cells: int, thickness: float):
+    def __init__(self, cells: int, thickness: float = OCCUPANCY_THRESHOLD):
         super().__init__()
         self.cells, self.thickness = cells, thickness
         if cells:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...camera.rays import Rays, Samples
 from ...datasets.scene import Frame, Scene
 from ...exchange.packing import Stored
-from ...files.ranges import NonNegative, Share, Steps, between
+from ...files.ranges import NonNegative, Share, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import visible_weights, weights_of
@@ -23,6 +23,8 @@ from .spaces import Space
 FIRST_RAYS = 256  # rays of the first step, before the number of samples per ray is known
 MIN_RAYS = 64  # rays of a step
 MAX_GROWTH = 1.5  # factor by which the number of rays may grow from one step to the next
+OCCUPANCY_INTERVAL = 16  # steps between updates of the occupancy grid, E.2
+OCCUPANCY_DECAY = 0.95  # share of a cell's density kept at each update, E.2
 EARLY_INTERVAL = 4  # steps between updates of the whole grid in the first steps
 CELLS_PER_SAMPLE = 4  # cells updated at most, for each sample of a step
 MIN_RESOLUTION = 4  # cells per axis
@@ -37,8 +39,6 @@ class OccupancyNumbers:
     transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates, E.1; higher is faster, less exact
     occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis and cascade, E.2; more skip more
     occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty, E.2; higher: faster
-    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid, E.2; more are faster
-    occupancy_decay: Share = 0.95  # share of a cell's density kept at each update, E.2; higher forgets more slowly
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
         """Bytes of the refined grid, of a bounded scene."""
@@ -70,6 +70,8 @@ class GridSchedule:
     early_steps: steps in which the whole grid is updated, every EARLY_INTERVAL steps
     probes:      share of all cells, drawn at random, that an update visits besides occupied ones; 1 for all cells
     max_cells:   cells that an update visits at most; None for CELLS_PER_SAMPLE of each sample
+    interval:    steps between updates
+    decay:       share of a cell's density that is kept at each update
     """
 
     stages: tuple[Stage, ...] = (Stage(0.0, 1.0),)
@@ -77,6 +79,8 @@ class GridSchedule:
     early_steps: int = 32
     probes: float = 0.02
     max_cells: int | None = None
+    interval: int = OCCUPANCY_INTERVAL
+    decay: float = OCCUPANCY_DECAY
 
     def stage(self, progress: float) -> Stage:
         """The stage at a share of the budget, in [0, 1]."""
@@ -232,12 +236,12 @@ class OccupancySampler(Sampler):
             self.grid.refine()
             self.stale = True
         early = step < schedule.early_steps
-        if self.stale or step % (EARLY_INTERVAL if early else n.occupancy_interval) == 0:
+        if self.stale or step % (EARLY_INTERVAL if early else schedule.interval) == 0:
             whole = self.stale or early or schedule.probes >= 1
             share, budget = (1.0, None) if whole else (schedule.probes, self._max_cells)
             chance = method.random(~step)
             density = method.density_in_training(chance)
-            self.grid.update(density, n.occupancy_threshold, chance, n.occupancy_decay, share, budget)
+            self.grid.update(density, n.occupancy_threshold, chance, schedule.decay, share, budget)
             self.stale = False
 
     @property

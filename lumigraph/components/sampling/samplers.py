@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -21,7 +21,7 @@ from torch.nn.functional import normalize
 from ...camera.rays import Rays
 from ...datasets.scene import Frame, Scene
 from ...exchange.packing import Stored
-from ...files.ranges import NonNegative, between
+from ...files.ranges import NonNegative
 from ...method import Field, Pass, Sampler
 from ...method.field import Points as Places
 from ...method.sampler import Density, RayCodes, codes_at
@@ -44,6 +44,10 @@ from .proposal import Proposal, proposal_loss
 from .spaces import Space
 
 CELLS = 96  # of the proposal grid, along each axis
+PROPOSAL_SAMPLES = 64  # samples of a ray in that grid
+SAMPLES_PER_RAY = 24  # samples of a ray in the field
+DISTORTION_WEIGHT = 0.01  # weight of the distortion loss (Barron 2022, eq. 15)
+AIR_WEIGHT = 0.05  # weight of clear air between cameras in the first half of training
 LEARNING_RATES = 0.1, 0.01  # of the proposal grid, at first and in the end
 SWEEP_SHARE = 0.1  # share of a budget of seconds that plane sweeps may take
 MAX_POINTS = 1 << 16  # surface points that are kept
@@ -61,11 +65,7 @@ RAYS_PER_CHUNK = 4096  # rendered at once: the activations of their samples fit 
 class ProposalNumbers:
     """A Config's numbers of the proposal sampler, for scenes without bounds."""
 
-    proposal_samples: Annotated[int, between(4, 1024)] = 64  # samples of a ray in the proposal grid; more cost time
-    samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray in the field; more are sharper, slower
-    distortion_weight: NonNegative = 0.01  # distortion loss's weight (Barron 2022, eq. 15); higher: fewer floaters
     sweep_weight: NonNegative = 0.03  # weight of plane-sweep depth at first, falling to 0; 0: off
-    air_weight: NonNegative = 0.05  # weight of clear air between cameras in the first half of training; 0: off
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
         """Bytes of the proposal grid, with its gradient and moments while it learns."""
@@ -89,9 +89,9 @@ class ProposalSampler(Sampler):
     def __init__(self, space: Space, numbers: ProposalNumbers, samples_per_step: int, max_rays: int | None = None):
         super().__init__()
         self.numbers, self.progress = numbers, 1.0
-        rays = max(1, math.ceil(samples_per_step / numbers.samples_per_ray))
+        rays = max(1, math.ceil(samples_per_step / SAMPLES_PER_RAY))
         self.batch_size = self.expected_rays = min(rays, max_rays or rays)
-        self.proposal = Proposal(space, CELLS, numbers.proposal_samples, numbers.samples_per_ray)
+        self.proposal = Proposal(space, CELLS, PROPOSAL_SAMPLES, SAMPLES_PER_RAY)
         for name in self.grows:
             self.register_buffer(name, torch.zeros(0, 3))
 
@@ -136,8 +136,7 @@ class ProposalSampler(Sampler):
         share of light that air between cameras stops."""
         weights = weights_of(last.samples, last.density)
         terms = {"proposal": proposal_loss(last.proposals, weights)}
-        if self.numbers.distortion_weight:
-            terms["distortion"] = self.numbers.distortion_weight * distortion_loss(last.samples, weights)
+        terms["distortion"] = DISTORTION_WEIGHT * distortion_loss(last.samples, weights)
         weight = self.numbers.sweep_weight * (1 - self.progress / DEPTH_UNTIL)
         if weight > 0 and len(self.surface):
             chosen = torch.randint(len(self.surface), (DEPTH_RAYS,), generator=generator).to(self.surface.device)
@@ -145,8 +144,7 @@ class ProposalSampler(Sampler):
             ways = self.surface[chosen] - origins
             error, missed = self._depth_error(density, origins, ways, generator)
             terms["depth"] = weight * error
-            if self.numbers.air_weight:
-                terms["air"] = self.numbers.air_weight * self._stopped_by_air(density, origins, ways, generator)
+            terms["air"] = AIR_WEIGHT * self._stopped_by_air(density, origins, ways, generator)
             terms["proposal"] = terms["proposal"] + missed * (DEPTH_RAYS / len(last.proposals.edges))
         return terms
 
@@ -184,8 +182,7 @@ class ProposalSampler(Sampler):
 
     @property
     def few_view_priors(self) -> tuple[str, ...]:
-        air = ("clear air between cameras",) if self.numbers.air_weight else ()
-        return ("plane-sweep depth", *air) if len(self.surface) else ()
+        return ("plane-sweep depth", "clear air between cameras") if len(self.surface) else ()
 
     # Training
 
@@ -269,14 +266,11 @@ def sampler_for(
 def sampling_bytes(frame: Frame, config: Any, learning: bool) -> int:
     """`Method.further_bytes` of a coordinate network, or of a hash table with its grids, by the names in its Config:
     activations that a step keeps for its gradients. With a mask the number of samples is not known beforehand."""
-    if getattr(config, "field", "hash" if hasattr(config, "table") else "network") == "network":
+    c = getattr(config, "backbone", config)
+    if getattr(c, "field", "hash" if hasattr(c, "table") else "network") == "network":
         masked = hasattr(config, "mask") and config.mask.occupancy_resolution > 0
-        even = hasattr(config, "samples")  # on each ray
-        owner = config.rays if hasattr(config, "rays") else config.occupancy
-        samples = config.samples * config.rays_per_step if even else owner.samples_per_step
-        kept = config.network.activation_bytes(samples, config.hidden_width)
+        samples = getattr(config, "rays", None) or c.occupancy
+        kept = c.network.activation_bytes(samples.samples_per_step, c.hidden_width)
         return 0 if masked else kept * learning
-    width = getattr(config, "table_width", config.hidden_width)
-    kept = config.table.activation_bytes(config.occupancy.samples_per_step, width)
-    grids = [config.occupancy, *([config.proposals] if hasattr(config, "proposals") else [])]
-    return kept * learning + sum(x.further_bytes(frame, learning) for x in grids)
+    kept = c.table.activation_bytes(c.occupancy.samples_per_step, getattr(c, "table_width", c.hidden_width))
+    return kept * learning + sum(x.further_bytes(frame, learning) for x in (c.occupancy, c.proposals))

@@ -1,5 +1,4 @@
-"""Photographs as bytes, and other values that are known of every pixel: in memory, or where they are too many, in
-files."""
+"""Photographs as bytes, and other values of every pixel: in memory, or, where they are too large, in files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of what can be made again: where they lie, what they are called, and that they are whole or not there."""
+"""Cache files: location, names, and atomic creation."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ Found = TypeVar("Found")
 
 
 def key(parts: Iterable[str | None]) -> str:
-    """A name for files that are made of these parts; with a part that has no name, a name that
-    is used once."""
+    """Name of a cache file by a hash of these parts; unique if one of them is None."""
     digest = hashlib.sha256(f"{CACHE_FORMAT} {sys.byteorder}".encode())
     for number, part in enumerate(parts):
         digest.update(f"\n{part or f'{os.getpid()} {time.time_ns()} {number}'}".encode())
@@ -37,7 +36,9 @@ def key(parts: Iterable[str | None]) -> str:
 
 @contextmanager
 def filled(folder: Path, size: int) -> Iterator[Path]:
-    """A folder to fill with so many bytes and MARK_FILE; it appears complete under its name or not at all."""
+    """Block that fills a cache folder with `size` bytes and MARK_FILE; it appears complete under its name or not at
+    all.
+    """
     part = folder.with_name(f"{folder.name}.{os.getpid()}.part")
     try:
         shutil.rmtree(part, ignore_errors=True)
@@ -74,7 +75,7 @@ def check_size(path: Path, size: int) -> None:
 
 
 def free_space(folder: Path) -> int:
-    """Bytes that a disk has for a folder, which need not be there yet; very many where it does not say."""
+    """Free bytes on the disk of a folder, which need not exist yet; very many if unknown."""
     there = next((place for place in (folder, *folder.parents) if place.is_dir()), Path.cwd())
     try:
         return shutil.disk_usage(there).free
@@ -88,8 +89,8 @@ def in_parallel(
     progress: Callable[[int], object] = lambda done: None,
     each: int = 1,
 ) -> list[Found]:
-    """Results of `read` for each number, from several threads. progress: called with the number that is done; each:
-    bytes that one call takes, for as many threads as memory allows."""
+    """Results of `read` for each number, from several threads. progress: called with each finished number; each: bytes
+    of one call, which limit the threads by free memory"""
     with ThreadPoolExecutor(threads_for(each)) as pool:
         tasks = [pool.submit(read, number) for number in numbers]
         found = []

@@ -1,4 +1,4 @@
-"""Layer: one named plane of values that is known of every pixel beside its colour, read on request."""
+"""Layer: one named plane of per-pixel values beside colour, read on request."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ UNKNOWN_INDEX = -1  # an index that is not known
 class LayerSource:
     """Source of one photograph's values of a layer.
 
-    read:     makes the stored numbers, (height, width) or (height, width, channels), of the photograph's size
-    identity: says all that they depend on, as in `ImageSource`
+    read:     returns the stored numbers, (height, width) or (height, width, channels), at the photograph's size
+    identity: determines the numbers, as in `ImageSource`
     """
 
     read: Callable[[], np.ndarray]
@@ -47,19 +47,19 @@ class LayerSource:
 
 @dataclass(eq=False, repr=False)
 class Layer:
-    """Values of one kind for every pixel of the photographs, as their source stores them, and what they mean.
+    """Values of one kind for every pixel of the photographs, in storage encoding.
 
-    They lie in the order of the store, so that a pixel's position there is its position here: under the same budget of
-    memory, else in a file. A photograph's values are read when they are first asked for.
+    They are in the order of the store, so that a pixel has the same position in both, within the same memory budget,
+    else in a file. A photograph's values are read on first use.
 
-    planes:   sources of each photograph; None where this one has no such values
+    planes:   sources of each photograph; None for one without values
     dtype:    of stored numbers
-    channels: numbers to a pixel; one alone has no axis of its own
-    encoding: what the numbers mean, a key of ENCODINGS
-    scale:    what a stored 1 is worth, in scene units for lengths
-    unknown:  stored numbers that mean unknown, as NaN always does. Photographs without a plane hold the first
-    empty:    stored lengths that say that nothing is there
-    names:    of what an index counts, if they have some
+    channels: numbers per pixel; a single one has no axis of its own
+    encoding: meaning of the numbers, a key of ENCODINGS
+    scale:    value of a stored 1, in scene units for lengths
+    unknown:  stored numbers that mean unknown, as NaN always does. Photographs without a plane have the first
+    empty:    stored lengths that mean empty space
+    names:    of an index's values, if any
     """
 
     images: ImageStore
@@ -78,7 +78,7 @@ class Layer:
         self._read = np.zeros(len(self.planes), bool)
 
     def __len__(self) -> int:
-        """Photographs that have such values of their own."""
+        """Number of photographs with values of their own."""
         return sum(plane is not None for plane in self.planes)
 
     def stored(self, image: int) -> np.ndarray:
@@ -94,14 +94,14 @@ class Layer:
         return values.reshape(height, width, *values.shape[1:])
 
     def gathered(self, position: Int[Tensor, " pixel"], images: Int[Tensor, " choice"]) -> np.ndarray:
-        """Stored numbers at positions of the store, which lie in some of the photographs."""
+        """Stored numbers at positions of the store within some of the photographs."""
         return self._hold(images.numpy())[position.numpy()]
 
     def decoded(self, stored: np.ndarray, cosine: Callable[[], Tensor]) -> Tensor:
-        """Values of stored numbers, in the project's units: float32 with NaN for unknown and infinity for empty; whole
-        numbers for an index, -1 for unknown.
+        """Decode stored numbers: float32 with NaN for unknown and infinity for empty; integers for an index, -1 for
+                               unknown.
 
-        cosine: of the angle between each pixel's ray and the optical axis; asked for where lengths lie along the axis
+        cosine: of the angle between each pixel's ray and the optical axis; needed for lengths along the axis
         """
         sure = self.known(stored)
         if self.encoding in INTEGER_ENCODINGS:
@@ -121,18 +121,18 @@ class Layer:
         return known(stored, self.unknown, self.channels)
 
     def reduced(self, image: int, factor: int) -> np.ndarray:
-        """A photograph's stored numbers so many times smaller; see `resized`. What fills no square is left out."""
+        """A photograph's stored numbers at 1 / factor of its size; see `resized`. Incomplete squares are cropped."""
         stored = self.stored(image)
         height, width = (n // factor * factor for n in stored.shape[:2])
         stored = stored[:height, :width]
         return resized(stored, (width // factor, height // factor), self.encoding, self.known(stored))
 
     def like(self, images: ImageStore, planes: Sequence[LayerSource | None]) -> Layer:
-        """A layer of the same kind, of other photographs."""
+        """A layer of the same kind for other photographs."""
         return replace(self, images=images, planes=planes)
 
     def _hold(self, wanted: Sequence[int] | np.ndarray) -> np.ndarray:
-        """All stored numbers, in the order of the store; those of the wanted photographs have been read."""
+        """All stored numbers in the order of the store, after reading those of the wanted photographs."""
         if self._values is None:
             shape = (int(self.images.sizes.prod(-1).sum()), *((self.channels,) if self.channels > 1 else ()))
             if self.images.grant(int(np.prod(shape)) * self.dtype.itemsize):
@@ -146,19 +146,19 @@ class Layer:
         return values
 
     def _alone(self, image: int) -> np.ndarray:
-        """One photograph's numbers, row by row, read now."""
+        """One photograph's numbers, row by row, read from its source."""
         width, height = self.images.sizes[image].tolist()
         values = np.empty((width * height, *((self.channels,) if self.channels > 1 else ())), self.dtype)
         self._put(values, image, None)
         return values.reshape(height, width, *values.shape[1:])
 
     def _fill(self, values: np.ndarray, image: int) -> None:
-        """Read one photograph's numbers to their place."""
+        """Read one photograph's numbers into their place."""
         self._put(values[self.images.span(image)], image, self.images.order(image))
         self._read[image] = True
 
     def _put(self, place: np.ndarray, image: int, order: np.ndarray | None) -> None:
-        """Read one photograph's numbers, in an order; None for row by row."""
+        """Read one photograph's numbers in a pixel order; None for row by row."""
         plane = self.planes[image]
         if plane is None:
             place[:] = self.unknown[0] if self.unknown else UNKNOWN_INDEX if self.encoding == "index" else np.nan
@@ -170,7 +170,7 @@ class Layer:
         place[:] = flat if order is None else flat[order]
 
     def _mapped(self, shape: tuple[int, ...]) -> np.ndarray:
-        """All numbers in a file, which stays for others that ask for the same."""
+        """All numbers in a mapped cache file, shared by equal layers."""
         nameless = self.images.name is None or any(p is not None and p.identity is None for p in self.planes)
         parts = [p.identity if p else "nothing" for p in self.planes]
         called = key([None if nameless else f"{self.images.name} {self.dtype.str} {self.channels}", *parts])

@@ -1,4 +1,4 @@
-"""Random pixels of an ImageStore: their places and their bytes (Numba)."""
+"""Random pixels of an ImageStore: their coordinates and bytes (Numba)."""
 
 from numba import njit, prange
 
@@ -7,9 +7,9 @@ from numba import njit, prange
 def sample_pixels(
     piece, chance, images, first, count, stride, width, start, before, ahead, first_run, pixels, image, xy, rgba, where
 ):
-    """Fill in the pixel of each random number and the bytes there, `piece` neighbours in the store at a time.
+    """Sample a pixel for each random number, and read its bytes, `piece` neighbours in the store at a time.
 
-    One number chooses both: the leading part of its 53 bits the image, the rest the pixel.
+    The leading part of a number's 53 bits chooses the image, the rest the pixel.
     where: filled with positions in the store, unless it is empty
     """
     for p in prange(len(chance)):

@@ -1,4 +1,4 @@
-"""Values of pixels at another size: averaged over areas where an average means something, otherwise picked."""
+"""Resizing of pixel values: area averages of light, nearest values of everything else."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ def resized(
 ) -> np.ndarray:
     """Values (height, width) or (height, width, channels) at a size (width, height), in their own type.
 
-    Light is averaged over each new pixel's area, over known values alone, and as much as they cover where a fourth
-    channel says so. A mosaic stays one (`in_phase`). All else is picked, never mixed: the value at the new
-    pixel's centre, or if that is not known, the known one nearest to it within the new pixel. Offsets in pixels follow
-    the size.
+    Light is averaged over each new pixel's area, over known values alone, weighted by a fourth channel's alpha. A
+    mosaic stays one (`in_phase`). Anything else is never mixed: the value at the new pixel's centre, or if unknown, the
+    nearest known one within the new pixel. Offsets in pixels are scaled with the size.
     """
     height, width = values.shape[:2]
     if (width, height) == size:
@@ -39,8 +38,8 @@ def resized(
 
 
 def in_phase(values: Shaped[np.ndarray, "height width"], size: Size) -> np.ndarray:
-    """A mosaic at another size: of each new pixel the mean of those within it whose place in the square of four is its
-    own, so that the same filter lies over them; NaN where there is none."""
+    """A mosaic at another size: each new pixel is the mean of the pixels within it under the same filter of the 2 x 2
+    pattern; NaN for none."""
     found = np.empty(size[::-1], values.dtype)
     for phase in np.ndindex(2, 2):
         own = tuple(slice(first, None, 2) for first in phase)
@@ -51,7 +50,7 @@ def in_phase(values: Shaped[np.ndarray, "height width"], size: Size) -> np.ndarr
 
 
 def averaged(values: np.ndarray, size: Size, known: np.ndarray | None, straight: bool) -> np.ndarray:
-    """Means over areas. straight: whether colours are not multiplied by the alpha in their fourth channel."""
+    """Means over areas. straight: whether colours are not premultiplied by the alpha in their fourth channel"""
     planes = values.astype(np.float32).reshape(*values.shape[:2], -1)
     weight = np.ones(values.shape[:2], np.float32) if known is None else known.astype(np.float32)
     planes = np.where(weight[..., None] > 0, planes, 0)
@@ -71,7 +70,7 @@ def box(plane: np.ndarray, size: Size) -> np.ndarray:
 
 
 def picked(own: Size, size: Size, known: Bool[np.ndarray, "height width"] | None) -> Int[np.ndarray, " pixel"]:
-    """The pixel of a picture, counted row by row, that stands for each pixel of another size."""
+    """Nearest known source pixel, as a row-major index, for each pixel of another size."""
     width = own[0]
     (x, left, right), (y, top, bottom) = (middles(n, m) for n, m in zip(own, size, strict=True))
     index = y[:, None] * width + x
@@ -95,8 +94,8 @@ def picked(own: Size, size: Size, known: Bool[np.ndarray, "height width"] | None
 
 
 def middles(own: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Source pixels of each of `count` pixels that share out `own`: the one at its centre, and those whose centres it
-    holds, first and one past the last."""
+    """Source pixels of each of `count` pixels along an axis of `own`: the one at its centre, and the range of those
+    inside."""
     edges = np.arange(count + 1) * (own / count)
     first = np.ceil(edges - 0.5).astype(np.int64)
     centre = np.minimum(((edges[:-1] + edges[1:]) / 2).astype(np.int64), own - 1)

@@ -1,4 +1,4 @@
-"""ImageStore: all photographs of a scene as bytes, in memory or, where they are too many, in a file."""
+"""ImageStore: all photographs of a scene as bytes, in memory or, if they are too large, in a file."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ MIN_PIECE, MAX_PIECE = 64, 1024  # pixels; the longest fills a page
 
 @dataclass(frozen=True)
 class Runs:
-    """Masks as runs of trusted pixels, row by row: a run begins at pixel `start` and is preceded by `before` trusted
-    pixels, counted from the first image on. Image i owns count[i] trusted pixels."""
+    """Run-length encoded masks, row by row: a run begins at pixel `start` and is preceded by `before` trusted pixels,
+    counted from the first image on. Image i has count[i] trusted pixels."""
 
     start: Int[Tensor, " run"]
     before: Int[Tensor, " run"]
     count: Int[Tensor, " image"]
 
     def columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """start, before, the trusted pixels ahead of each image, and each image's first run, one longer than images."""
+        """start, before, the trusted pixels before each image, and each image's first run, one longer than images."""
         ahead = self.count.cumsum(0) - self.count
         first_run = torch.searchsorted(self.before, torch.cat([ahead, self.count.sum()[None]]))
         return self.start, self.before, ahead, first_run
 
     @staticmethod
     def of(found: Sequence[tuple[np.ndarray, np.ndarray]]) -> Runs:
-        """Runs of images one after the other, each as of `runs_of`."""
+        """Concatenate the runs of images, each from `runs_of`."""
         starts, lengths = zip(*found, strict=True)
         length = torch.from_numpy(np.concatenate(lengths))
         count = torch.tensor([int(x.sum()) for x in lengths])
@@ -63,7 +63,7 @@ def runs_of(mask: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndar
 
 
 def spread(count: int) -> int:
-    """The factor a of the shuffle of `count` pixels."""
+    """Factor a of the pixel shuffle of `count` pixels."""
     a = max(round(count * (math.sqrt(5) - 1) / 2), 1)
     while math.gcd(a, count) != 1:
         a += 1
@@ -79,7 +79,7 @@ def shuffled_order(pixels: int, mask: Tensor | np.ndarray | None) -> Int[np.ndar
 
 @dataclass(frozen=True)
 class StoreMark:
-    """Contents of the mark of a store in a file."""
+    """Contents of the mark file of a store."""
 
     has_alpha: bool
     trusted: bool
@@ -89,10 +89,10 @@ class StoreMark:
 class ImageSource:
     """Source of one photograph.
 
-    size:     (width, height) that `read` will give
-    read:     makes the pixels, uint8 (height, width, 3 or 4), and which of them to trust (None: all)
-    identity: says all that the pixels depend on (file, its date and size, scaling); None if nothing can
-    decoding: bytes that `read` takes at most; fewer are read at a time where that is much
+    size:     (width, height) of the result of `read`
+    read:     returns the pixels, uint8 (height, width, 3 or 4), and a mask of trusted ones (None: all)
+    identity: determines the pixels (file, its date and size, scaling); None if unknown
+    decoding: peak bytes of `read`; limits the number of parallel calls
     """
 
     size: tuple[int, int]
@@ -103,9 +103,9 @@ class ImageSource:
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """Random pixels: which image, where (x, y), and their bytes (red, green, blue, alpha; 255 where there is none).
+    """Random pixels: image, coordinates (x, y), and bytes (red, green, blue, alpha; 255 without alpha).
 
-    position: where they lie in the store, which is where they lie in every layer; None where not requested
+    position: in the store and in every layer; None where not requested
     """
 
     image: Int[Tensor, " pixel"]
@@ -115,18 +115,18 @@ class PixelBatch:
 
 
 class ImageStore:
-    """Photographs of any sizes, end to end, four bytes to a pixel so that a pixel is one load.
+    """Photographs of any sizes, concatenated, four bytes per pixel so that a pixel is one load.
 
-    In a file, each image's pixels lie shuffled: pixel (a s) mod n at position s, with a the whole number beside
-    n / golden ratio that shares no factor with n. Consecutive positions are then spread evenly over the picture, so
+    In a file, each image's pixels are shuffled: pixel (a s) mod n at position s, with a an integer near
+    n / golden ratio that is coprime to n. Consecutive positions are then spread evenly over the picture, so
     a random batch is a few short reads rather than one disk access for every ray.
 
     rgba:     all pixels, four bytes seen as one int32
     sizes:    (width, height) of each image
-    trusted:  per image the pixels to learn from, or None for all
-    name:     of what the pictures decode to; None where nothing can name it
-    memory:   bytes that layers may still take of it; None means a share of the machine's
-    cache:    where what does not fit goes; None means the user's cache folder
+    trusted:  mask of training pixels per image, or None for all
+    name:     hash of the decoded pictures; None if unknown
+    memory:   bytes left for layers; None means a share of the machine's
+    cache:    folder for data that exceeds memory; None means the user's cache folder
     """
 
     streams = False  # whether photographs are read again and again, so that they have no place
@@ -162,9 +162,9 @@ class ImageStore:
         """Read pictures in parallel.
 
         memory:   bytes that may stay in memory; None means a share of the machine's
-        cache:    where larger captures go; None means the user's cache folder. It may be deleted at any time.
-        progress: told how many are done
-        Raises LumigraphError where the cache's disk is full, and whatever the pictures' `read` raises.
+        cache:    folder for larger captures; None means the user's cache folder. It may be deleted at any time.
+        progress: called with the number of finished ones
+        Raises LumigraphError for a full disk, and all errors of the pictures' `read`.
         """
         sizes = torch.tensor([p.size for p in pictures])
         total, memory = int(sizes.prod(-1).sum()), memory_for_images() if memory is None else memory
@@ -192,7 +192,7 @@ class ImageStore:
 
     @classmethod
     def from_arrays(cls, images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> ImageStore:
-        """Pictures that are already here: uint8 (height, width, 3 or 4), and optionally which pixels to trust."""
+        """Store of arrays: uint8 (height, width, 3 or 4), and optionally masks of trusted pixels."""
 
         def source(image: np.ndarray, mask: np.ndarray | None) -> ImageSource:
             return ImageSource((image.shape[1], image.shape[0]), lambda: (image, mask))
@@ -232,7 +232,7 @@ class ImageStore:
         return self._count
 
     def order(self, index: int) -> Int[np.ndarray, " pixel"] | None:
-        """Pixel of an image, row by row, at each of its positions; None if they lie row by row."""
+        """Pixel of an image, as a row-major index, at each of its positions; None if they are row by row."""
         return shuffled_order(int(self.sizes[index].prod()), self.mask(index)) if self.shuffled else None
 
     def span(self, index: int) -> slice:
@@ -241,7 +241,7 @@ class ImageStore:
         return slice(first, first + int(self.sizes[index].prod()))
 
     def grant(self, size: int) -> bool:
-        """True if so many more bytes may stay in memory; they count as taken from then on."""
+        """Reserve bytes of the memory budget; False if they exceed it."""
         granted = size <= self._memory
         self._memory -= size if granted else 0
         return granted
@@ -249,9 +249,9 @@ class ImageStore:
     def draw(
         self, count: int, images: Int[Tensor, " choice"], generator: torch.Generator, positions: bool = False
     ) -> PixelBatch:
-        """Random pixels: each of the given images as likely as the next, each trusted pixel of it as well.
+        """Random pixels: images uniformly, then their trusted pixels uniformly.
 
-        positions: whether to tell where they lie, for layers
+        positions: also return their positions, for layers
         """
         piece = min(max(count // READS_PER_BATCH, MIN_PIECE), MAX_PIECE) if self.shuffled else 1
         chance = torch.rand(-(-count // piece), dtype=torch.float64, generator=generator)
@@ -286,7 +286,7 @@ def see_through(pixels: UInt8[np.ndarray, "height width 4"]) -> bool:
 def fill(
     rgba: np.ndarray, pictures: Sequence[ImageSource], progress: Callable[[int], object], shuffled: bool
 ) -> tuple[bool, Runs | None]:
-    """Read all pictures into their places. Returns whether any is see-through, and what to trust."""
+    """Read all pictures into their places. Returns whether any has transparency, and the runs of trusted pixels."""
     ends = np.cumsum([p.size[0] * p.size[1] for p in pictures])
 
     def read(index: int) -> tuple[bool, tuple[np.ndarray, np.ndarray] | None]:

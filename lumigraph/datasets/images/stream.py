@@ -1,4 +1,4 @@
-"""ImageStream: photographs that neither memory nor a file can hold, read again and again while they are learnt from."""
+"""ImageStream: photographs that exceed memory and disk, re-read from their sources during training."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def load(
     progress: Callable[[int], object] = lambda done: None,
     keep: bool = False,
 ) -> ImageStore:
-    """Photographs in memory, else in a file, else, where that would take more than half of what is free on its disk,
-    read again and again. Arguments and faults as of `ImageStore.load`.
+    """Photographs in memory, else in a file, else, if that exceeds half of the free disk space, as a stream. Arguments
+    and errors as in `ImageStore.load`.
 
-    keep: whether each picture goes to a file of the cache even if all fit, so that it is made once
+    keep: cache each picture in a file even if all fit into memory, so that it is made once
     """
     memory = memory_for_images() if memory is None else memory
     size = 4 * sum(width * height for width, height in (p.size for p in pictures))
@@ -69,14 +69,13 @@ def load(
 class ImageStream(ImageStore):
     """Photographs of any sizes, of which some random pixels are in memory at a time.
 
-    Readers go through all photographs in a random order, and then in another one, and leave KEPT random pixels of each;
-    a batch is drawn from those that are there, of which the oldest makes room for the next. So each photograph is as
-    likely as any other in the long run, each of its trusted pixels as well, and no batch waits for a photograph that it
-    alone would need. What is drawn depends on the generator of the first batch, on all batches since, and on
-    nothing else; a run that is resumed begins anew.
+    Reader threads go through all photographs in a random order, again and again, and store KEPT random pixels of each.
+    A batch is sampled from the stored photographs, of which the oldest is evicted for the next. So in the long run
+    photographs are sampled uniformly, and their trusted pixels too, and no batch waits for a photograph. Samples depend
+    on the generator of the first batch and on all batches since; a resumed run begins anew.
 
-    pictures: how to get each
-    memory:   bytes that all of it may take, photographs that are being read included
+    pictures: sources of each photograph
+    memory:   byte limit, photographs that are being read included
     """
 
     streams = True
@@ -94,7 +93,7 @@ class ImageStream(ImageStore):
         self._images: Tensor | None = None  # those that are drawn from
 
     def __getitem__(self, index: int) -> UInt8[Tensor, "height width channel"]:
-        """One image's bytes, read now."""
+        """One image's bytes, read from its source."""
         pixels, _ = whole(self._pictures[index])
         return torch.from_numpy(pixels)[..., : 4 if self.has_alpha else 3]
 
@@ -104,7 +103,7 @@ class ImageStream(ImageStore):
         return True
 
     def mask(self, index: int) -> Bool[Tensor, "height width"] | None:
-        """Mask of an image's pixels to use, read now; None if all."""
+        """Mask of an image's pixels to use, read from its source; None if all."""
         _, trusted = whole(self._pictures[index])
         return None if trusted is None else torch.from_numpy(trusted)
 
@@ -132,7 +131,7 @@ class ImageStream(ImageStore):
         return PixelBatch(torch.from_numpy(image), xy, torch.from_numpy(self._rgba_of[place, rank]))
 
     def _begin(self, images: Tensor, generator: torch.Generator) -> None:
-        """Draw from these photographs from now on."""
+        """Start sampling from these photographs."""
         self._images, self._due = images.clone(), 0
         self._random = np.random.default_rng(int(torch.randint(1 << 62, (1,), generator=generator)))
         self._left: list[int] = []
@@ -145,7 +144,7 @@ class ImageStream(ImageStore):
             self._take()
 
     def _take(self) -> None:
-        """Wait for the next photograph, and have further ones read meanwhile."""
+        """Wait for the next photograph, and start reading further ones."""
         assert self._images is not None
         while len(self._coming) <= READ_AHEAD:
             if not self._left:
@@ -161,7 +160,7 @@ class ImageStream(ImageStore):
         self._filled, self._next = max(self._filled, place + 1), (place + 1) % self._room
 
     def _some(self, number: int, seed: int) -> Some:
-        """Random pixels of a photograph, or all that are to be trusted where they are few."""
+        """Random trusted pixels of a photograph, or all if they are few."""
         pixels, trusted = whole(self._pictures[number])
         if not self.has_alpha and see_through(pixels):
             raise LumigraphError(
@@ -183,8 +182,8 @@ class ImageStream(ImageStore):
 
 
 def kept(picture: ImageSource, cache: Path) -> ImageSource:
-    """A picture that took long to make, made once for all scenes: it reads its file in `cache` where there is one, and
-    writes one otherwise. As it is if nothing says what it depends on."""
+    """A picture with a cache file, for pictures that take long to make: read from `cache` if there, else made and
+    written. Unchanged if it has no identity."""
     if picture.identity is None:
         return picture
     return replace(picture, read=partial(read_or_make, picture, cache / PICTURES_FOLDER))
@@ -203,7 +202,7 @@ def read_or_make(picture: ImageSource, folder: Path) -> tuple[np.ndarray, np.nda
 
 
 def leave(path: Path, pixels: np.ndarray) -> None:
-    """Write a picture, whole or not at all. A disk that is full or may not be written keeps nothing."""
+    """Write a picture atomically. A full or read-only disk is ignored."""
     part = path.with_name(f"{path.stem}.{os.getpid()}.part")
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Shapes: meshes or clouds of points to learn from, and the distance and occupancy of the space around them."""
+"""Shapes: training meshes or point clouds, with distance and occupancy of the space around them."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ CUBE = Frame(background=(1.0, 1.0, 1.0))  # of many shapes, each of which has a 
 
 @dataclass(frozen=True)
 class PointBatch:
-    """Points in scene units, and what shapes say of them.
+    """Points in scene units, with distance and occupancy.
 
-    member:    number of the shape that each belongs to
+    member:    number of each point's shape
     distance:  to the surface; negative inside of closed meshes
     occupancy: 1 inside, 0 outside; None for clouds of points, which have no inside
     normals:   unit length, of points on a surface
@@ -61,13 +61,13 @@ class PointBatch:
 
     @property
     def signed(self) -> Float[Tensor, " point"]:
-        """Distance, negative where occupied: also of a surface with holes, by its winding number."""
+        """Signed distance, negative where occupied; for a surface with holes by its winding number."""
         assert self.distance is not None and self.occupancy is not None
         return self.distance.abs() * (1 - 2 * self.occupancy)
 
     @staticmethod
     def cat(parts: list[PointBatch]) -> PointBatch:
-        """One batch from several; what one of them lacks, all lack."""
+        """Concatenate batches; an optional field must be in all of them."""
         points, member = torch.cat([x.points for x in parts]), torch.cat([x.member for x in parts])
         known = (join(getattr(x, name) for x in parts) for name in ("distance", "occupancy", "normals"))
         return PointBatch(points, member, *known)
@@ -77,9 +77,9 @@ class PointBatch:
 class Shape:
     """A mesh in scene units. One without faces is a cloud of points.
 
-    frame:   where it is, and the way back to its file
-    normals: of a cloud's points, where the file has them
-    partial: whether it is a scan of some sides, so that the place and size of the whole are unknown
+    frame:   bounds, and the similarity to its file's frame
+    normals: of a cloud's points, if the file has them
+    partial: whether it is a scan of some sides, so that position and size of the whole are unknown
     """
 
     name: str
@@ -94,8 +94,8 @@ class Shape:
 
     @cached_property
     def closed(self) -> bool:
-        """True if it has an inside: its winding number is whole nearly everywhere. Closed parts may go through each
-        other, which a mesh that is called watertight may not."""
+        """True for an almost everywhere integer winding number. Unlike in a watertight mesh, closed parts may
+        intersect."""
         if self.is_cloud:
             return False
         low, high = np.array(self.frame.bounds)
@@ -104,7 +104,7 @@ class Shape:
         return bool((np.abs(found - found.round()) < INTEGER_TOLERANCE).mean() >= MIN_CLOSED_SHARE)
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """To the nearest point of the surface, in scene units: signed, negative inside, if it is closed."""
+        """Distance to the surface, in scene units: signed, negative inside, if it is closed."""
         away = self._away(points)
         return torch.where(self.inside(points), -away, away) if self.closed else away
 
@@ -115,7 +115,7 @@ class Shape:
         return torch.from_numpy(away).float()
 
     def inside(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-        """True for points with a winding number above a half. Nothing is inside of a point cloud."""
+        """True for points with a winding number above 1/2. A point cloud has no inside."""
         if self.is_cloud:
             return torch.zeros(len(points), dtype=torch.bool)
         return torch.from_numpy(self._triangles.winding(points.detach().cpu().double().numpy()) > 0.5)
@@ -128,7 +128,7 @@ class Shape:
         return PointBatch(points, torch.full((len(points),), member), distance, occupancy)
 
     def surface(self, count: int, generator: torch.Generator, member: int = 0) -> PointBatch:
-        """Random points of the surface, evenly by its area, with their normals; of a cloud, random ones of its points.
+        """Random points of the surface, uniformly by area, with their normals; for a cloud, random ones of its points.
         Their distance is 0."""
         members, zero = torch.full((count,), member), torch.zeros(count)
         if self.is_cloud:
@@ -167,7 +167,7 @@ class Shape:
 
     @cached_property
     def _facing(self) -> tuple[Float[np.ndarray, " face"], Float[np.ndarray, "face 3"]]:
-        """The faces' areas, summed up so far, and their unit normals."""
+        """Cumulative areas and unit normals of the faces."""
         a, b, c = self._corners.transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
         areas = np.linalg.norm(normals, axis=-1)
@@ -180,9 +180,9 @@ def normalised(
     normals: Float[np.ndarray, "vertex 3"] | None = None,
     upright: Float[np.ndarray, "3 3"] | None = None,
 ) -> Shape:
-    """A mesh as a Shape: its longest side from -0.9 to 0.9 and its middle at the origin.
+    """A mesh as a Shape: its longest side from -0.9 to 0.9, centred at the origin.
 
-    upright: rotation that turns the mesh's own frame upright, +z up; None for one that stands so
+    upright: rotation from the mesh's own frame to +z up; None if it is upright
     """
     turn = torch.eye(3, dtype=torch.float64) if upright is None else torch.from_numpy(np.asarray(upright, np.float64))
     places = np.asarray(mesh.vertices, np.float64) @ turn.numpy().T
@@ -205,7 +205,7 @@ def normalised(
 
 @dataclass(frozen=True)
 class Shapes:
-    """Shape i is members[i]. A single one is its own test: other points of the same shape.
+    """Training shapes; shape i is members[i]. A single one is also its own test, at other points.
 
     frame:    of a single shape its own; of many the cube that each of them fills
     splits:   numbers of members by purpose
@@ -245,7 +245,7 @@ class Shapes:
         return found
 
     def preview(self) -> Camera:
-        """A camera of 128 pixels before it."""
+        """A camera of 128 pixels in front of a shape."""
         return ring(self.frame.bounds, size=128)[0]
 
     def sample(
@@ -259,9 +259,9 @@ class Shapes:
     ) -> PointBatch:
         """Random points with their distance and occupancy.
 
-        near:    share of them close to the surface, Gaussian offsets away; the others lie evenly in [-1, 1]^3
+        near:    share of points near the surface, with Gaussian offsets; the others are uniform in [-1, 1]^3
         spread:  deviation of these offsets along each axis, scene units
-        members: shapes that they are taken from, drawn for this batch; the points are shared out evenly
+        members: shapes of this batch; the points are divided evenly among them
         """
         there = self.splits[split]
         drawn = there[torch.randint(len(there), (members,), generator=generator)].tolist()

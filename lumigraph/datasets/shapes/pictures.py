@@ -1,4 +1,4 @@
-"""Pictures of shapes: their surface in grey light from a camera."""
+"""Pictures of shapes: their shaded grey surface for a camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ AMBIENT, DIFFUSE = 0.25, 0.65  # of the grey surface in light from the camera
 
 
 def picture_of(shape: Shape, camera: Camera, generator: torch.Generator) -> Photograph:
-    """A shape in grey light from the camera, before nothing: the nearest of many surface points in each pixel."""
+    """A shaded grey shape with transparent background: the nearest of many surface points in each pixel."""
     surface = shape.surface(SURFACE_POINTS, generator)
     width, height = camera.size[0].tolist()
     pixels, visible = camera.project(surface.points)

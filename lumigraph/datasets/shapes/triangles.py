@@ -1,8 +1,8 @@
-"""Triangles in a tree of boxes: the nearest point on them, and how often they wind around a point (Numba).
+"""Bounding volume hierarchy of triangles: nearest point and winding number (Numba).
 
 The generalised winding number (Jacobson 2013) is the solid angle of all triangles over 4 pi: 1 inside of a closed
-surface and 0 outside, and in between where it has holes. Triangles that are far away count together, by the first term
-of their expansion (Barill 2018).
+surface and 0 outside, and in between near holes. Far triangles are summed together, by the first term of their
+expansion (Barill 2018).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ STACK_DEPTH = 64  # boxes that wait while a tree is walked
 
 
 class Triangles:
-    """corners: (face, corner, 3), in double precision. Faces keep their numbers outside, and have an order of their own
-    inside, in which those of a box follow each other."""
+    """Triangles with a hierarchy. corners: (face, corner, 3), in double precision. Face numbers in results are those of
+    the input; inside, faces are sorted by boxes."""
 
     def __init__(self, corners: np.ndarray):
         self.order, self.first, self.count, self.child = divide(np.ascontiguousarray(corners.mean(1), np.float64))
@@ -26,15 +26,15 @@ class Triangles:
         self.box, self.dipole = surround(self.sorted, self.first, self.count)
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The distance of each point (point, 3), and the number of the triangle that is nearest."""
+        """Distance of each point (point, 3) to its nearest triangle, and that triangle's number."""
         points = np.ascontiguousarray(points, np.float64)
         distance, place = nearest(self.sorted, self.box, self.first, self.count, self.child, points)
         return distance, self.order[place]
 
     def winding(self, points: np.ndarray, reach: float = 2.0) -> np.ndarray:
-        """The winding number around each point (point, 3).
+        """Winding number of each point (point, 3).
 
-        reach: radii of a box away from which its triangles count together; infinity for the exact sum
+        reach: distance, in radii of a box, beyond which its triangles are summed together; infinity for the exact sum
         """
         points = np.ascontiguousarray(points, np.float64)
         return winding(self.sorted, self.dipole, self.first, self.count, self.child, points, reach)
@@ -42,9 +42,9 @@ class Triangles:
 
 @njit(cache=True)
 def divide(centres):
-    """A binary tree over points, halved along the longest side of their box. Children follow their parents.
+    """Binary tree over points, halved along the longest side of their box. Children follow their parents.
 
-    Returns the order of the points, and for each node its first place in it, how many, and its left child (the right
+    Returns the order of the points, and for each node its first index in it, its count, and its left child (the right
     one is next to it; -1 for a leaf).
     """
     most = max(1, 4 * len(centres) // LEAF_TRIANGLES + 4)
@@ -72,8 +72,8 @@ def divide(centres):
 
 @njit(cache=True)
 def surround(triangles, first, count):
-    """Two tables of the nodes: the box of each one's triangles (low, high); and the middle of their area, the sum of
-    their area vectors, and the distance of the farthest corner from the middle."""
+    """Two tables of the nodes: the bounding box of each one's triangles (low, high); and their centroid, the sum of
+    their area vectors, and the distance of the farthest corner from the centroid."""
     nodes = len(first)
     box, dipole = np.empty((nodes, 6)), np.zeros((nodes, 7))
     for node in range(nodes):
@@ -111,7 +111,7 @@ def dot(ax, ay, az, bx, by, bz):
 
 @njit(cache=True, error_model="numpy")
 def square_distance(px, py, pz, t, i):
-    """From a point to triangle i (Ericson 2005, section 5.1.5)."""
+    """Squared distance from a point to triangle i (Ericson 2005, section 5.1.5)."""
     abx, aby, abz = t[i, 3] - t[i, 0], t[i, 4] - t[i, 1], t[i, 5] - t[i, 2]
     acx, acy, acz = t[i, 6] - t[i, 0], t[i, 7] - t[i, 1], t[i, 8] - t[i, 2]
     apx, apy, apz = px - t[i, 0], py - t[i, 1], pz - t[i, 2]

@@ -11,6 +11,7 @@ import time
 from bisect import bisect_left
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -24,7 +25,8 @@ from ...camera.rays import Rendering
 from ...datasets.images import ImageStore
 from ...datasets.scene import Scene
 from ...errors import LumigraphError
-from ...evaluation import evaluate
+from ...evaluation.options import EvaluationOptions
+from ...evaluation.views import evaluate
 from ...geometry import evenly
 from ...method import Method
 from ...method.capabilities import CanCompress, needs
@@ -34,6 +36,7 @@ from ...run.checkpoint import Checkpoints
 from ...run.derived import Compressed
 from ...system.progress import NumberedStages, clock, track
 from ...system.work import at_work
+from ..options import CompressOptions
 from .model import LADDER, RUNG_POSITIONS, CompressedModel, rung_at
 
 JUDGED_VIEWS = 6  # training photographs that judge a rung; held-out ones judge the outcome alone
@@ -45,43 +48,18 @@ STAGES = "importance of each row", "pruning and codebook, by trial", "tune", "co
 DEFAULT_PSNR = 30.0  # dB of a run without a recorded training PSNR
 
 
-@dataclass(frozen=True)
-class CompressionTarget:
-    """Target of a compression and its limit in time; exactly one of size and loss.
-
-    size:     bytes of the model at most
-    loss:     dB that photographs which were learnt from may lose at most
-    codebook: rows of the codebook at most, where the ladder's are not wanted
-    steps, seconds: of tuning in all; one of them
-    views:    held-out views to compare; None for all
-    """
-
-    size: int | None = None
-    loss: float | None = None
-    codebook: int | None = None
-    steps: int | None = None
-    seconds: float | None = None
-    views: int | None = None
-
-    def part(self, share: float) -> tuple[int | None, float | None]:
-        """Steps or seconds of a share of all tuning."""
-        return self.steps and max(1, round(share * self.steps)), self.seconds and share * self.seconds
-
-
 @at_work()
 def compress(
     run: Run,
     output: Path,
-    aim: CompressionTarget,
-    source: str | None = None,
+    aim: CompressOptions = CompressOptions(),
     device: torch.device | str = "cpu",
     show: bool = False,
 ) -> Compressed:
     """A smaller run in a new folder, which opens like any other; gives what compress.json says.
 
-    source: where the photographs are now, if they have moved. Where they cannot be opened, the run's own renderings are
-            learnt from and compared with.
-    show:   whether stages are announced
+    show: whether stages are announced
+    Where the photographs cannot be opened, the run's own renderings are learnt from and compared with.
     Raises LumigraphError for a run that was compressed already, a method that cannot be, a codebook larger than what it
     would stand for, and a size that no rung reaches.
     """
@@ -92,22 +70,22 @@ def compress(
     needs(before, CanCompress)
     if aim.codebook is not None:
         check_codebook(before, aim.codebook)
-    truth = truth_of(run, before, source, JUDGED_VIEWS)
+    truth = truth_of(run, before, aim.scene, JUDGED_VIEWS)
     stages = NumberedStages(STAGES, about_time(truth, aim), show)
     stages.begin()
     ladder = Ladder(run, truth, aim, device, important(before, truth), stages)
-    model = ladder.by_size(aim.size) if aim.size is not None else ladder.by_loss(aim.loss or 0.0)
+    model = ladder.by_size(aim.bytes) if aim.bytes is not None else ladder.by_loss(aim.loss)
     stages.begin()
     return written(run, before, model, truth, output, aim)
 
 
-def about_time(truth: Truth, aim: CompressionTarget) -> str:
+def about_time(truth: Truth, aim: CompressOptions) -> str:
     """Duration of a compression as text; empty if steps limit it."""
-    if aim.seconds is None:
+    if (seconds := aim.tuning_seconds) is None:
         return ""
     learnt, held_out = min(len(truth.scene.splits["train"]), IMPORTANCE_VIEWS), len(truth.scene.splits["test"])
     views = GRADIENT_COST * learnt + len(LADDER).bit_length() * JUDGED_VIEWS + 2 * min(aim.views or held_out, held_out)
-    return f", about {clock(aim.seconds + views * truth.view_seconds)} in all"
+    return f", about {clock(seconds + views * truth.view_seconds)} in all"
 
 
 class Ladder:
@@ -117,7 +95,7 @@ class Ladder:
         self,
         run: Run,
         truth: Truth,
-        aim: CompressionTarget,
+        aim: CompressOptions,
         device: torch.device | str,
         importance: dict[str, Tensor],
         stages: NumberedStages,
@@ -211,10 +189,11 @@ def row_width(tensor: Tensor, layout: str) -> int:
 
 
 def written(
-    run: Run, before: Method, model: CompressedModel, truth: Truth, output: Path, aim: CompressionTarget
+    run: Run, before: Method, model: CompressedModel, truth: Truth, output: Path, aim: CompressOptions
 ) -> Compressed:
     """Write the run; what it says of itself is measured on what was written, opened again."""
     views = min(aim.views or len(truth.scene.splits["test"]), len(truth.scene.splits["test"]))
+    compared = EvaluationOptions("test", views)
     settings = replace(run.settings, said=run.settings.said | {"compressed": {"source": str(run.folder.resolve())}})
     rung = model.rung
     with files.replacing_folder(output) as partial:
@@ -230,8 +209,8 @@ def written(
             bytes_after=small.model_bytes,
             folder_before=folder_bytes(run.folder),
             folder_after=folder_bytes(partial),
-            psnr_before=evaluate(before, truth.scene, "test", views=views).psnr if truth.photographed else None,
-            psnr_after=evaluate(small.method(before.device), truth.scene, "test", views=views).psnr,
+            psnr_before=evaluate(before, truth.scene, compared).psnr if truth.photographed else None,
+            psnr_after=evaluate(small.method(before.device), truth.scene, compared).psnr,
             compared_with="photographs" if truth.photographed else "renderings of the run",
             views=views,
             pruned=rung.pruned,
@@ -278,7 +257,7 @@ def truth_of(run: Run, method: Method, source: str | None, views: int) -> Truth:
     """The run's photographs; where they cannot be opened, and no other place is named, its own renderings."""
     try:
         scene = run.scene(source)
-        found = evaluate(method, scene, "train", views=views)
+        found = evaluate(method, scene, EvaluationOptions("train", views))
         return Truth(scene, True, 10 ** (-found.psnr / 10), found.seconds_per_view)
     except LumigraphError:
         if source is not None:
@@ -289,9 +268,9 @@ def truth_of(run: Run, method: Method, source: str | None, views: int) -> Truth:
     return Truth(scene, False, error, (time.perf_counter() - begin) / len(scene))
 
 
-def squared_error(method: Method, scene: Scene, split: str, views: int) -> float:
+def squared_error(method: Method, scene: Scene, split: Literal["test", "train"], views: int) -> float:
     """Mean over views of what their PSNR is the logarithm of, so that errors can be added."""
-    return 10 ** (-evaluate(method, scene, split, views=views).psnr / 10)
+    return 10 ** (-evaluate(method, scene, EvaluationOptions(split, views)).psnr / 10)
 
 
 def decibels(error: float) -> float:

@@ -1,4 +1,4 @@
-"""Packing: tensors in few bytes. How a tensor may be stored, the forms that tables of numbers take, and one file."""
+"""Packing: compressed tensors. Storage declarations, encodings of tables, and one file."""
 
 from .file import read as read
 from .file import write as write

@@ -1,9 +1,9 @@
-"""One file of tensors in few bytes: a head that declares everything, then streams packed by zstandard.
+"""One file of compressed tensors: a header that declares all sizes, then streams compressed by zstandard.
 
     8 bytes "LUMIPACK" · 4 bytes length of the head · the head, JSON (`Head`) · one stream after another
 
-Nothing of it is unpacked before its declared sizes were compared with the bytes that are there and with the memory that
-is free. Streams that are alike are stored once, so that tensors share a mask of what is kept.
+Declared sizes are compared with the file's bytes and with free memory before anything is unpacked. Equal streams are
+stored once, so that tensors share a mask of kept rows.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Which = Annotated[int, between(0, 1_000_000)]  # stream
 
 @dataclass(frozen=True)
 class PackedPart:
-    """Columns in one form, and the streams that hold it."""
+    """Columns in one form, and their streams."""
 
     form: str
     streams: tuple[Which, ...]
@@ -47,9 +47,9 @@ class PackedPart:
 
 @dataclass(frozen=True)
 class Entry:
-    """A tensor: a `Table`; or the stream that holds it to the bit.
+    """A tensor: a `Table`, or a lossless stream.
 
-    kept: the stream that marks rows which are not `fill`
+    kept: stream with the mask of rows that are not `fill`
     """
 
     shape: tuple[Extent, ...]
@@ -68,14 +68,14 @@ class Head:
 
 
 class Streams:
-    """The streams of a file that is being written: what is there already is not written again."""
+    """Streams of a file in writing, without duplicates."""
 
     def __init__(self) -> None:
         self.about: list[Stream] = []
         self.data: list[bytes] = []
 
     def add(self, array: Shaped[np.ndarray, "*shape"]) -> int:
-        """Its number."""
+        """Add a stream unless it exists. Returns its index."""
         stream, data = to_stream(array)
         for number, (other, known) in enumerate(zip(self.about, self.data, strict=True)):
             if (stream, data) == (other, known):
@@ -86,7 +86,7 @@ class Streams:
 
 
 def write(tensors: dict[str, Tensor | Table]) -> bytes:
-    """The file's bytes. Tables are stored in their forms, tensors to the bit."""
+    """The file's bytes. Tables are stored in their forms, tensors losslessly."""
     streams, entries = Streams(), dict[str, Entry]()
     for name, value in tensors.items():
         if isinstance(value, Tensor):
@@ -101,7 +101,7 @@ def write(tensors: dict[str, Tensor | Table]) -> bytes:
 
 
 def read(data: bytes, path: Path) -> dict[str, Tensor]:
-    """The tensors. path: named in the LumigraphError for a damaged file or one that declares too much."""
+    """Read the tensors. path: named in the LumigraphError for a damaged file or one that declares too much"""
     magic, length = HEAD.unpack(data[: HEAD.size]) if len(data) >= HEAD.size else (b"", 0)
     if magic != MAGIC or HEAD.size + length > len(data):
         raise LumigraphError(f"{path} holds no packed tensors; restore it from a copy")
@@ -116,7 +116,7 @@ def read(data: bytes, path: Path) -> dict[str, Tensor]:
 
 
 def check_sizes(head: Head, there: int, path: Path) -> None:
-    """Raise LumigraphError for streams that are not there, and for tensors that memory would not hold."""
+    """Raise LumigraphError for missing streams, and for tensors that exceed memory."""
     if (declared := sum(stream.bytes for stream in head.streams)) != there:
         raise LumigraphError(
             f"{path} declares {declared:,} bytes of tensors and holds {there:,}; restore it from a copy"
@@ -131,7 +131,7 @@ def check_sizes(head: Head, there: int, path: Path) -> None:
 
 
 def tensor_of(entry: Entry, arrays: list[np.ndarray]) -> Tensor:
-    """A tensor of the streams that hold it. Raises ValueError and its like where they do not fit."""
+    """A tensor from its streams. Raises ValueError and similar errors for inconsistent ones."""
     if entry.exact is not None:
         return torch.from_numpy(arrays[entry.exact].copy()).reshape(entry.shape)
     kept = None if entry.kept is None else torch.from_numpy(arrays[entry.kept])

@@ -1,7 +1,7 @@
-"""Forms: tables of numbers as whole numbers with a scale, as rows of a codebook, as halves; each can learn on.
+"""Forms: encodings of tables as scaled integers, as codebook rows, or as float16; all trainable.
 
-`values()` is what a picture is made of: the stored numbers, whose gradients go straight through the rounding to what
-was rounded (Bengio 2013), so that a table can be tuned as it will be read.
+`values()` are the decoded numbers, with a straight-through gradient to the unrounded ones (Bengio 2013), so that a
+table can be fine-tuned as it will be read.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ MAX_DISTANCES = 1 << 20  # distances of rows to a codebook that are held at once
 def clustered(
     rows: Float[Tensor, "row column"], weights: Float[Tensor, " row"], size: int, generator: torch.Generator
 ) -> tuple[Float[Tensor, "code column"], Int[Tensor, " row"]]:
-    """A codebook of `size` rows and the code of each row: sum_i w_i |x_i - b_{c(i)}|^2 is made small (Lloyd 1982).
+    """Weighted k-means (Lloyd 1982): a codebook of `size` rows and the code of each row, minimising
+    sum_i w_i |x_i - b_{c(i)}|^2.
 
-    Rows that the codebook begins with are drawn by their weights. A code that nothing is nearest to begins anew at one
-    of the rows that are worst off.
+    Initial rows are sampled by their weights. An empty cluster restarts at one of the rows with the largest error.
     """
     weights = weights.double().clamp_min(0) + 1e-9 * (float(weights.max()) if len(weights) else 1.0) + 1e-30
     if len(rows) > MAX_TRAINING_ROWS:
@@ -53,7 +53,7 @@ def clustered(
 def nearest(
     rows: Float[Tensor, "row column"], book: Float[Tensor, "code column"]
 ) -> tuple[Int[Tensor, " row"], Float[Tensor, " row"]]:
-    """The code of each row, and its squared distance."""
+    """Nearest code of each row, and its squared distance."""
     half = 0.5 * book.square().sum(-1)
     codes, errors = torch.empty(len(rows), dtype=torch.int64), torch.empty(len(rows))
     chunk = max(1, MAX_DISTANCES // max(1, len(book)))
@@ -72,7 +72,7 @@ TUNING_UNIT = 0.02  # of a float16's typical size: what tuning takes for its uni
 
 
 class Form(ABC):
-    """A table in some form.
+    """An encoded table.
 
     name:  of the form, in files
     width: columns
@@ -83,7 +83,7 @@ class Form(ABC):
 
     @abstractmethod
     def values(self) -> Float[Tensor, "row column"]:
-        """The numbers as they will be read; differentiable in what learns."""
+        """The decoded numbers; differentiable in the trainable tensors."""
 
     @abstractmethod
     def learning(self) -> list[tuple[Tensor, float]]:
@@ -91,11 +91,11 @@ class Form(ABC):
 
     @abstractmethod
     def streams(self) -> list[np.ndarray]:
-        """The arrays that a file keeps."""
+        """Arrays to store in a file."""
 
 
 class Half(Form):
-    """Numbers of 16 bits."""
+    """Table of float16 numbers."""
 
     name = "half"
 
@@ -118,7 +118,7 @@ class Half(Form):
 
 
 class Scaled(Form):
-    """low + step · n: whole numbers n, of 8 or 16 bits, with a scale for each column."""
+    """Table of scaled integers: low + step · n, n of 8 or 16 bits, with a scale for each column."""
 
     name = "scaled"
 
@@ -156,7 +156,7 @@ class Scaled(Form):
 
 
 class Coded(Form):
-    """b_c: each row is one of a codebook's, and the most important ones are their own (Li 2023, VQRF).
+    """Vector-quantised table b_c: rows of a codebook; the most important rows are stored scaled (Li 2023, VQRF).
 
     weights: importance of the rows
     size:    rows of the codebook
@@ -222,7 +222,7 @@ def straight(exact: Float[Tensor, "*shape"], rounded: Float[Tensor, "*shape"]) -
 
 
 def most_important(weights: Float[Tensor, " row"], share: float) -> Bool[Tensor, " row"]:
-    """The fewest rows that add up to a share of all weight."""
+    """Mask of the fewest rows that add up to a share of the total weight."""
     order = weights.double().argsort(descending=True, stable=True)
     before = weights.double()[order].cumsum(0) - weights.double()[order]
     chosen = torch.zeros(len(weights), dtype=torch.bool)

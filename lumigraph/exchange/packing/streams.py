@@ -1,4 +1,4 @@
-"""Streams: arrays of few kinds, entropy-coded with zstandard, and unpacked to the declared size at most."""
+"""Streams: arrays of some dtypes, compressed with zstandard, and unpacked to the declared size at most."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ Number = Literal["bool", "uint8", "uint16", "int32", "int64", "float16", "float3
 class Stream:
     """An array within a file.
 
-    bytes: that it takes there
-    delta: whether each row is stored as its difference to the one before; of whole numbers alone
+    bytes: compressed size
+    delta: whether rows are stored as differences to the previous one; for integers only
     """
 
     dtype: Number
@@ -36,13 +36,13 @@ class Stream:
 
     @property
     def size(self) -> int:
-        """Bytes of the array before it is entropy-coded, as the file declares them."""
+        """Declared bytes of the array before compression."""
         count = math.prod(self.shape)
         return -(-count // 8) if self.dtype == "bool" else count * np.dtype(self.dtype).itemsize
 
 
 def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
-    """An array as a stream, whichever way is smaller."""
+    """An array as a stream, with or without delta coding, the smaller of both."""
     ways = (False, True) if array.dtype.kind in "ui" and array.ndim else (False,)
     quick, coder = (zstandard.ZstdCompressor(level=level) for level in (QUICK_LEVEL, ZSTD_LEVEL))
     found = []
@@ -55,7 +55,7 @@ def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
 
 
 def kind_of(array: Shaped[np.ndarray, "*shape"]) -> Number:
-    """The name of an array's numbers, one of those that a file may hold."""
+    """Name of an array's dtype, one of those allowed in files."""
     assert array.dtype.name in get_args(Number)
     return cast(Number, array.dtype.name)
 
@@ -77,7 +77,7 @@ def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
 
 
 def take(stream: Any, size: int) -> bytes:
-    """Exactly `size` bytes, in pieces, so that memory grows with the data and not with the declared size."""
+    """Decompress exactly `size` bytes, in pieces, so that memory grows with the data and not with the declared size."""
     pieces = []
     while size:
         piece = stream.read(min(size, CHUNK_BYTES))
@@ -89,7 +89,7 @@ def take(stream: Any, size: int) -> bytes:
 
 
 def _bytes(array: Shaped[np.ndarray, "*shape"]) -> bytes:
-    """Column by column, and of each number the first bytes, then the second ones: similar bytes are together."""
+    """Byte shuffle: column by column, first bytes of all numbers, then second ones, which compresses better."""
     if array.dtype == bool:
         return np.packbits(array).tobytes()
     columns = np.ascontiguousarray(array.reshape(array.shape[0] if array.ndim else 1, -1).T) if array.size else array

@@ -1,4 +1,4 @@
-"""Table: one tensor as rows and columns, without the rows where nothing is, its columns in one form or two."""
+"""Table: one tensor as rows and columns, without empty rows, its columns in one form or two."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Layout = Literal["rows", "cells", "channels"]
 class Stored:
     """Storage format of a tensor, seen as a table of rows and columns.
 
-    how:   "scaled", as whole numbers with a scale for each column; "coded", as rows of a codebook, the most important
+    how:   "scaled", as integers with a scale for each column; "coded", as rows of a codebook, the most important
            ones scaled; "half", as float16; "nothing", because rendering does not need it: it reads as `fill`.
-           A tensor without a declaration is stored to the bit; a mask (bool) as one bit each
-    bits:  of a whole number
+           A tensor without a declaration is stored losslessly; a mask (bool) as one bit each
+    bits:  of an integer
     layout: meaning of a row: "rows", the first axis; "cells", of (..., channel); "channels", the cells of
            (grid, channel, x, y, z)
-    plain: columns at the front that are scaled, also where the others are coded
+    plain: leading columns that are scaled, also where the others are coded
     fill:  the value of all numbers in an empty row; such rows are not stored
     """
 
@@ -47,8 +47,8 @@ class Recipe:
     """Strength of the compression.
 
     codebook: largest number of its rows
-    apart:    share of importance that stays out of it, see `forms.Coded`
-    coarser:  bits to take off the method's own number of bits
+    apart:    share of importance outside the codebook, see `forms.Coded`
+    coarser:  bits to subtract from the method's own number of bits
     """
 
     codebook: int = 4096
@@ -59,9 +59,9 @@ class Recipe:
 class Table:
     """A tensor of `shape`, whose rows that are not in `kept` are all `fill`.
 
-    layout: what is a row, see `Stored`;  kept: None for all rows
-    forms: side by side, left to right; none where nothing is kept
-    dtype: of the tensor; float32 unless nothing is kept
+    layout: meaning of a row, see `Stored`;  kept: None for all rows
+    forms: side by side, left to right; empty if no row is kept
+    dtype: of the tensor; float32 unless no row is kept
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Table:
         self.dtype = dtype
 
     def values(self) -> Float[Tensor, "row column"]:
-        """The rows that are kept."""
+        """The kept rows."""
         return torch.cat([form.values() for form in self.forms], -1)
 
     def tensor(self) -> Shaped[Tensor, "*shape"]:
@@ -89,7 +89,7 @@ class Table:
 
     @torch.no_grad()
     def put(self, tensor: Float[Tensor, "*shape"], values: Float[Tensor, "row column"] | None = None) -> None:
-        """Write the rows that are kept into a tensor of the same shape. values: where they are known already"""
+        """Write the kept rows into a tensor of the same shape. values: if known already"""
         values = (self.values() if values is None else values).to(tensor.device)
         rows = as_rows(tensor, self.layout)
         if self.kept is None:

@@ -26,11 +26,12 @@ from ...errors import LumigraphError
 from ...geometry import evenly
 from ...paths.opening import Opening
 from ...system.progress import track
+from ..mesh_file import write_mesh
+from ..options import Photo3DOptions
 from ..page import mesh_page
 from .layers import background, mesh_of, texture_of
 from .stitching import dense_inverse_depth, drawn, exposures, stitched
 
-MAX_PHOTOGRAPHS = 16
 MIN_PARALLAX = 0.004  # of the distance between photographs to the median depth; below it there is one place
 MIN_SURE = 0.02  # share of pixels of sure depth, below which photographs have no parallax
 MARGIN = 0.002  # of the panorama's angles, cut off where single rays of photographs reach farther
@@ -63,15 +64,26 @@ class Photo3D:
     flat: bool
 
 
+def export_photo3d(scene: Scene, path: Path, title: str, options: Photo3DOptions = Photo3DOptions()) -> Photo3D:
+    """Write a 3-D photograph as a page (.html) or a textured mesh (.glb). title: of a page whose options have none"""
+    found = photo3d(scene, options)
+    if path.suffix.lower() == ".html":
+        write_page(path, found, options.title or title)
+    else:
+        up = scene.frame.to_source.rotation[:, 2].numpy()
+        write_mesh(path, found.mesh.in_source(scene.frame), up, origin=scene.frame.origin if options.origin else None)
+    return found
+
+
 @torch.no_grad()
-def photo3d(scene: Scene, size: int, views: int = MAX_PHOTOGRAPHS) -> Photo3D:
-    """A 3-D photograph of the training photographs. size: pixels along the longer side of the depth maps, about"""
-    numbers = evenly(scene.splits["train"].tolist(), views)
+def photo3d(scene: Scene, options: Photo3DOptions = Photo3DOptions()) -> Photo3D:
+    """A 3-D photograph of the training photographs."""
+    numbers = evenly(scene.splits["train"].tolist(), options.views)
     if len(numbers) < 2:
         raise LumigraphError(
             f"{scene.source} has one photograph; a 3-D photograph needs two or more, beside each other"
         )
-    maps = depth_of(scene, numbers, size)
+    maps = depth_of(scene, numbers, options.size)
     positions = torch.cat([seen.camera.position for seen in maps])
     sure = torch.cat([seen.depth[seen.solid] for seen in maps])
     spread = float((positions - positions.mean(0)).norm(dim=-1).max())

@@ -23,19 +23,19 @@ def antialias(
     faces: Int[Tensor, "face 3"],
     neighbours: Int[Tensor, "face 3"],
 ) -> Float[Tensor, "height width channel"]:
-    """A picture of `rasterize_mesh` whose pixels blend across silhouettes, so that gradients reach the vertices there
+    """Picture of `rasterize_mesh` whose pixels blend across silhouettes, so that gradients reach the vertices there
     (Laine 2020, section 3.6).
 
-    Of two neighbouring pixels A and B, left and right or above and below, with different triangles the nearer one's
-    surface is followed towards the other's centre, from triangle to triangle. Where it ends at an edge, by itself or
-    because it turns away, with s the distance from the middle between A and B to that edge,
+    For two neighbouring pixels A and B (left and right, or above and below) with different triangles, the nearer
+    surface is followed from triangle to triangle towards the other pixel's centre. It ends at a boundary or silhouette
+    edge. With s the distance from the middle between A and B to that edge,
 
         B += s (A - B)  for s > 0      A's surface reaches into B
         A += s (A - B)  for s < 0      B's surface reaches into A
 
-    An edge that is steeper than 45 degrees is for pixels side by side, all others for pixels above each other. So the
+    Edges steeper than 45 degrees are used for pixels side by side, all others for pixels above each other. So the
     sum over a picture is the area that a surface covers, and its gradient the area that moving edges sweep. Following
-    the surface finds edges of triangles that no pixel's centre lies in; Laine 2020 looks at one triangle alone.
+    the surface finds edges of triangles without a pixel's centre inside; Laine 2020 looks at one triangle alone.
 
     depth, found: of `rasterize_mesh` for the same corners and faces
     neighbours:   of `neighbours`
@@ -50,7 +50,7 @@ def antialias(
 
 
 def neighbours(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "face 3"]:
-    """The triangle beyond the edge across from each corner, int32; -1 where there is none, or more than one."""
+    """Triangle across the edge opposite each corner, int32; -1 for none or more than one."""
     edges = torch.stack([faces.roll(-1, 1), faces.roll(-2, 1)], -1).reshape(-1, 2).long().sort(-1).values
     _, number, count = edges.unique(dim=0, return_inverse=True, return_counts=True)
     order = number.argsort()
@@ -61,7 +61,7 @@ def neighbours(faces: Int[Tensor, "face 3"]) -> Int[Tensor, "face 3"]:
 
 
 def cases(generator: torch.Generator):
-    """Pictures that every engine must agree on: no triangles, few large ones, many less than a pixel, a soup."""
+    """Test pictures for all engines: no triangles, few large ones, many less than a pixel, a soup."""
     scenes = [(0, (5, 3), 2), (12, (9, 7), 1), (30, (16, 12), 3), (60, (19, 27), 4), (700, (12, 12), 2)]
     for count, size, channels in scenes:
         yield _picture(*ball(count, size, generator), size, channels, generator)
@@ -75,7 +75,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A square picture of `size` pixels of a ball of a triangle for every 8 of them, with six channels."""
+    """A square picture of `size` pixels with six channels: a ball with one triangle for every 8 pixels."""
     width = round(size**0.5)
     corners, faces = ball(size // 16, (width, width), generator)
     picture, *given = _picture(corners, faces, (width, width), 6, generator, "cpu")
@@ -84,7 +84,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _picture(corners, faces, size, channels, generator, engine="reference"):
-    """Random colours of triangles, seen before a random background."""
+    """Randomly coloured triangles over a random background."""
     with using(engine):
         _, depth, found = rasterize_mesh(corners, corners, faces, size)
     colours = torch.rand(len(faces) + 1, channels, generator=generator)

@@ -1,5 +1,5 @@
-"""Numba: rows share out the picture. Each pixel follows the surface to its right and lower neighbours, then takes what
-the four pairs that it belongs to give it. Only the few edges found are summed up by one thread.
+"""Numba: threads share the rows. Each pixel follows the surface to its right and lower neighbours, then blends over the
+four pairs that it belongs to. One thread sums the gradients of the few silhouette edges.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ def _row(planes, k):
 
 @njit(**FAST)
 def _silhouette(f, x, y, dx, dy, corners, faces, neighbours):
-    """The edge, 3 f + k, at which the surface of triangle f, seen at (x, y), ends on the way to (x + dx, y + dy); -1
-    where it does not."""
+    """Silhouette edge 3 f + k at which the surface of triangle f, seen at (x, y), ends before (x + dx, y + dy); -1
+    for none."""
     for _ in range(MAX_FACES):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if min(corners[a, 2], corners[b, 2], corners[c, 2]) <= 0:
@@ -50,8 +50,10 @@ def _silhouette(f, x, y, dx, dy, corners, faces, neighbours):
 
 @njit(**FAST)
 def _crossing(edge, row, column, axis, corners, faces):
-    """Where an edge crosses the line through the centres of a pixel and its neighbour along an axis, from the middle
-    between them; the share of the way along the edge; its slope; whether it is steep enough to count."""
+    """Crossing of an edge with the line through the centres of a pixel and its neighbour along an axis: distance from
+    the middle between them, position along the edge in [0, 1], the edge's slope, and whether it is steep enough to
+    count.
+    """
     f, k = edge // 3, edge % 3
     i, j = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
     other = 1 - axis
@@ -66,7 +68,7 @@ def _crossing(edge, row, column, axis, corners, faces):
 
 @njit(parallel=True, **FAST)
 def _find(depth, found, corners, faces, neighbours, edges, shifts):
-    """Edge and s of each pixel and its neighbour to the right, and below; -1 and 0 for none."""
+    """Edge and s for each pixel with its right neighbour and with its lower one; -1 and 0 for none."""
     height, width = found.shape
     for number in prange(height):
         row = np.int64(number)  # or Numba makes floating-point numbers of its sums
@@ -111,7 +113,7 @@ def _blend(picture, shifts, out):
 
 @njit(parallel=True, **FAST)
 def _to_picture(grad, picture, edges, shifts, out, to_shifts):
-    """Gradient of the picture, and of each pair's s."""
+    """Gradients of the picture and of each pair's s."""
     height, width, channels = picture.shape
     for number in prange(height):
         row = np.int64(number)  # or Numba makes floating-point numbers of its sums
@@ -136,7 +138,9 @@ def _to_picture(grad, picture, edges, shifts, out, to_shifts):
 
 @njit(**FAST)
 def _to_corners(to_shifts, edges, corners, faces, out):
-    """ds is (1 - share, share) times the ends' movement along the axis, less the edge's slope times that across it."""
+    """Gradient of vertices: ds = (1 - share, share) times the ends' movement along the axis, less slope times that
+    across it.
+    """
     height, width, _ = edges.shape
     out[:] = 0
     for row in range(height):

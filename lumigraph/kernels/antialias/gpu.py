@@ -15,8 +15,7 @@ PAIRS = tl.constexpr(64)  # of a program
 
 @triton.jit
 def _leaves(plane, sign, x, y, dx, dy):
-    """How far towards (x + dx, y + dy) a triangle's edge is crossed outwards, as a share of the way; infinity for not
-    at all."""
+    """Distance to the exit through a triangle's edge, as a fraction of (dx, dy); infinity for none."""
     slope = (plane[0] * dx + plane[1] * dy) * sign
     here = (plane[0] * x + plane[1] * y + plane[2]) * sign
     out = (slope < 0) & (here + slope < 0)
@@ -30,7 +29,7 @@ def _chosen(k, first, second, third):
 
 @triton.jit
 def _pairs(N, width, height):
-    """Numbers of pairs and of their first pixels, that pixel's column and row, the pair's axis, and a mask."""
+    """Indices of pairs and of their first pixels, these pixels' columns and rows, the pairs' axes, and a mask."""
     n, here = indices(N, PAIRS)
     axis, pixel = n % 2, n // 2
     column, row = pixel % width, pixel // width
@@ -47,7 +46,7 @@ def _ends(edge, faces, here):
 
 @triton.jit
 def _vertex(corners, v, axis, here):
-    """Place of a vertex along an axis and across it, and its depth."""
+    """Coordinates of a vertex along an axis and across it, and its depth."""
     z = tl.load(corners + 3 * v + 2, mask=here, other=1.0).to(tl.float64)
     along = tl.load(corners + 3 * v + axis, mask=here, other=0.0).to(tl.float64) / z
     return along, tl.load(corners + 3 * v + 1 - axis, mask=here, other=0.0).to(tl.float64) / z, z
@@ -55,7 +54,7 @@ def _vertex(corners, v, axis, here):
 
 @triton.jit
 def _crossing(edge, column, row, axis, corners, faces, here):
-    """Vertices of an edge with their places, s, the share of the way along the edge, its slope, and whether it is steep
+    """Vertices of an edge and their positions, s, position along the edge in [0, 1], its slope, and whether it is steep
     enough to count."""
     i, j = _ends(edge, faces, here)
     a, c, z = _vertex(corners, i, axis, here)
@@ -70,7 +69,7 @@ def _crossing(edge, column, row, axis, corners, faces, here):
 
 @triton.jit
 def _follow(f, x, y, dx, dy, going, corners, faces, neighbours):
-    """The edge at which each surface ends, 3 f + k; -1 for none."""
+    """Silhouette edge 3 f + k at which each surface ends; -1 for none."""
     edge = tl.full([PAIRS], -1, tl.int64)
     step = 0
     while (step < MAX_FACES) & (tl.sum(going.to(tl.int32), 0) > 0):
@@ -137,7 +136,7 @@ def _forward(
 
 @triton.jit
 def _move(d_corners, v, place, g, slope, axis, here):
-    """The gradient of a vertex h whose place along the axis has the gradient g, and that across it -g slope."""
+    """Gradient of a vertex h from that of its position: g along the axis, -g slope across it."""
     along, across, z = place
     _add(d_corners + 3 * v + axis, g / z, here)
     _add(d_corners + 3 * v + 1 - axis, -g * slope / z, here)

@@ -1,4 +1,4 @@
-"""The definition: all pairs of pixels at once."""
+"""Reference implementation: all pairs of pixels at once."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(picture: Tensor, depth: Tensor, found: Tensor, corners: Tensor, faces: T
 
 @torch.no_grad()
 def silhouettes(a, b, axis, depth, found, corners, faces, neighbours) -> Tensor:
-    """The two vertices of the edge at which the nearer surface ends between each pair of pixels; -1 for none."""
+    """Vertices of the silhouette edge of the nearer surface between each pair of pixels; -1 for none."""
     ends = torch.full((len(a), 2), -1, device=a.device)
     away = depth.view(-1).where(found.view(-1) >= 0, torch.inf)
     near = torch.where(away[a] <= away[b], a, b)
@@ -66,5 +66,5 @@ def _centre(pixel: Tensor, width: int, like: Tensor) -> Tensor:
 
 
 def _turned(x: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates along the axis on which two pixels lie, and across it."""
+    """Coordinates along the axis of a pixel pair, and across it."""
     return x.gather(1, axis)[:, 0], x.gather(1, 1 - axis)[:, 0]

@@ -1,4 +1,4 @@
-"""Allocation: blocks of voxels along the truncation band of a depth map that a table does not hold yet."""
+"""Allocation: voxel blocks in the truncation band of a depth map that are not in the hash table yet."""
 
 import math
 
@@ -24,11 +24,11 @@ def band_blocks(
     side: float,
     truncation: float,
 ) -> Int32[Tensor, "new 3"]:
-    """Coordinates floor(p / side) of the blocks at places p along each pixel's ray (Nießner 2013, sec. 4.2),
+    """Coordinates floor(p / side) of the blocks at points p along each pixel's ray (Nießner 2013, sec. 4.2),
 
-        p = o + t d,    t = depth - truncation ... depth + truncation,   at least two places to a side
+        p = o + t d,    t = depth - truncation ... depth + truncation,   at least two points per block side
 
-    of those that the table does not hold; each once, in the order of x, y, z.
+    that are missing from the table; each once, sorted by x, y, z.
 
     depth: along rays; pixels that are not finite or not positive have no blocks
     pose:  camera-to-world, OpenCV axes; lens: of a pinhole, focal lengths and centre (fx, fy, cx, cy) in pixels
@@ -60,7 +60,7 @@ def wall(height: int, width: int, generator: torch.Generator) -> Float[Tensor, "
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: no pixel, holes alone, blocks that are there already."""
+    """Test inputs for all engines: no pixel, depth without values, blocks that the table has already."""
     for height, width, held, side, truncation in [
         (0, 5, 3, 0.2, 0.1),
         (1, 1, 0, 0.1, 0.1),
@@ -76,7 +76,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A wall in a depth map of a fourth as many pixels, half a thousand blocks there already."""
+    """A wall in a depth map of size / 4 pixels, with 500 blocks in the table."""
     side = max(round((size / 4) ** 0.5), 1)
     depth, (pose, _), blocks = wall(side, side, generator), hand_held(generator), random_blocks(500, 7, generator)
     lens = torch.tensor([side * 0.9, side * 0.9, side / 2, side / 2])

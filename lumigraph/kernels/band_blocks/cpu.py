@@ -1,4 +1,4 @@
-"""Numba: rays one after another. New blocks go to a small table of their own, and are sorted in the end."""
+"""Numba: one ray after another. New blocks go to a small hash table of their own and are sorted at the end."""
 
 import math
 
@@ -17,7 +17,7 @@ FAR = np.int32(2**31 - 1)  # coordinate of no block
 
 @njit(cache=True, error_model="numpy")
 def _place(new, count, own):
-    """The table `own` of the new blocks so far."""
+    """Rebuild the hash table `own` of the new blocks."""
     own[:] = NONE
     mask = len(own) - 1
     for i in range(count):
@@ -29,8 +29,8 @@ def _place(new, count, own):
 
 @njit(cache=True, error_model="numpy")
 def _walk(depth, pose, lens, blocks, table, side, truncation, steps, begin, new, count, own):
-    """Blocks along rays from pixel `begin` on, until the room for new ones is half full; returns the pixel it came to
-    and the number of new blocks."""
+    """Collect blocks along rays from pixel `begin` on, until `new` is half full. Returns the next pixel and the number
+    of new blocks."""
     height, width = depth.shape
     mask, step = len(own) - 1, np.float32(2) * truncation / np.float32(steps)
     for pixel in range(begin, height * width):

@@ -1,4 +1,4 @@
-"""Triton: one lane takes one place on one ray, and says which block it lies in unless the table holds that."""
+"""Triton: one lane takes one point on one ray and writes its block unless the table has it."""
 
 import torch
 import triton

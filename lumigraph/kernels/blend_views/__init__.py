@@ -63,7 +63,7 @@ def blend_views(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: one photograph and many, distortion, points behind, unknown depth."""
+    """Test inputs for all engines: one photograph and many, distortion, points behind, unknown depth."""
     for pixels, views, count, distortion in [(0, 2, 1, 0.0), (1, 1, 4, 0.0), (60, 7, 3, 0.1), (33, 5, 8, 0.0)]:
         yield _inputs(pixels, views, count, distortion, generator)
     points, eyes, focal, pictures, depths, *others = _inputs(40, 6, 2, 0.1, generator)
@@ -75,12 +75,12 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """So many pixels, a photograph for each eight of them at most, four of eight blended."""
+    """`size` pixels, a photograph for every eight of them at most, the best four of eight blended."""
     return _inputs(size, 8, 4, 0.05, generator, side=max(8, round((size / 8) ** 0.5)))
 
 
 def _inputs(pixels, views, count, distortion, generator, side=19):
-    """Photographs in a row that look along z, and points ahead of them."""
+    """A row of cameras that look along z, with random photographs, and points ahead of them."""
 
     def uniform(*shape):
         return torch.rand(shape, generator=generator)

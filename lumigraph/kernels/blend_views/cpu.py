@@ -1,4 +1,4 @@
-"""Numba. A task takes a run of points; of each point's penalties it keeps the least in order."""
+"""Numba. A task takes a run of points and keeps each point's least penalties in order."""
 
 import numpy as np
 from numba import njit, prange
@@ -15,7 +15,7 @@ FAST = {"fastmath": True, "error_model": "numpy"}
 
 @njit(**FAST)
 def _place(poses, lenses, n, px, py, pz):
-    """Pixel of a point, and its distance; the distance is 0 where the lens does not see it."""
+    """Pixel of a point, and its distance; distance 0 if the point is outside the view."""
     x = poses[n, 0, 0] * px + poses[n, 0, 1] * py + poses[n, 0, 2] * pz + poses[n, 0, 3]
     y = poses[n, 1, 0] * px + poses[n, 1, 1] * py + poses[n, 1, 2] * pz + poses[n, 1, 3]
     z = poses[n, 2, 0] * px + poses[n, 2, 1] * py + poses[n, 2, 2] * pz + poses[n, 2, 3]
@@ -37,7 +37,7 @@ def _place(poses, lenses, n, px, py, pz):
 
 @njit(**FAST)
 def _gap(depths, n, u, v, width, height, away):
-    """Least difference between a distance and those of the four pixels around a place; UNSEEN where none is known."""
+    """Least difference between a distance and the four depths around a pixel; UNSEEN if all are unknown."""
     x = min(max(u - HALF, ZERO), np.float32(width - 1))
     y = min(max(v - HALF, ZERO), np.float32(height - 1))
     left, top = int(x), int(y)
@@ -52,7 +52,7 @@ def _gap(depths, n, u, v, width, height, away):
 
 @njit(**FAST)
 def _add_colour(pictures, n, u, v, width, height, weight, out, i):
-    """Add a photograph's colour at a place, times a weight, to row i."""
+    """Add a photograph's interpolated colour, times a weight, to row i."""
     x = min(max(u - HALF, ZERO), np.float32(width - 1))
     y = min(max(v - HALF, ZERO), np.float32(height - 1))
     left, top = int(x), int(y)

@@ -1,4 +1,4 @@
-"""Triton: penalties of all photographs at all points, then the colours of the least."""
+"""Triton: penalties of all photographs at all points, then a blend of the least."""
 
 import torch
 import triton
@@ -20,7 +20,7 @@ def _row(pose, row: tl.constexpr, x, y, z):
 
 @triton.jit
 def _between(u, side):
-    """The two pixels around a place along one side, and how far it lies towards the second."""
+    """The two pixels around a coordinate along one axis, and the interpolation weight of the second."""
     x = tl.minimum(tl.maximum(u - 0.5, 0.0), side.to(tl.float32) - 1)
     first = x.to(tl.int64)
     return first, tl.minimum(first + 1, side - 1), x - first.to(tl.float32)

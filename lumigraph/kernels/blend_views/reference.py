@@ -1,4 +1,4 @@
-"""The definition: penalties of all photographs at all points, (V, P), then the least of them."""
+"""Reference implementation: penalties of all photographs at all points, (V, P), then the least of them."""
 
 import torch
 from torch import Tensor
@@ -45,7 +45,7 @@ def run(
 
 
 def place(local: Tensor, lens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (u, v) of points in a camera's frame, and whether the lens sees them."""
+    """Pixels (u, v) of points in camera coordinates, and a mask of those inside the view."""
     x, y, z = local.unbind(-1)
     valid = z > BEHIND_DEPTH
     x, y = (torch.where(valid, a / torch.where(valid, z, 1), 0) for a in (x, y))
@@ -58,7 +58,7 @@ def place(local: Tensor, lens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def corners(values: Tensor, u: Tensor, v: Tensor, size: Tensor):
-    """Values of the four pixels around places of a picture, and how far right and down in between they lie."""
+    """Values of the four pixels around points of a picture, and the interpolation weights to the right and down."""
     x, y = ((at.nan_to_num(0.5) - 0.5).clamp_min(0).minimum(side - 1) for at, side in zip((u, v), size, strict=True))
     left, top = x.floor().long(), y.floor().long()
     right, below = (left + 1).minimum(size[0] - 1), (top + 1).minimum(size[1] - 1)

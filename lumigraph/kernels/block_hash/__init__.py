@@ -43,14 +43,14 @@ def new_table(blocks: Int32[Tensor, "block 3"]) -> Int32[Tensor, " slot"]:
 
 
 def random_blocks(count: int, reach: int, generator: torch.Generator) -> Int32[Tensor, "block 3"]:
-    """So many different coordinates from -reach up to reach - 1, for tests."""
+    """`count` distinct random coordinates from -reach to reach - 1, for tests."""
     drawn = torch.randperm((2 * reach) ** 3, generator=generator)[:count]
     across = torch.stack([drawn // (2 * reach) ** 2, drawn // (2 * reach) % (2 * reach), drawn % (2 * reach)], -1)
     return (across - reach).int()
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: an empty table, nearly full ones, blocks that are added later."""
+    """Test inputs for all engines: an empty table, nearly full ones, blocks that are added later."""
     for count, slots, first in [(0, 1, 0), (1, 2, 0), (3, 4, 1), (60, 64, 0), (60, 64, 41), (100, 256, 30)]:
         blocks = random_blocks(count, 4, generator)
         table = torch.full((slots,), EMPTY, dtype=torch.int32)
@@ -58,6 +58,6 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A thousandth of so many blocks in a table that is less than half full."""
+    """size / 1000 blocks in a table that is less than half full."""
     blocks = random_blocks(max(size // 16, 1), 32, generator)
     return blocks, torch.full((1 << len(blocks).bit_length() + 1,), EMPTY, dtype=torch.int32), 0

@@ -1,4 +1,4 @@
-"""Numba: one block after another. Each evicts a smaller number, which goes on to the next slot."""
+"""Numba: blocks are inserted one after another. Each evicts smaller numbers, which move to the next slot."""
 
 import numpy as np
 import torch

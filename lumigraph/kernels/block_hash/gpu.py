@@ -1,4 +1,6 @@
-"""Triton: one lane carries one block, or the one that it evicts, on to the next slot until it finds an empty one."""
+"""Triton: one lane inserts one block; it carries the block, or the one evicted, from slot to slot until one is
+empty.
+"""
 
 import torch
 import triton

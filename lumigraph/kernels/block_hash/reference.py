@@ -1,4 +1,4 @@
-"""The definition, in plain PyTorch: all blocks step from slot to slot together until each has one."""
+"""Reference implementation in PyTorch: all blocks probe in lockstep until each has a slot."""
 
 import torch
 

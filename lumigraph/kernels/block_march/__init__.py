@@ -20,20 +20,20 @@ MAX_BLOCK_DISTANCE = 64  # blocks; the same for empty blocks
 
 @dataclass(frozen=True)
 class Blocks:
-    """Table row of each voxel of a mostly empty grid; made by `of`.
+    """Sparse voxel grid in blocks: table row of each voxel; made by `of`.
 
-    Voxel (x, y, z) has its centre there. Block (a, b, c) holds voxels from (a, b, c) * block on, and one more on each
-    side, its apron, so that all that is blended at a place lies within one block.
+    Voxel (x, y, z) has its centre there. Block (a, b, c) has the voxels from (a, b, c) * block on and an apron of one
+    voxel on each side, so that trilinear interpolation stays within one block.
 
-    With a `ball` the voxels lie in contracted coordinates (Barron 2022, eq. 10), h the ball's radius, c the middle of
+    With a `ball` the voxels are in contracted coordinates (Barron 2022, eq. 10), h the ball's radius, c the centre of
     the grid, 4 h voxels wide: x is x inside the ball around c, and beyond it c + (2 - h / |x - c|) h (x - c) / |x - c|,
-    so that all there is lies within 2 h of c.
+    so that all of space lies within 2 h of c.
 
-    index: each block's number; or -d where it and its apron are empty, and so are all blocks fewer than d away
-    rows:  of each voxel of each block: its row; or -d where it is empty, and all voxels within that block that are
-           fewer than d away along every axis are, too
-    count: of rows
-    ball:  radius in voxels of the ball inside of which nothing is contracted; 0 where nothing is anywhere
+    index: number of each block; or -d if it and its apron are empty, and so are all blocks fewer than d away
+    rows:  table row of each voxel of each block; or -d if it is empty, and so are all voxels of that block that are
+           fewer than d away along every axis
+    count: number of rows
+    ball:  radius in voxels of the uncontracted ball; 0 for no contraction
     """
 
     index: Int32[Tensor, "x y z"]
@@ -45,8 +45,8 @@ class Blocks:
     def of(
         cls, places: Int[Tensor, "row 3"], shape: tuple[int, int, int], block: int, contracted: bool = False
     ) -> Blocks:
-        """Rows for voxels at these places, which all differ, of a grid of a shape; contracted, it is a cube. Raises
-        ValueError for others."""
+        """Blocks of voxels at these distinct coordinates in a grid of a shape, a cube if contracted. Raises ValueError
+        for duplicates and for coordinates outside."""
         size = torch.tensor(shape, device=places.device)
         require(not contracted or len(set(shape)) == 1, f"what is contracted lies in a cube, and {shape} is none")
         require(bool(((places >= 0) & (places < size)).all()), f"places of voxels go from 0 below {shape}")
@@ -86,7 +86,9 @@ class Blocks:
 
 
 def _with_distances(rows: Int32[Tensor, "n x y z"], farthest: int, beyond: bool) -> Int32[Tensor, "n x y z"]:
-    """Rows with distances to the nearest row at empty places. beyond: whether there may be rows around them"""
+    """Rows with Chebyshev distances to the nearest row at empty voxels. beyond: whether there may be rows outside
+    the array
+    """
     near = torch.nn.functional.pad(rows >= 0, (1,) * 6, value=beyond)
     far = torch.full_like(near, farthest, dtype=torch.int8)
     for distance in range(1, farthest):
@@ -114,17 +116,17 @@ def block_march(
     """Accumulate premultiplied values front to back, one voxel a step (Hedman 2021, section 5.2).
 
         t_i = enter + i, while t_i < leave      v_i: trilinear at o + t_i d, alpha_i one of its channels
-        T_i = prod_{j<i} (1 - alpha_j)          light that reaches step i; 0 once it is below `stop`
+        T_i = prod_{j<i} (1 - alpha_j)          transmittance; 0 once it is below `stop`
 
-    In contracted blocks v_i is found where o + t_i d lies contracted, and t_i goes on by as much as brings the ray one
-    voxel onward there: r / (h^2 s / r - cos), where r is the distance from the middle, cos that of the angle to the way
-    out, h^2 s / r^2 the ray's speed in contracted voxels, s^2 = 1 + 4 (r sin / h)^2 (1 - h / r). To first order that
-    is r^2 / (h^2 s), the rest makes it exact straight in and out.
+    In contracted blocks v_i is looked up at the contraction of o + t_i d, and the step of t_i is that of one contracted
+    voxel: r / (h^2 s / r - cos), where r is the distance from the centre, cos that of the angle to the outward
+    direction, h^2 s / r^2 the ray's speed in contracted voxels, s^2 = 1 + 4 (r sin / h)^2 (1 - h / r). To first order
+    that is r^2 / (h^2 s); the rest makes it exact for radial rays.
 
-    origins:      in voxels; the centre of voxel (x, y, z) is there; never contracted
+    origins:      in voxels, centre of voxel (x, y, z) at (x, y, z); never contracted
     directions:   unit length
     enter, leave: distances of the first step and of the end, in voxels as origins
-    blocks:       which row each voxel has, 0 where it has none; trusted to be as its maker leaves it
+    blocks:       table row of each voxel, 0 where it has none; trusted to be unchanged since `of`
     values:       (blocks.count, 8): red, green, blue, alpha, four features, all but alpha multiplied by alpha
 
     Returns sum_i T_i v_i (R, 8), of which alpha's channel is the opacity, and sum_i T_i alpha_i t_i (R,).
@@ -135,7 +137,7 @@ def block_march(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: none, haze, walls, several sizes of blocks, rays beside the grid."""
+    """Test inputs for all engines: none, haze, walls, several sizes of blocks, rays beside the grid."""
     for rays, shape, block, share, most, stop in [
         (0, (4, 4, 4), 2, 0.5, 0.5, 0.0),
         (1, (2, 2, 2), 2, 1.0, 0.5, 0.0),
@@ -155,7 +157,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Rays through a shell in a grid of 256 voxels an axis, in blocks of 30; 64 times fewer than `size`."""
+    """size / 64 rays through a shell in a grid of 256 voxels an axis, in blocks of 30."""
     place = torch.arange(256.0) - 127.5
     radius = (place[:, None, None] ** 2 + place[:, None] ** 2 + place**2).sqrt()
     places = ((radius > 90) & (radius < 94)).nonzero()
@@ -189,7 +191,7 @@ def _contracted(rays, size, block, share, most, stop, generator):
 
 
 def _rays(count, shape, generator):
-    """From around a grid through it; one along an axis, one beside the grid."""
+    """Rays from around a grid through it; one along an axis, one beside the grid."""
     size = torch.tensor(shape, dtype=torch.float32)
     out = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     target = size * (0.2 + 0.6 * torch.rand(count, 3, generator=generator)) - 0.5

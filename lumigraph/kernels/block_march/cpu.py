@@ -1,5 +1,5 @@
-"""Numba. Threads share out the rays. Backwards, each ray's steps are walked again and noted, its gradients worked out
-from the back to the front, and what the steps owe to rows is spread slab by slab, so that no two threads add to one."""
+"""Numba. Threads share the rays. Backward, each ray's steps are repeated and stored, its gradients computed back to
+front, and each step's gradient is added to rows slab by slab, so that no two threads add to one row."""
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ SURE_STEP = np.float32(0.9)  # voxels of a step, in a count of steps that must n
 
 @njit(inline="always")
 def placed(o, d, t, ball):
-    """Place in the grid of a ray at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
+    """Grid position of a ray at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
     x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
     if ball > ZERO:
         middle = TWO * ball - HALF
@@ -34,7 +34,9 @@ def placed(o, d, t, ball):
 
 @njit(inline="always")
 def nearest(o, d, ball):
-    """Distance backwards along a ray to its point nearest to the ball's centre, and that point's squared distance."""
+    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared distance to
+    the centre.
+    """
     middle = TWO * ball - HALF
     u, v, w = o[0] - middle, o[1] - middle, o[2] - middle
     along = u * d[0] + v * d[1] + w * d[2]
@@ -44,7 +46,7 @@ def nearest(o, d, ball):
 
 @njit(inline="always")
 def later(t, steps, along, aside, ball):
-    """The distance so many steps onward. along, aside: of `nearest`"""
+    """Distance after so many more steps. along, aside: of `nearest`"""
     if ball == ZERO:
         return t + np.float32(steps)
     for _ in range(steps):
@@ -60,7 +62,7 @@ def later(t, steps, along, aside, ball):
 
 @njit(inline="always")
 def block_of(x, y, z, index, block):
-    """The block's coordinates at a place, and its number; -1 beyond the grid and where there is none."""
+    """Coordinates and number of the block at a position; number -1 outside the grid and for no block."""
     wide = np.float32(block)
     bx, by, bz = np.floor((x + HALF) / wide), np.floor((y + HALF) / wide), np.floor((z + HALF) / wide)
     ix, iy, iz = np.int64(bx), np.int64(by), np.int64(bz)
@@ -71,7 +73,7 @@ def block_of(x, y, z, index, block):
 
 @njit(inline="always")
 def to_side(x, d, b, block):
-    """Distance along a ray to where it leaves block b of one axis."""
+    """Distance along a ray to its exit from block b of one axis."""
     if abs(d) < np.float32(1e-9):
         return FAR
     return (np.float32(block * (b + (d > 0))) - HALF - x) / d
@@ -79,21 +81,23 @@ def to_side(x, d, b, block):
 
 @njit(inline="always")
 def beyond(x, y, z, dx, dy, dz, bx, by, bz, block):
-    """Steps, one at least, after which a ray has left a block."""
+    """Number of steps, at least one, to leave a block."""
     away = min(to_side(x, dx, bx, block), to_side(y, dy, by, block), to_side(z, dz, bz, block))
     return max(np.int64(1), np.int64(np.ceil(min(away, np.float32(1e9)))))
 
 
 @njit(inline="always")
 def from_sides(x, b, block):
-    """Distance along one axis from the nearer side of block b."""
+    """Distance along one axis to the nearer side of block b."""
     inside = x + HALF - np.float32(block * b)
     return min(inside, np.float32(block) - inside)
 
 
 @njit(inline="always")
 def past(x, y, z, d, bx, by, bz, number, block, ball):
-    """Steps, one at least, that lead over what is empty where a block is, wherever a curved ray turns to."""
+    """Number of steps, at least one, that skip the empty space around a block; conservative, since contracted rays
+    curve.
+    """
     if ball == ZERO:
         return beyond(x, y, z, d[0], d[1], d[2], bx, by, bz, block)
     clear = min(from_sides(x, bx, block), from_sides(y, by, block), from_sides(z, bz, block))
@@ -103,7 +107,7 @@ def past(x, y, z, d, bx, by, bz, number, block, ball):
 
 @njit(inline="always")
 def cell_of(x, b, block):
-    """Along one axis: the first of the two voxels around a place, counted in its block, and the place beyond it."""
+    """Along one axis: the voxel below a position, counted within its block, and the fractional position above it."""
     place = x - np.float32(block * b) + ONE
     cell = min(max(np.int64(place), np.int64(0)), np.int64(block))
     return cell, place - np.float32(cell)
@@ -111,15 +115,15 @@ def cell_of(x, b, block):
 
 @njit(inline="always")
 def onward(row, ball):
-    """Steps that an empty voxel's distance leaves empty; 0 where there is something to look up. Those of curved rays
-    may be longer than a voxel, so there is one less."""
+    """Number of steps that an empty voxel's distance lets a ray skip; 0 where a voxel has a row. One less on curved
+    rays, whose steps may be longer than a voxel."""
     leap = np.int64(0) if row >= -1 else np.int64(-1 - row)
     return leap if ball == ZERO else max(leap - 1, np.int64(0))
 
 
 @njit(inline="always")
 def corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights):
-    """Rows and weights of those of the eight voxels that have a row; returns how many there are."""
+    """Rows and trilinear weights of the non-empty ones of the eight voxels; returns their number."""
     count = 0
     for x in range(2):
         for y in range(2):
@@ -144,9 +148,9 @@ def blended(values, at, weights, count, seen):
 
 @njit(inline="always")
 def next_met(o, d, t, end, ahead, aside, index, rows, ball, at, weights):
-    """The first step from t on that meets voxels with rows, and how many these are; 0 if there is none before the end.
+    """Next step from t on at non-empty voxels, and their number; 0 for none before the end.
 
-    ahead, aside: of `nearest`; at, weights: filled as by `corners`
+    ahead, aside: of `nearest`; at, weights: filled by `corners`
     """
     block, count = rows.shape[1] - 2, 0
     while t < end:
@@ -168,7 +172,7 @@ def next_met(o, d, t, end, ahead, aside, index, rows, ball, at, weights):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _forward(origins, directions, enter, leave, index, rows, values, ball, stop, totals, distance, lengths):
-    """lengths: how many steps of each ray met something"""
+    """lengths: number of non-empty steps of each ray"""
     n = len(origins)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights = np.empty(9, np.int64), np.empty(9, np.float32)
@@ -197,7 +201,7 @@ def _forward(origins, directions, enter, leave, index, rows, values, ball, stop,
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, lights):
-    """Distances of the steps of each ray that met something, and the light that reached them."""
+    """Distances and transmittances of each ray's non-empty steps."""
     n = len(origins)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights, seen = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
@@ -216,9 +220,9 @@ def _steps(origins, directions, enter, leave, index, rows, values, ball, starts,
 def _owed(
     g_totals, g_distance, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, out
 ):
-    """What each step's blended values owe: dL/dv = T g, and for alpha beside it what it hides of all behind it.
+    """Gradient of each step's interpolated values: dL/dv = T g; alpha also gets what it occludes.
 
-    first: of each step, the first of the two voxels around it along x, counted from the grid's apron
+    first: of each step, the lower of the two voxels around it along x, counted from the grid's apron
     """
     block = rows.shape[1] - 2
     for r in prange(len(origins)):

@@ -18,7 +18,7 @@ SURE_STEP = tl.constexpr(0.9)  # voxels of a step, in a count of steps that must
 
 @triton.jit
 def _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED: tl.constexpr):
-    """Where in the grid each ray is at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
+    """Grid position of each ray at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     if CURVED:
         middle = 2 * ball - 0.5
@@ -31,7 +31,9 @@ def _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED: tl.constexpr):
 
 @triton.jit
 def _nearest(ox, oy, oz, dx, dy, dz, ball):
-    """How far behind each ray's origin it is nearest to the middle of the ball, and the square of how near."""
+    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared distance to
+    the centre.
+    """
     middle = 2 * ball - 0.5
     u, v, w = ox - middle, oy - middle, oz - middle
     along = u * dx + v * dy + w * dz
@@ -41,7 +43,7 @@ def _nearest(ox, oy, oz, dx, dy, dz, ball):
 
 @triton.jit
 def _later(t, steps, along, aside, ball, CURVED: tl.constexpr):
-    """The distance so many steps onward. along, aside: of `_nearest`"""
+    """Distance after so many more steps. along, aside: of `_nearest`"""
     if CURVED:
         while tl.max(steps, 0) > 0:
             radius = tl.maximum(tl.sqrt(aside + (along + t) * (along + t)), 1e-6)
@@ -57,7 +59,7 @@ def _later(t, steps, along, aside, ball, CURVED: tl.constexpr):
 
 @triton.jit
 def _block_of(x, y, z, index, here, X, Y, Z, B: tl.constexpr):
-    """The block's coordinates at each place, and its number; -1 beyond the grid and where there is none."""
+    """Coordinates and number of the block at each position; number -1 outside the grid and for no block."""
     bx = tl.floor((x + 0.5) / B).to(tl.int32)
     by = tl.floor((y + 0.5) / B).to(tl.int32)
     bz = tl.floor((z + 0.5) / B).to(tl.int32)
@@ -67,7 +69,7 @@ def _block_of(x, y, z, index, here, X, Y, Z, B: tl.constexpr):
 
 @triton.jit
 def _to_side(x, d, b, B: tl.constexpr):
-    """Distance along the ray to where it leaves block b of one axis."""
+    """Distance along the ray to its exit from block b of one axis."""
     still = tl.abs(d) < 1e-9
     side = (B * (b + (d > 0).to(tl.int32))).to(tl.float32) - 0.5
     return tl.where(still, 1e9, (side - x) / tl.where(still, 1.0, d))
@@ -75,14 +77,14 @@ def _to_side(x, d, b, B: tl.constexpr):
 
 @triton.jit
 def _from_sides(x, b, B: tl.constexpr):
-    """Distance along one axis from the nearer side of block b."""
+    """Distance along one axis to the nearer side of block b."""
     inside = x + 0.5 - (B * b).to(tl.float32)
     return tl.minimum(inside, B - inside)
 
 
 @triton.jit
 def _cell_of(x, b, B: tl.constexpr):
-    """Along one axis: the first of the two voxels around a place, counted in its block, and the place beyond it."""
+    """Along one axis: the voxel below a position, counted within its block, and the fractional position above it."""
     place = x - (B * b).to(tl.float32) + 1.0
     cell = tl.minimum(tl.maximum(place.to(tl.int32), 0), B)
     return cell, place - cell.to(tl.float32)
@@ -90,7 +92,9 @@ def _cell_of(x, b, B: tl.constexpr):
 
 @triton.jit
 def _voxel_of(x, y, z, bx, by, bz, B: tl.constexpr):
-    """The first of the eight voxels around each place, counted in its block, and the place beyond it."""
+    """The lowest of the eight voxels around each position, counted within its block, and the fractional position
+    above it.
+    """
     cx, fx = _cell_of(x, bx, B)  # one pair a line: Triton 3.6 assigns to no nested tuple
     cy, fy = _cell_of(y, by, B)
     cz, fz = _cell_of(z, bz, B)
@@ -105,7 +109,7 @@ def _row_of(rows, number, voxel, there, B: tl.constexpr):
 
 @triton.jit
 def _blended(rows, values, number, voxel, f, there, B: tl.constexpr):
-    """What is at each place, and whether any of the eight voxels around it has a row."""
+    """Trilinear values at each position, and a mask of those with a non-empty voxel."""
     c = tl.arange(0, C)
     seen = tl.zeros([BLOCK, C], tl.float32)
     some = tl.zeros([BLOCK], tl.int32)
@@ -127,7 +131,7 @@ def _alpha(seen):
 def _march(
     rays, grid, values, sums, noted, R, X, Y, Z, ball, stop, NOTE: tl.constexpr, CURVED: tl.constexpr, B: tl.constexpr
 ):
-    """Composite along each ray; or NOTE its steps that meet something, and the light that reaches them."""
+    """Composite along each ray; or, with NOTE, store its non-empty steps and their transmittances."""
     origins, directions, enter, leave = rays
     index, rows = grid
     totals, distance, lengths = sums
@@ -184,7 +188,7 @@ def _march(
 
 @triton.jit(do_not_specialize=["R"])
 def _backward(grads, rays, grid, values, noted, to_values, R, X, Y, Z, ball, CURVED: tl.constexpr, B: tl.constexpr):
-    """From the back of each ray to its front: dL/dv = T g, and for alpha beside it what it hides of all behind it."""
+    """Gradients of rows, back to front along each ray: dL/dv = T g; alpha also gets what it occludes."""
     g_totals, g_distance = grads
     origins, directions = rays
     index, rows = grid

@@ -1,4 +1,4 @@
-"""The definition: every step of every ray, looked up and composited."""
+"""Reference implementation: every step of every ray, looked up and composited."""
 
 import itertools
 
@@ -25,7 +25,7 @@ def run(
 
 
 def steps(origins: Tensor, directions: Tensor, enter: Tensor, leave: Tensor, ball: float) -> Tensor:
-    """The distance of each step of each ray (ray, step), as many as the longest ray has."""
+    """Distance of each step (ray, step), padded to the longest ray."""
     if not ball:
         count = int((leave - enter).ceil().clamp_min(0).amax()) if len(enter) else 0
         return enter[:, None] + torch.arange(count, device=enter.device)
@@ -40,8 +40,8 @@ def steps(origins: Tensor, directions: Tensor, enter: Tensor, leave: Tensor, bal
 
 
 def stride(along: Tensor, aside: Tensor, ball: float) -> Tensor:
-    """Distance along a ray to the next voxel. along: distance from where it is nearest to the middle of the
-    ball; aside: square of the middle's distance from there"""
+    """Distance along a ray to the next voxel. along: distance from the point closest to the ball's centre; aside: that
+    point's squared distance from the centre"""
     radius = (aside + along.square()).sqrt()
     share = ball / radius.clamp_min(ball)
     speed = (1 + 4 * aside / ball**2 * (1 - share)).sqrt() * share * ball
@@ -49,7 +49,7 @@ def stride(along: Tensor, aside: Tensor, ball: float) -> Tensor:
 
 
 def contracted(points: Tensor, ball: float) -> Tensor:
-    """Positions of points in the grid."""
+    """Grid positions of points, contracted if there is a ball."""
     if not ball:
         return points
     middle = 2 * ball - 0.5
@@ -58,7 +58,7 @@ def contracted(points: Tensor, ball: float) -> Tensor:
 
 
 def looked_up(points: Tensor, blocks: Blocks, values: Tensor) -> Tensor:
-    """Eight voxels, blended; all that lies beyond the grid or in a block that is left out is empty."""
+    """Trilinear interpolation of eight voxels, zero outside the grid and in empty blocks."""
     block, size = blocks.block, torch.tensor(blocks.index.shape, device=points.device)
     own = ((points + 0.5) / block).floor().long()
     inside = ((own >= 0) & (own < size)).all(-1)

@@ -46,8 +46,8 @@ def triangles() -> tuple[tuple[tuple[int, int, int], ...], ...]:
     """Triangles of each of the 256 cases, by their edges.
 
     Bit c of a case is set if corner c = 4 i + 2 j + k of the cube is negative. Edge 3 c + axis goes from corner c,
-    which is 0 along that axis, to the next. On each face of the cube a segment cuts off every run of negative
-    corners; segments form loops, and loops fans of triangles.
+    whose coordinate along that axis is 0, to the next. On each face of the cube a segment cuts off every run of
+    negative corners; segments form loops, and loops are fanned into triangles.
     """
     return tuple(tuple(fan for loop in _loops(case) for fan in _fans(loop)) for case in range(256))
 
@@ -89,7 +89,7 @@ def _fans(loop: list[int]) -> list[tuple[int, int, int]]:
 
 @cache
 def case_table(device: str = "cpu") -> tuple[Tensor, Tensor]:
-    """Triangles of each case as (case, triangle, 3) edges, and how many each has."""
+    """Triangles of each case as (case, triangle, 3) edges, and the number of triangles of each."""
     every = triangles()
     out = torch.zeros(256, max(map(len, every)), 3, dtype=torch.int32)
     for case, fans in enumerate(every):
@@ -98,7 +98,7 @@ def case_table(device: str = "cpu") -> tuple[Tensor, Tensor]:
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: no block, one, a ball in loose blocks, every case of a cube."""
+    """Test inputs for all engines: no block, one, a ball in scattered blocks, every case of a cube."""
     for count, reach, least in [(0, 1, 0.0), (1, 1, 0.0), (3, 1, 0.5), (4, 1, 0.0)]:
         yield *a_ball(count, reach, generator), least
     voxels, blocks, table = a_ball(3, 1, generator)
@@ -110,7 +110,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A ball in a cube of blocks, about as many voxels as half of `size`."""
+    """A ball in a cube of blocks, about size / 2 voxels."""
     reach = max(round((size / 1024) ** (1 / 3) / 2), 1)
     voxels, blocks, _ = a_ball((2 * reach) ** 3, reach, generator)
     return voxels, blocks, new_table(blocks), 0.0

@@ -16,7 +16,8 @@ UNKNOWN, ZERO, ONE = np.float32(np.nan), np.float32(0), np.float32(1)
 
 @njit(error_model="numpy")
 def _fill(number, voxels, blocks, table, min_weight, near, d):
-    """Distances of a block's voxels and its neighbours' first, NaN where unknown; True if the zero level is among them.
+    """Load the distances of a block's voxels and its neighbours' first, NaN where unknown; True if the zero level is
+    among them.
 
     near: numbers of the block itself and its neighbours
     """
@@ -46,7 +47,7 @@ def _crosses(a, b):
 
 @njit(inline="always", error_model="numpy")
 def _case(d, i, j, k):
-    """Case of a cube, 0 where one of its corners is unknown."""
+    """Marching cubes case of a cube, 0 where one of its corners is unknown."""
     case, total = 0, ZERO
     for c in range(8):
         value = d[i + (c >> 2), j + ((c >> 1) & 1), k + (c & 1)]
@@ -57,8 +58,8 @@ def _case(d, i, j, k):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def _count(voxels, blocks, table, min_weight, counts, packed, vertices, faces):
-    """Vertices and faces of each block; packed: of each voxel, how many vertices come before it in its block, and which
-    of its three edges have one."""
+    """Count vertices and faces of each block. packed: of each voxel, number of vertices before it in its block, and a
+    bit mask of its edges with a vertex."""
     for number in prange(len(blocks)):
         near, d = np.empty(8, np.int64), np.empty((SIZE, SIZE, SIZE), np.float32)
         vertices[number], faces[number] = 0, 0

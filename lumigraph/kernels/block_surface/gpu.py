@@ -15,14 +15,14 @@ N, S = tl.constexpr(VOXELS), tl.constexpr(SIDE)
 
 @triton.jit
 def _at(i, j, k, bx, by, bz, blocks, table, mask):
-    """Number of the block, and row, of voxels (i, j, k) of a block or of its neighbours."""
+    """Block number and row of voxels (i, j, k) of a block or of its neighbours."""
     number = find(bx + (i >> 3), by + (j >> 3), bz + (k >> 3), blocks, table, mask, i >= 0)
     return number.to(tl.int64), ((i & 7) * S + (j & 7)) * S + (k & 7)
 
 
 @triton.jit
 def _distance(number, row, voxels, channels, min_weight):
-    """Distances of voxels, and whether they are known."""
+    """Distances of voxels, and a mask of known ones."""
     there = number >= 0
     place = voxels + (number * N + row) * channels
     known = there & (tl.load(place + 1, mask=there, other=-1.0) > min_weight)

@@ -1,4 +1,4 @@
-"""The definition, in plain PyTorch."""
+"""Reference implementation in PyTorch."""
 
 import torch
 
@@ -8,7 +8,7 @@ from . import case_table
 
 
 def lattice(count, device):
-    """Numbers (i, j, k) from 0 to count - 1 along each axis, k fastest."""
+    """Indices (i, j, k) from 0 to count - 1 along each axis, k fastest."""
     axis = torch.arange(count, device=device)
     return torch.cartesian_prod(axis, axis, axis)
 
@@ -29,7 +29,7 @@ def run(voxels, blocks, table, min_weight):
     negative = values[..., 0] < 0
 
     def moved(x, step):
-        """Of each voxel of the blocks, the one a step further."""
+        """Neighbour of each voxel of the blocks, a step away."""
         i, j, k = step
         return x[:, i : i + SIDE, j : j + SIDE, k : k + SIDE]
 

@@ -23,14 +23,14 @@ def cast_blocks(
     voxel: float,
     step: float,
 ) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
-    """Distance, normal and colour where each ray first goes through the zero level from outside (Nießner 2013, sec. 5).
+    """Distance, normal and colour where each ray first crosses the zero level from outside (Nießner 2013, sec. 5).
 
         t_k = t_near + k step < t_far      D(t_k) >= 0 > D(t_k+1)      t = t_k + step D(t_k) / (D(t_k) - D(t_k+1))
 
-    with the first such k. D is trilinear between the eight voxels around a place, unknown where one of them has no
-    block or no weight. Engines skip the t_k in blocks that are not there. The distance is infinite without a surface.
-    The normal is the unit gradient of D, or the way back along the ray where D is unknown or flat. The colour is that
-    of the eight voxels around which have one, by their share; grey where none has.
+    with the first such k. D is trilinear between the eight voxels around a point, unknown where one of them has no
+    block or no weight. Engines skip the t_k in missing blocks. The distance is infinite without a surface. The normal
+    is the unit gradient of D, or the reversed ray direction where D is unknown or flat. The colour is interpolated
+    between those of the eight voxels that have one; grey where none has.
 
     voxels, blocks: as in `fuse_depth`; table: of the blocks (`block_hash`). Trusted
     Not differentiable.
@@ -42,7 +42,7 @@ def cast_blocks(
 
 
 def a_ball(count: int, reach: int, generator: torch.Generator):
-    """Voxels, blocks and table of a ball in blocks about the origin, for tests: truncated, with some holes."""
+    """Voxels, blocks and table of a ball around the origin, for tests: truncated distances, with some holes."""
     blocks = random_blocks(count, reach, generator)
     axis = torch.arange(8)
     places = 8 * blocks[:, None] + torch.cartesian_prod(axis, axis, axis).int()
@@ -57,7 +57,7 @@ def a_ball(count: int, reach: int, generator: torch.Generator):
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: no ray, no block, rays past all blocks, from inside, along the axes."""
+    """Test inputs for all engines: no ray, no block, rays past all blocks, from inside, along the axes."""
     for rays, count, reach, step in [(0, 9, 2, 0.1), (5, 0, 2, 0.1), (40, 60, 2, 0.11), (30, 40, 2, 0.25)]:
         yield _inputs(rays, count, reach, step, generator)
     origins, directions, *rest = _inputs(6, 8, 1, 0.1, generator)
@@ -83,7 +83,7 @@ def _inputs(rays, count, reach, step, generator, steady=True):
 
 
 def _steady(origins, directions, t_near, t_far, voxels, blocks, table, voxel, step):
-    """The inputs without rays whose surface changes when they move by a hundred-thousandth."""
+    """The inputs without rays whose surface changes when they move by 1e-5."""
     run, steady = implementation("cast_blocks", origins), torch.ones(len(origins), dtype=torch.bool)
     rest = t_far, voxels, blocks, table, voxel, step
     found = run(origins, directions, t_near, *rest)

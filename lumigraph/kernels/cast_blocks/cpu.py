@@ -1,4 +1,4 @@
-"""Numba: a task takes some rays. A ray leaves a block that is not there in one stride."""
+"""Numba: a task takes some rays. A ray skips a missing block in one step."""
 
 import math
 
@@ -18,7 +18,7 @@ RAYS_PER_TASK = 64
 
 @njit(inline="always", error_model="numpy")
 def _gather(x, y, z, number, voxels, blocks, table, d, w, rows):
-    """Distance, weight and row of the eight voxels from (x, y, z) on, whose block is `number`."""
+    """Load distance, weight and row of the eight voxels from (x, y, z) on, whose block is `number`."""
     i, j, k = x & 7, y & 7, z & 7
     inside = i < SIDE - 1 and j < SIDE - 1 and k < SIDE - 1
     for c in range(8):
@@ -45,7 +45,7 @@ def _all_known(w):
 
 @njit(error_model="numpy")
 def _exit(base, p, d, over):
-    """Voxels along a ray until it leaves the block of a voxel along one axis."""
+    """Distance in voxels along a ray to its exit from the block of a voxel, along one axis."""
     if d > ZERO:
         return (np.float32((base >> 3) * SIDE + SIDE) - p) * over
     if d < ZERO:
@@ -55,7 +55,7 @@ def _exit(base, p, d, over):
 
 @njit(error_model="numpy")
 def _cast_one(ox, oy, oz, dx, dy, dz, near, far, voxels, blocks, table, per_unit, step, d, w, rows):
-    """Distance to the surface, infinite without one. d, w, rows: room for eight voxels"""
+    """Distance to the surface, infinite without one. d, w, rows: buffers for eight voxels"""
     ix, iy, iz = ONE / dx, ONE / dy, ONE / dz
     before, k = UNKNOWN, np.int64(0)
     last_x, last_y, last_z, number = np.int64(1) << 40, np.int64(0), np.int64(0), np.int64(-1)

@@ -1,4 +1,4 @@
-"""Triton: one lane takes one ray. It leaves a block that is not there in one stride."""
+"""Triton: one lane takes one ray. It skips a missing block in one step."""
 
 import triton
 import triton.language as tl
@@ -15,7 +15,7 @@ BLOCK = tl.constexpr(64)
 
 @triton.jit
 def _corner(x, y, z, voxels, blocks, table, mask, here, c: tl.constexpr):
-    """Distance, weight and place of one of the eight voxels from (x, y, z) on; the weight is 0 without a block."""
+    """Distance, weight and row of one of the eight voxels from (x, y, z) on; weight 0 in a missing block."""
     x, y, z = x + c // 4, y + c // 2 % 2, z + c % 2
     number = find(x >> 3, y >> 3, z >> 3, blocks, table, mask, here)
     there = here & (number >= 0)
@@ -30,7 +30,7 @@ def _share(part, far: tl.constexpr):
 
 @triton.jit
 def _exit(base, p, d, inverse):
-    """Voxels along a ray until it leaves the block of a voxel along one axis."""
+    """Distance in voxels along a ray to its exit from the block of a voxel, along one axis."""
     face = ((base >> 3) + (d > 0).to(tl.int32)) * 8
     return tl.where(d == 0, float("inf"), (face.to(tl.float32) - p) * inverse)
 

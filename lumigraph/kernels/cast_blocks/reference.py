@@ -1,4 +1,4 @@
-"""The definition, in plain PyTorch: every ray asks at every step."""
+"""Reference implementation in PyTorch: every ray evaluates every step."""
 
 import torch
 
@@ -9,7 +9,7 @@ GREY = 0.5
 
 
 def corners(points, voxels, blocks, table, voxel):
-    """The eight voxels around points, z fastest, their shares, and whether each has a weight."""
+    """The eight voxels around points, z fastest, their trilinear weights, and a mask of those with an observation."""
     base = (points / voxel).floor()
     part, base = points / voxel - base, base.int()
     steps = torch.cartesian_prod(*[torch.arange(2, dtype=torch.int32, device=points.device)] * 3)

@@ -1,4 +1,4 @@
-"""Matching cost of a rectified pair: how far the neighbourhoods of two pixels differ in the order of their values."""
+"""Census matching cost of a rectified pair: difference in the order of brightness around two pixels."""
 
 import torch
 from jaxtyping import Bool, UInt8
@@ -40,7 +40,7 @@ def census_cost(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: tiny pictures, negative disparities, masks, ranges beyond the width."""
+    """Test inputs for all engines: tiny pictures, negative disparities, masks, ranges beyond the width."""
     for height, width, first, count in [(1, 1, 0, 1), (2, 3, -2, 5), (7, 20, 0, 9), (6, 9, 3, 20), (5, 11, -14, 6)]:
         yield _inputs(height, width, first, count, generator)
     left, right, _, right_valid, first, count = _inputs(4, 12, 0, 4, generator)
@@ -51,7 +51,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A picture of so many pixels, 64 disparities."""
+    """A picture of `size` pixels, 64 disparities."""
     side = max(round(size**0.5), 1)
     return _inputs(side, side, 0, 64, generator)
 

@@ -1,4 +1,4 @@
-"""Numba. Signatures are whole numbers. The right picture is mirrored, so that disparities run forward in memory."""
+"""Numba. Signatures are integers. The right picture is mirrored, so that disparities run forward in memory."""
 
 import numpy as np
 from numba import njit, prange, types
@@ -14,7 +14,7 @@ FAST = {"error_model": "numpy"}
 
 
 def _bits(x):
-    """Number of bits that are 1."""
+    """Population count: number of set bits."""
     return int(x).bit_count()
 
 
@@ -28,7 +28,7 @@ overload(_bits)(lambda x: lambda x: _count(x))
 
 @njit(parallel=True, cache=True, **FAST)
 def _signatures(padded, places, out):
-    """padded: the picture with REACH pixels more around it"""
+    """Census signatures. padded: the picture with a border of REACH pixels"""
     height, width = out.shape
     for y in prange(height):
         out[y] = NO_BITS

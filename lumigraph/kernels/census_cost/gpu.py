@@ -1,4 +1,4 @@
-"""Triton: signatures of all pixels, then one number for each pixel and disparity."""
+"""Triton: signatures of all pixels, then the cost of each pixel and disparity."""
 
 import torch
 import triton

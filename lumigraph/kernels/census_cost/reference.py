@@ -1,4 +1,4 @@
-"""The definition: signatures as planes of bits, one disparity after the other."""
+"""Reference implementation: signatures as bit planes, one disparity after the other."""
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ def run(left, right, left_valid, right_valid, first, count) -> Tensor:
 
 
 def signature(picture: Tensor) -> Tensor:
-    """Bits (offset, height, width): whether each neighbour is darker."""
+    """Bits (offset, height, width): True where the neighbour is darker."""
     height, width = picture.shape
     row, column = torch.arange(height, device=picture.device), torch.arange(width, device=picture.device)
     darker = [

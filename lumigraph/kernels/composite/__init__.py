@@ -1,4 +1,4 @@
-"""Compositing: samples along rays become one value per ray."""
+"""Compositing: samples along rays are accumulated to one value per ray."""
 
 import torch
 from jaxtyping import Float, Int
@@ -18,8 +18,8 @@ def composite(
 ) -> tuple[Float[Tensor, "ray channel"], Float[Tensor, " ray"], Float[Tensor, " sample"]]:
     """Accumulate values front to back (Max 1995, eq. 9).
 
-        T_i = exp(-sum_{j<i} tau_j)      light that reaches sample i
-        w_i = T_i (1 - exp(-tau_i))      its share of what the eye gets; 0 once T_i < stop
+        T_i = exp(-sum_{j<i} tau_j)      transmittance in front of sample i
+        w_i = T_i (1 - exp(-tau_i))      weight of sample i; 0 once T_i < stop
 
     tau:        optical thickness, density times length; never negative
     values:     colour, distance or anything else, per sample
@@ -34,7 +34,7 @@ def composite(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: empty space, haze and walls, with and without early termination."""
+    """Test inputs for all engines: empty space, haze and walls, with and without early termination."""
     for lengths in ([], [0], [1], [3, 0, 5], [0, 0, 63, 1, 0], [200, 1, 129]):
         for thickness, channels, stop in [(0.0, 1, 0.0), (0.1, 4, 0.0), (30.0, 3, 0.0), (0.2, 5, 0.05)]:
             yield _inputs(lengths, thickness, channels, stop, generator)

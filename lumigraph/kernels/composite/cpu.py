@@ -30,7 +30,7 @@ def _forward(tau, values, starts, stop, total, opacity, weights):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _backward(to_total, to_opacity, to_weights, tau, values, weights, starts, stop, to_tau, to_values):
-    """dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss."""
+    """Gradients: dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j with g_i = dL/dw_i."""
     channels = values.shape[1]
     for r in prange(len(starts) - 1):
         behind = np.float32(0)

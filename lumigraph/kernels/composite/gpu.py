@@ -11,7 +11,7 @@ BLOCK = tl.constexpr(32)  # samples; most rays of a trained scene need one or tw
 
 @triton.jit
 def _thickness(tau, i, i0, b, before):
-    """Each sample's tau, and the sum of all in front of it: of tau_{i-1}, because sum - tau_i would lose digits."""
+    """Each sample's tau, and the sum of tau in front of it, over tau_{i-1} because sum - tau_i would lose digits."""
     t = tl.load(tau + i, mask=i < b, other=0.0)
     previous = tl.load(tau + i - 1, mask=(i > i0) & (i < b), other=0.0)
     return t, before + tl.cumsum(previous, 0)
@@ -46,7 +46,7 @@ def _forward(tau, values, ray_starts, outputs, stop, C: tl.constexpr, CHANNELS: 
 
 @triton.jit
 def _backward(grads, tau, values, ray_starts, outputs, d_tau, d_values, stop, C: tl.constexpr, CHANNELS: tl.constexpr):
-    """With g_i the loss's derivative in w_i:  dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j,  dL/dv_i = w_i dL/dtotal."""
+    """Gradients: dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j with g_i = dL/dw_i, dL/dv_i = w_i dL/dtotal."""
     d_total, d_opacity, d_weights = grads
     total, opacity, weights = outputs
     r = tl.program_id(0).to(tl.int64)

@@ -1,4 +1,4 @@
-"""The definition: rays laid out as rows, (R, K) with K the longest ray."""
+"""Reference implementation: rays laid out as rows, (R, K) with K the longest ray."""
 
 import torch
 from torch import Tensor

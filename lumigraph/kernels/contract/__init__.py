@@ -17,15 +17,14 @@ def contract(
 
         c(x) = x / 2 for |x| <= 1, else (2 - 1 / |x|) x / (2 |x|)
 
-    stretch: whether to return |det dc/dx|^(1/3) as well, the length in coordinates of a scene unit, averaged over
-             directions
+    stretch: also return |det dc/dx|^(1/3), the length in coordinates of a scene unit, averaged over directions
     Not differentiable.
     """
     return implementation("contract", points)(points, stretch)
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: the origin, points on the unit sphere, and points far out."""
+    """Test inputs for all engines: the origin, points on the unit sphere, and points far out."""
     for points, stretch in [(0, True), (1, False), (70, False), (300, True)]:
         yield _inputs(points, generator), stretch
     axes = torch.cat([torch.eye(3), -torch.eye(3)])

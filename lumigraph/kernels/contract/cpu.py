@@ -10,7 +10,7 @@ from .._operation import empty
 
 @njit(inline="always")
 def scale_of(x, y, z):
-    """1 / |x|, at most 1, and the factor that takes a point into the contraction's ball."""
+    """1 / |x|, at most 1, and the contraction's scale factor c(x) / x."""
     one, radius = np.float32(1), np.float32(math.sqrt(x * x + y * y + z * z))
     inverse = one / radius if radius > one else one
     return inverse, np.float32(0.5) * (one + one - inverse) * inverse
@@ -28,14 +28,14 @@ def cube_root(x):
 
 @njit(inline="always")
 def _stretch(inverse, across):
-    """|det J|^(1/3) from the two numbers of `scale_of`; a half within the unit ball."""
+    """|det J|^(1/3) from the results of `scale_of`; 1/2 within the unit ball."""
     outside = cube_root(np.float32(0.5) * inverse * inverse * across * across)
     return across if inverse == 1 else outside
 
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _contract(points, coordinates, stretch):
-    """stretch: filled, unless it is empty"""
+    """Contract points. stretch: output array, empty if not wanted"""
     for i in prange(len(points)):
         inverse, across = scale_of(points[i, 0], points[i, 1], points[i, 2])
         for axis in range(3):

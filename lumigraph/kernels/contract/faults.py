@@ -1,4 +1,4 @@
-"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
+"""Faults that tests seed, by name: engine, function, code, replacement. ASTRAY: out-of-bounds accesses."""
 
 FAULTS = {
     "a ball of radius 2": ("cpu", "scale_of", "np.float32(0.5) * (one", "np.float32(1) * (one"),

@@ -11,14 +11,14 @@ BLOCK = tl.constexpr(256)
 
 @triton.jit
 def scale_of(x, y, z):
-    """1 / |x|, at most 1, and the factor that takes a point into the contraction's ball."""
+    """1 / |x|, at most 1, and the contraction's scale factor c(x) / x."""
     inverse = 1.0 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1.0)
     return inverse, 0.5 * (2.0 - inverse) * inverse
 
 
 @triton.jit
 def stretch_of(inverse, across):
-    """|det J|^(1/3) from the two numbers of `scale_of`."""
+    """|det J|^(1/3) from the results of `scale_of`."""
     return tl.exp2(tl.log2(0.5 * inverse * inverse * across * across) / 3)
 
 

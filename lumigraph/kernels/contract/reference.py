@@ -1,4 +1,4 @@
-"""The definition: Barron 2022, eq. 10, halved, and the determinant of its Jacobian."""
+"""Reference implementation: Barron 2022, eq. 10, halved, and the determinant of its Jacobian."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Trilinear lookup of a grid's channels, as voxel grids of density and features need it for every sample."""
+"""Trilinear interpolation of a dense grid's channels, for voxel grids of density and features."""
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,7 @@ UNIT = torch.tensor([[0.0] * 3, [1.0] * 3])
 def dense_grid(
     points: Float[Tensor, "sample 3"], grid: Float[Tensor, "x y z channel"], box: Float[Tensor, "2 3"]
 ) -> Float[Tensor, "sample channel"]:
-    """The blend of the eight corners around each point, all channels at once (Sun 2022, section 3.1, "interp").
+    """Trilinear interpolation of all channels at each point (Sun 2022, section 3.1, "interp").
 
         u = (size - 1) (p - box_0) / (box_1 - box_0)
         out(p) = sum over corners c of  prod_a (1 - |u_a - c_a|)  grid[c]
@@ -31,7 +31,7 @@ def dense_grid(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: one channel and many, the smallest grid, every face, and beyond it."""
+    """Test inputs for all engines: one channel and many, the smallest grid, every face, and beyond it."""
     for samples, shape in [(0, (3, 4, 5, 2)), (1, (2, 2, 2, 1)), (63, (5, 3, 9, 1)), (200, (9, 17, 5, 12))]:
         yield _inputs(samples, shape, generator)
     borders = torch.cartesian_prod(*[torch.tensor([-0.5, 0.0, 0.28125, 1.0, 1.5])] * 3)
@@ -41,9 +41,8 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Samples along rays as a training step has them: runs of 32 through a grid of 128^3 corners with the 12 channels
-    of Sun 2022, half a voxel from one to the next. The reference is `torch.nn.functional.grid_sample`. Points ask for
-    no gradient there."""
+    """Samples as in a training step: runs of 32 through a grid of 128^3 corners with the 12 channels of Sun 2022, half
+    a voxel apart. The reference is `torch.nn.functional.grid_sample`. Points get no gradient there."""
     start = 0.2 + 0.6 * torch.rand(size // 32, 1, 3, generator=generator)
     direction = torch.nn.functional.normalize(torch.randn(size // 32, 1, 3, generator=generator), dim=-1)
     points = (start + direction * torch.arange(32)[:, None] * 0.5 / 127).reshape(-1, 3)
@@ -51,8 +50,8 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(samples: int, shape: tuple[int, ...], generator: torch.Generator):
-    """Sizes are a power of two and one more, or small, and points multiples of 2^-12, so that no engine's rounding
-    decides which cell holds one."""
+    """Random points and grid. Sizes are a power of two and one more, or small, and points multiples of 2^-12, so that
+    cells do not depend on rounding."""
     points = torch.randint(-(2**9), 2**12 + 2**9, (samples, 3), generator=generator) / 2**12
     box = torch.tensor([[-1.0, -0.5, 0.25], [1.0, 1.5, 0.75]])
     return box[0] + points * (box[1] - box[0]), 2 * torch.rand(*shape, generator=generator) - 1, box

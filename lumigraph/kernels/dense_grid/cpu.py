@@ -1,6 +1,6 @@
-"""Numba. Looking up, threads share out the points. Spreading gradients, they share out slabs of the grid: each goes
-through all points and adds to the planes of corners that are its own, so that no two threads add to one place and
-every corner's sum is taken in the order of the points, however many threads there are."""
+"""Numba. Forward, threads share the points. For gradients they share slabs of the grid: each goes through all points
+and adds to the corners of its own planes, so that no two threads add to one corner and every corner's sum has the order
+of the points, for any number of threads."""
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 @njit(inline="always")
 def _axis(x, low, scale, size):
-    """Along one axis: the corner at or below a coordinate, and the place between it and the next; clamped."""
+    """Along one axis: the corner at or below a coordinate, and the fraction towards the next; clamped."""
     s = min(max((x - low) * scale, ZERO), np.float32(size - 1))
     corner = max(min(np.int32(s), np.int32(size - 2)), np.int32(0))  # the last also where x is no number
     return corner, s - np.float32(corner)
@@ -24,7 +24,7 @@ def _axis(x, low, scale, size):
 
 @njit(**FAST)
 def _sides(y, z, box, shape):
-    """The four corners around a point within a plane of x: where they lie from the plane's first on, and weights."""
+    """Offsets and weights of the four corners around a point within a plane of x."""
     cy, fy = _axis(y, box[0, 1], box[1, 1], shape[1])
     cz, fz = _axis(z, box[0, 2], box[1, 2], shape[2])
     across = np.uint32(shape[2]) * np.uint32(shape[3])
@@ -57,7 +57,7 @@ def _look_up(points, grid, box, shape, lanes, out):
 
 @njit(parallel=True, **FAST)
 def _grid_gradient(grad, points, slabs, box, shape, lanes, out):
-    """slabs: the plane of x at which each thread's own begin"""
+    """Gradient of the grid. slabs: first plane of x of each thread"""
     n = len(points)
     plane = np.uint32(shape[1]) * np.uint32(shape[2]) * np.uint32(shape[3])
     for slab in prange(len(slabs) - 1):
@@ -83,7 +83,7 @@ def _grid_gradient(grad, points, slabs, box, shape, lanes, out):
 
 @njit(parallel=True, **FAST)
 def _point_gradient(grad, points, grid, box, out):
-    """The slope of the blend along each axis: corners' values, signed by side."""
+    """Gradient of points: derivative of the interpolation along each axis."""
     nx, ny, nz, channels = grid.shape
     for i in prange(len(points)):
         cx, fx = _axis(points[i, 0], box[0, 0], box[1, 0], nx)
@@ -109,7 +109,7 @@ def _point_gradient(grad, points, grid, box, out):
 
 @njit(cache=True)
 def _slabs(points, box, planes, parts):
-    """Planes of x at which to part the grid so that each part has about as many points. It changes no sum."""
+    """Planes of x that split the grid into parts with about as many points each. No sum depends on them."""
     counts = np.zeros(planes, np.int64)
     for i in range(len(points)):
         counts[_axis(points[i, 0], box[0, 0], box[1, 0], planes)[0]] += 1
@@ -153,7 +153,7 @@ def backward(ctx, grad):
 
 
 def _scaled(box, grid):
-    """The box's lower corner, and voxels for a unit along each axis."""
+    """Lower corner of the box, and voxels per unit along each axis."""
     return torch.stack([box[0], (torch.tensor(grid.shape[:3]) - 1) / (box[1] - box[0])])
 
 

@@ -1,4 +1,4 @@
-"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
+"""Faults that tests seed, by name: engine, function, code, replacement. ASTRAY: out-of-bounds accesses."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_grid", "tl.static_range(8)", "tl.static_range(7)"),

@@ -1,4 +1,4 @@
-"""The definition: what PyTorch has for it."""
+"""Reference implementation: PyTorch's `grid_sample`."""
 
 from torch import Tensor
 from torch.nn.functional import grid_sample

@@ -1,4 +1,4 @@
-"""Distortion loss: how far apart the weights along a ray lie."""
+"""Distortion loss of the weights along each ray."""
 
 import torch
 from jaxtyping import Float, Int
@@ -16,12 +16,13 @@ def distortion(
     lengths: Float[Tensor, " sample"],
     ray_starts: Int[Tensor, " ray_plus_one"],
 ) -> Float[Tensor, " ray"]:
-    """For each ray sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i (Barron 2022, eq. 15), in time linear in samples.
+    """Distortion loss of each ray, sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i (Barron 2022, eq. 15), in linear
+    time.
 
-    It is least where a ray's weight is small or lies in one place: neither fog before a surface nor a floater.
+    It is least where a ray's weight is small or lies in one place: it removes fog before surfaces, and floaters.
 
-    weights:    each sample's share of what the eye gets, as `composite` gives them
-    middles:    m, where along its ray each sample is, in any unit; trusted to rise along each ray
+    weights:    of samples, as `composite` gives them
+    middles:    m, each sample's distance along its ray, in any unit; trusted to rise along each ray
     lengths:    d, in the same unit
     ray_starts: (R + 1,) int64; ray r owns samples ray_starts[r] to ray_starts[r + 1]
 
@@ -33,7 +34,7 @@ def distortion(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: empty rays, one sample, more samples than a block holds."""
+    """Test inputs for all engines: empty rays, one sample, more samples than a block holds."""
     for lengths in ([], [0], [1], [3, 0, 5], [0, 0, 63, 1, 0], [200, 1, 129]):
         yield _inputs(lengths, generator)
 

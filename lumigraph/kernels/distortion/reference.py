@@ -1,4 +1,4 @@
-"""The definition: every sample with every other of its ray."""
+"""Reference implementation: every sample with every other of its ray."""
 
 import torch
 from torch import Tensor

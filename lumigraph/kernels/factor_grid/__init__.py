@@ -51,7 +51,7 @@ class Factors:
 
     @property
     def products(self) -> int:
-        """Products that each component takes part in: three planes with their lines, or one of three lines."""
+        """Products of each component: three of planes and lines, or one of three lines."""
         return 3 if self.kind == "vm" else 1
 
     def split(self, table: Float[Tensor, "row component"]) -> list[Tensor]:
@@ -71,7 +71,7 @@ def factor_grid(
 
     points: in the unit cube, whose corners are the outermost nodes; those outside are clamped to it
     table:  (factors.rows, components)
-    summed: add up all products and components into one value, as density wants them
+    summed: add up all products and components into one value, as for density
     Returns (S, products * components), product by product, or (S, 1); differentiable in the table. Bilinear in planes,
     linear along lines, so that their product is not trilinear (section 4.1).
     """
@@ -80,7 +80,9 @@ def factor_grid(
 
 
 def cases(generator: torch.Generator) -> Iterator[tuple]:
-    """Inputs that every engine must agree on: both kinds, widths that lanes divide and others, borders and beyond."""
+    """Test inputs for all engines: both kinds, widths that are multiples of the lanes and others, borders and
+    beyond.
+    """
     kinds: tuple[Kind, Kind] = ("vm", "cp")
     for kind in kinds:
         for samples, nodes, components, summed in [

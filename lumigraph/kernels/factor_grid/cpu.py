@@ -1,8 +1,7 @@
 """Numba. Components are lanes: sixteen of them lie side by side at each node, and a node is one line of the cache.
 
-Looking up, threads share out the points. Spreading gradients, they share out planes, components, and bands of a
-plane's rows, so that no two threads add to one place; a band adds the samples in their order, so the sum is the same
-every time and for any number of threads.
+Forward, threads share the points. For gradients they share planes, components, and bands of a plane's rows, so that no
+two threads add to one place. A band adds the samples in their order, so the sum is the same for any number of threads.
 """
 
 import numpy as np
@@ -24,7 +23,7 @@ AXES = np.array(MODES)
 
 @njit(inline="always")
 def _place(x, n):
-    """The node before a coordinate in [0, 1], and how much of the way to the next one is behind it."""
+    """Node below a coordinate in [0, 1], and the fraction towards the next one."""
     s = min(max(x, ZERO), ONE) * np.float32(n - 1)
     node = max(min(np.int64(s), n - 2), 0)  # also where x is no number
     return node, s - np.float32(node)
@@ -37,7 +36,9 @@ def _on_line(table, at, width, f):
 
 @njit(inline="always")
 def _on_plane(table, at, down, width, f, g):
-    """down, width: from a node to the next along the plane's first and second axis, as far as f and g have come."""
+    """Bilinear interpolation in a plane. down, width: strides of its first and second axis; f, g: fractions along
+    both
+    """
     return _on_line(table, at, width, g) * (ONE - f) + _on_line(table, at + down, width, g) * f
 
 
@@ -83,7 +84,7 @@ def _look_up(points, table, nodes, starts, vm, width, summed, out):
 
 @njit(**FAST)
 def _places(points, nodes, cells, fractions):
-    """`_place` of all points along each axis, kept for the ways back."""
+    """`_place` of all points along each axis, kept for the backward passes."""
     for share in prange((len(points) + SHARE - 1) // SHARE):
         for i in range(share * SHARE, min(len(points), (share + 1) * SHARE)):
             for axis in range(3):
@@ -97,10 +98,10 @@ def _slope(grad, i, at, summed):
 
 @njit(**FAST)
 def _spread_planes(grad, cells, fractions, table, nodes, starts, axes, edges, width, summed, out, sums):
-    """out: gradients of the planes. sums (band, row of the lines, width): those of the lines, from each band's samples.
+    """Gradients of planes into `out`, and of lines into `sums` (band, row of the lines, width), summed per band's
+    samples.
 
-    A sample belongs to the band that holds the first of its two rows; the next band adds to the second of them if that
-    is its own.
+    A sample belongs to the band of the first of its two rows; the next band adds to the second row if it owns that.
     """
     chunks, samples = width // LANES, cells.shape[1]
     for unit in prange(3 * chunks * BANDS):
@@ -134,7 +135,7 @@ def _spread_planes(grad, cells, fractions, table, nodes, starts, axes, edges, wi
 
 @njit(**FAST)
 def _spread_lines(grad, cells, fractions, table, starts, width, summed, sums):
-    """sums (part, row, width): gradients of the lines, from each part of the samples."""
+    """Gradients of lines, summed over each part of the samples: sums (part, row, width)."""
     samples = cells.shape[1]
     for part in prange(BANDS):
         mine = part * sums.size // BANDS
@@ -189,7 +190,7 @@ _factor_grid = differentiable(forward, backward)
 
 
 def _bands(rows, count):
-    """Where bands of rows begin and end that hold about as many samples each."""
+    """Bounds of bands of rows with about as many samples each."""
     below = np.bincount(rows, minlength=count).cumsum()
     inner = np.searchsorted(below, below[-1] * np.arange(1, BANDS) / BANDS, side="right")
     return np.array([0, *inner.clip(0, count), count])
@@ -201,7 +202,7 @@ def _flat(x, axes=1):
 
 
 def run(points, table, factors, summed):
-    """Whole vectors of components: a table whose width they do not divide is widened by zeros."""
+    """Evaluate with whole vectors of components: a table of other width is padded with zeros."""
     width = table.shape[1]
     table = torch.nn.functional.pad(table, (0, -width % LANES)) if width % LANES else table
     found = _factor_grid(points, table, factors, summed)

@@ -1,4 +1,4 @@
-"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
+"""Faults that tests seed, by name: engine, function, code, replacement. ASTRAY: out-of-bounds accesses."""
 
 FAULTS = {
     "the other axis's step": ("cpu", "_look_up", "ny * width, width, fx, fy", "nz * width, width, fx, fy"),

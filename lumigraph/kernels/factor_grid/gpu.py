@@ -13,7 +13,7 @@ MAX_COMPONENTS = 32  # components taken together
 
 @triton.jit
 def _place(points, i, axis: tl.constexpr, here, n):
-    """The node before each point along an axis, and how much of the way to the next one is behind it."""
+    """Node below each point along an axis, and the fraction towards the next one."""
     s = tl.load(points + 3 * i + axis, mask=here, other=0.0)
     s = tl.minimum(tl.maximum(s, 0.0), 1.0) * (n - 1)
     node = tl.minimum(s.to(tl.int32), n - 2)
@@ -29,7 +29,7 @@ def _line(table, row, f, c, there, R: tl.constexpr):
 
 @triton.jit
 def _plane(table, row, across, f, g, c, there, R: tl.constexpr):
-    """across: from a row of nodes to the next, as far as f has come; g has come along it."""
+    """Bilinear interpolation in a plane. across: stride of its rows; f, g: fractions across rows and along them"""
     low, high = _line(table, row, g, c, there, R), _line(table, row + across, g, c, there, R)
     return low * (1 - f)[:, None] + high * f[:, None]
 

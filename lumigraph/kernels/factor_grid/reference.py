@@ -1,4 +1,4 @@
-"""The definition: PyTorch's own interpolation of planes and lines, as the paper's code composes it."""
+"""Reference implementation: PyTorch's own interpolation of planes and lines, as the paper's code composes it."""
 
 from functools import reduce
 from operator import mul
@@ -22,7 +22,7 @@ def run(points: Tensor, table: Tensor, factors: Factors, summed: bool) -> Tensor
 
 
 def _plane(nodes: Tensor, places: Tensor) -> Tensor:
-    """Bilinear interpolation of nodes (a, b, component) at places (sample, 2), whose first coordinate is along b."""
+    """Bilinear interpolation of nodes (a, b, component) at coordinates (sample, 2), whose first is along b."""
     picture, at = nodes.permute(2, 0, 1)[None], places[None, None]
     return F.grid_sample(picture, at, padding_mode="border", align_corners=True)[0, :, 0].t()
 

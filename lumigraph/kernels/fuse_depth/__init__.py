@@ -32,15 +32,15 @@ def fuse_depth(
     max_weight: float = math.inf,
     in_place: bool = False,
 ) -> Float[Tensor, "block 512 5"]:
-    """Voxels (distance D, weight W, colour) with one depth map more (Curless and Levoy 1996, eq. 3 and 4).
+    """Voxels (distance D, weight W, colour) after integrating a depth map (Curless and Levoy 1996, eq. 3 and 4).
 
         d = min((depth - |p - o|) / truncation, 1)     D <- (W D + w d) / (W + w)     W <- min(W + w, max_weight)
 
     for voxels at p = voxel (8 block + (i, j, k)) inside the picture, where d >= -1 and w > 0; others stay. Depth,
-    colour and trust w are interpolated between the four pixels around a voxel's projection; where their depths differ
-    by more than `edge` times the least, one surface ends before another, and the nearest pixel's are taken. Where a
-    depth of the four is unknown (not finite or not positive), so is the voxel's. The colour is averaged as the distance
-    is, but by voxels within the band alone, |d| < 1; red is UNCOLOURED before the first.
+    colour and weight w = trust are interpolated between the four pixels around a voxel's projection. Where their depths
+    differ by more than `edge` times the least, at a depth edge, the nearest pixel is taken. Where one of the four
+    depths is unknown (not finite or not positive), so is the voxel's. The colour is averaged likewise, but only over
+    voxels within the band, |d| < 1; red is UNCOLOURED before the first.
 
     voxels:   [block, (i, j, k) with k fastest, channel]
     depth:    along rays; pose: camera-to-world, OpenCV axes; lens: of a pinhole, (fx, fy, cx, cy) in pixels
@@ -58,13 +58,13 @@ def fuse_depth(
 
 
 def empty_voxels(count: int, device: torch.device | str = "cpu") -> Float[Tensor, "block 512 5"]:
-    """Voxels of blocks that no depth map has seen."""
+    """Voxels of blocks without observations."""
     fresh = torch.tensor([1.0, 0.0, UNCOLOURED, UNCOLOURED, UNCOLOURED], device=device)
     return fresh.expand(count, VOXELS, CHANNELS).contiguous()
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: no block, no pixel, blocks beside and behind, voxels that know things."""
+    """Test inputs for all engines: no block, no pixel, blocks beside and behind the view, voxels with observations."""
     for height, width, side, most in [(0, 4, 0.2, 9.0), (1, 1, 0.1, 9.0), (6, 5, 0.3, 2.5), (12, 16, 0.23, 2.0)]:
         yield _inputs(height, width, side, most, generator)
     voxels, blocks, *rest = _inputs(6, 8, 0.2, math.inf, generator)
@@ -73,13 +73,15 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """The blocks around a wall in a depth map of a fourth as many pixels."""
+    """The blocks around a wall in a depth map of size / 4 pixels."""
     side = max(round((size / 4) ** 0.5), 1)
     return _inputs(side, side, 0.08, 64.0, generator)
 
 
 def _inputs(height, width, side, most, generator):
-    """A wall, the blocks around it and others, half of the voxels seen before; none hangs on an engine's rounding."""
+    """A wall, the blocks around it and others, half of the voxels already observed; without inputs that depend on
+    rounding.
+    """
     pose, _ = hand_held(generator)
     lens = torch.tensor([width * 1.1 + 0.1, width * 1.2 + 0.1, width / 2 + 0.03, height / 2 - 0.07])
     depth, truncation = wall(height, width, generator), side / 2
@@ -101,7 +103,7 @@ def _inputs(height, width, side, most, generator):
 
 
 def _steady(voxels, blocks, depth, rgb, trust, pose, lens, *numbers):
-    """The inputs without blocks in which a voxel changes much when the camera moves by a millionth."""
+    """The inputs without blocks in which a voxel changes much when the camera moves by 1e-6."""
     if not len(blocks) or not depth.numel():
         return voxels, blocks, depth, rgb, trust, pose, lens, *numbers
     run = implementation("fuse_depth", voxels)

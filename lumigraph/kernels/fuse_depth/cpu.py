@@ -1,4 +1,4 @@
-"""Numba: a task takes some of the blocks that may be in the picture, voxel by voxel."""
+"""Numba: a task takes some of the blocks in the view frustum, voxel by voxel."""
 
 import math
 
@@ -17,7 +17,7 @@ MARGIN = np.float32(1.001)  # of a block's ball, for rounding
 
 @njit(cache=True, error_model="numpy")
 def _visible(blocks, height, width, pose, lens, voxel, farthest, chosen):
-    """Numbers of the blocks whose ball reaches into the picture's frustum; returns how many there are."""
+    """Numbers of the blocks whose bounding sphere meets the view frustum; returns how many there are."""
     count, radius = 0, MARGIN * voxel * np.float32(0.5 * (SIDE - 1) * math.sqrt(3.0))
     middle = np.float32(0.5 * (SIDE - 1))
     left, top = lens[2] / lens[0], lens[3] / lens[1]
@@ -47,7 +47,7 @@ def _four(values, a, b, c, d, wa, wb, wc, wd):
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 def _fuse(voxels, blocks, chosen, depth, rgb, trust, height, width, pose, lens, voxel, truncation, edge, max_weight):
-    """Arrays of pixels and voxels are flat. Indices are unsigned, so that none is looked at for its sign."""
+    """Integrate into the chosen blocks. Arrays are flat; indices are unsigned, which saves tests for negative ones."""
     over, wide, high = ONE / truncation, np.float32(width), np.float32(height)
     last_x, last_y = wide - ONE, high - ONE
     step_x, step_y, step_z = voxel * pose[2, 0], voxel * pose[2, 1], voxel * pose[2, 2]

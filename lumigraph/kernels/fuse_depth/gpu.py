@@ -13,7 +13,7 @@ MIN_DEPTH, NONE = tl.constexpr(BEHIND_DEPTH), tl.constexpr(UNCOLOURED)
 
 @triton.jit
 def _pick(values, a, b, c, d, wa, wb, wc, wd, here, stride: tl.constexpr, channel: tl.constexpr):
-    """A channel, blended from four pixels."""
+    """Bilinear interpolation of a channel between four pixels."""
     found = wa * tl.load(values + a * stride + channel, mask=here, other=0.0)
     found += wb * tl.load(values + b * stride + channel, mask=here, other=0.0)
     found += wc * tl.load(values + c * stride + channel, mask=here, other=0.0)

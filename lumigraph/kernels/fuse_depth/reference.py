@@ -1,4 +1,4 @@
-"""The definition, in plain PyTorch."""
+"""Reference implementation in PyTorch."""
 
 import torch
 
@@ -13,7 +13,7 @@ def offsets(like):
 
 
 def seen(points, depth, rgb, trust, pose, lens, edge):
-    """Depth, colour and trust in the direction of points, and where they are known; see `fuse_depth`."""
+    """Interpolated depth, colour and trust in the direction of points, and a mask of known ones; see `fuse_depth`."""
     height, width = depth.shape
     q = (points - pose[:, 3]) @ pose[:, :3]
     before = q[:, 2] > BEHIND_DEPTH

@@ -21,12 +21,12 @@ def harmonic_grid(
     density: Float[Tensor, " row"],
     harmonics: Float[Tensor, "row 9 3"],
 ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]:
-    """Trilinear density, and the colour that trilinear harmonics of degree 2 show in each sample's direction:
+    """Trilinear density, and colour of trilinear spherical harmonics of degree 2 in each sample's direction:
 
         sigma = sum_v w_v(x) density_v,    c = sum_v w_v(x) sum_lm Y_lm(d) harmonics_v,lm
 
-    over the eight nodes v around the point; a node without a row counts as 0. Neither is activated. The 27 blended
-    coefficients of a sample are nowhere stored.
+    over the eight nodes v around the point; a node without a row counts as 0. Neither is activated. The 27 interpolated
+    coefficients of a sample are not stored.
 
     points, nodes: as for `sparse_grid`
     directions:    unit length
@@ -38,7 +38,7 @@ def harmonic_grid(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: odd shapes, empty tables, every border of the cube, and beyond it."""
+    """Test inputs for all engines: odd shapes, empty tables, every border of the cube, and beyond it."""
     for samples, shape, share in [
         (0, (4, 4, 4), 0.5),
         (1, (2, 2, 2), 1.0),
@@ -63,7 +63,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _with_values(points: Tensor, nodes: Nodes, generator: torch.Generator, run: int = 2):
-    """Each `run` samples look the same way, as on a ray."""
+    """Add directions and values to points and nodes. Runs of `run` samples share a direction, as on a ray."""
     directions = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=generator), dim=-1)
     directions = directions[torch.arange(len(points)) // run * run]
     values = torch.randn(nodes.count, 9, 3, generator=generator)

@@ -37,7 +37,7 @@ def _basis(directions, i, out):
 
 @njit(inline="always")
 def _turned(directions, i, before):
-    """Whether sample i looks another way than the one `before` it."""
+    """True if the direction of sample i differs from that of sample `before`."""
     return (
         before < 0
         or directions[i, 0] != directions[before, 0]

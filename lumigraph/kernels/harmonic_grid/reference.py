@@ -1,4 +1,4 @@
-"""The definition: all 28 channels blended, then a scalar product with the harmonics."""
+"""Reference implementation: all 28 channels interpolated, then a scalar product with the harmonics."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Multiresolution hash encoding: features of a point, looked up at many scales."""
+"""Multiresolution hash encoding of points."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,7 +53,7 @@ class HashLevels:
 
     @property
     def offsets(self) -> list[int]:
-        """First entry of each level in the table; one longer than there are levels."""
+        """First entry of each level in the table, then the number of entries of all."""
         offsets = [0]
         for size in self.sizes:
             offsets.append(offsets[-1] + size)
@@ -86,7 +86,7 @@ def hash_encode(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: dense and hashed levels, every border of the cube, and beyond it."""
+    """Test inputs for all engines: dense and hashed levels, every border of the cube, and beyond it."""
     mixed = HashLevels(levels=4, features=2, log2_entries=9, coarsest=3, finest=40)
     for samples in (0, 1, 63, 129):
         yield _inputs(samples, mixed, generator)
@@ -101,8 +101,8 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Samples along rays as a training step has them: runs of 32 through the unit cube, each two of the steps that
-    Instant-NGP takes (sqrt(3) / 1024) from the next. Points ask for no gradient there.
+    """Samples as in a training step: runs of 32 through the unit cube, two of Instant-NGP's steps (sqrt(3) / 1024)
+    apart. Points get no gradient there.
     """
     levels = HashLevels(levels=16, features=2, log2_entries=17)
     start = 0.2 + 0.6 * torch.rand(size // 32, 1, 3, generator=generator)
@@ -113,7 +113,9 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(samples: int, levels: HashLevels, generator: torch.Generator):
-    """Points are multiples of 2^-12, so that N_l p is exact and no engine's rounding decides which cell holds one."""
+    """Random points and table. Points are multiples of 2^-12, so that N_l p is exact and cells do not depend on
+    rounding.
+    """
     points = torch.randint(-(2**9), 2**12 + 2**9, (samples, 3), generator=generator) / 2**12
     table = 2 * torch.rand(levels.offsets[-1], levels.features, generator=generator) - 1
     return points, table, levels

@@ -1,8 +1,8 @@
-"""Numba. Work goes level by level, so that one level's table stays in cache, and features are kept in planes (feature,
-sample), as a matrix product likes them. Looking up, threads share out the points; spreading gradients, the levels, so
+"""Numba. Work goes level by level, so that one level's table stays in cache. Features are stored in planes (feature,
+sample), the layout for matrix products. Forward, threads share the points. For gradients they share the levels, so
 that no two threads add to one place and the sum is the same every time.
 
-Before many points are looked up, a level is read once in order: random reads from the main memory are slower."""
+Before many points are looked up, a level is read once in order: random reads from main memory are slower."""
 
 from functools import cache
 
@@ -37,7 +37,7 @@ CHUNK = 1 << 16  # points a thread takes at most at a time: many, so that a leve
 
 @njit(inline="always")
 def _along(points, at, resolution):
-    """Along one axis: the cells of sixteen points, and the weights of their two sides."""
+    """Along one axis: the cells of sixteen points, and the interpolation weights of their two sides."""
     x = lowest(highest(fetch(points, at), ZERO), ONE) * np.float32(resolution)
     cell = lowest(whole(x), np.uint32(resolution - 1))
     share = x - real(cell)
@@ -56,10 +56,10 @@ def _hashed(x, y, z, mask):
 
 @njit(inline="always")
 def _corners(points, n, at, resolution, step_y, step_z, join, mask, base, features, entries, weights, i):
-    """Number of the first feature, and trilinear weight, of the corners around sixteen points, from point `at` on.
+    """Index of the first feature, and trilinear weight, of the corners around sixteen points, from point `at` on.
 
-    step_y, step_z: what a step along y and z adds to an entry's number (multiplies, where hashed)
-    Written to [corner BLOCK + i] and on. Lanes beyond the last point get what happens to lie there.
+    step_y, step_z: strides of an entry's number along y and z (factors, where hashed)
+    Written to [corner BLOCK + i] and on. Lanes beyond the last point are undefined.
     """
     x, u0, u1 = _along(points, at, resolution)
     y, v0, v1 = _along(points, n + at, resolution)
@@ -79,7 +79,7 @@ def _corners(points, n, at, resolution, step_y, step_z, join, mask, base, featur
 
 @njit(inline="always")
 def _place(points, n, first, count, resolution, mask, base, features, entries, weights):
-    """The eight corners around each of `count` points."""
+    """Entries and weights of the eight corners around each of `count` points."""
     row = np.uint32(resolution + 1)
     for i in range(0, count, LANES):
         if mask:
@@ -92,9 +92,9 @@ def _place(points, n, first, count, resolution, mask, base, features, entries, w
 
 @njit(inline="always")
 def blend(table, entries, weights, i, features, out, at, stride):
-    """Point i's sum over corners of weight times entry; its features go to numbers `at`, `at` + `stride`, ... of out.
+    """Point i's sum over corners of weight times entry, written in steps of `stride` from out[at] on.
 
-    All features of an entry are one register, so that there are eight loads and eight multiply-adds however many.
+    All features of an entry are one register, so that there are eight loads and eight multiply-adds for any number.
     """
     total = weights[i] * fetch_like(table, entries[i], features)
     for corner in range(1, 8):
@@ -105,7 +105,7 @@ def blend(table, entries, weights, i, features, out, at, stride):
 
 @njit(inline="always")
 def spread(grad, at, stride, entries, weights, i, features, table):
-    """The way back: add to each corner's entry its weight times the gradient that `blend` would have written."""
+    """Backward of `blend`: add the gradient times its weight to each corner's entry."""
     g = gather(grad, at, stride, features)
     for corner in range(8):
         k = corner * BLOCK + i
@@ -114,9 +114,9 @@ def spread(grad, at, stride, entries, weights, i, features, table):
 
 @njit(inline="always")
 def _pass_over(table, first, last):
-    """Read a level's entries in order, which brings them into the caches at more than the rate of random reads.
+    """Prefetch a level's entries: reading in order fills the caches faster than random reads.
 
-    The sum is for nothing; it keeps the compiler from dropping the loop.
+    The returned sum keeps the compiler from dropping the loop.
     """
     total = filled(ZERO, SIXTEEN)
     for at in range(first, last - LANES + 1, LANES):
@@ -161,7 +161,7 @@ def _table_gradient(grad, points, n, resolutions, offsets, masks, order, feature
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _point_gradient(grad, points, table, resolutions, offsets, masks, out):
-    """The slope of each level's trilinear blend along each axis: corners' values, signed by side."""
+    """Gradient of points: derivative of each level's trilinear interpolation along each axis."""
     features = table.shape[1]
     for i in prange(points.shape[1]):
         slope = np.zeros(3, np.float32)
@@ -192,7 +192,9 @@ def _point_gradient(grad, points, table, resolutions, offsets, masks, out):
 
 @cache
 def _grid(levels):
-    """Resolution, first entry and hash mask (0: dense) of each level, and a tuple as long as an entry."""
+    """Resolution, first entry and hash mask (0: dense) of each level, and a tuple with a number for each feature of
+    an entry.
+    """
     resolutions = np.array(levels.resolutions)
     dense = (resolutions + 1) ** 3 <= 2**levels.log2_entries
     masks = np.where(dense, 0, 2**levels.log2_entries - 1).astype(np.uint32)
@@ -231,7 +233,7 @@ run = differentiable(forward, backward, contiguous=False)
 
 
 def _planes(points):
-    """One axis after another, and as much memory after the last as lanes may reach over the end."""
+    """Points as planes of x, y and z, padded by as much as lanes may read beyond the end."""
     n = len(points)
     flat = empty(3 * n + LANES)
     flat[: 3 * n].view(3, n).copy_(points.t())
@@ -241,5 +243,5 @@ def _planes(points):
 
 @cache
 def _shared_out(levels, threads):
-    """Levels in an order that gives each thread's consecutive share fine and coarse ones alike."""
+    """Order of levels that balances the threads' consecutive shares between fine and coarse ones."""
     return np.concatenate([np.arange(t, levels, threads) for t in range(threads)])

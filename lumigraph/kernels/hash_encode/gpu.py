@@ -63,7 +63,7 @@ def _backward_table(grad, points, pyramid, d_table, S, L: tl.constexpr, F: tl.co
 def _backward_points(
     grad, points, table, pyramid, d_points, S, L: tl.constexpr, F: tl.constexpr, FEATURES: tl.constexpr
 ):
-    """Here one program sees all levels, so that it can sum over them."""
+    """Gradient of points. One program takes all levels, so that it can sum over them."""
     i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
     there = here[:, None] & (feature < F)[None, :]

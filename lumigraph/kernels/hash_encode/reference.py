@@ -1,4 +1,4 @@
-"""The definition: eight corners a level, looked up and blended."""
+"""Reference implementation: eight corners a level, looked up and blended."""
 
 import itertools
 

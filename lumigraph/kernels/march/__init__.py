@@ -1,4 +1,4 @@
-"""Ray marching: which stretches of each ray are worth asking the network about."""
+"""Ray marching: intervals of rays in occupied cells."""
 
 import math
 
@@ -34,9 +34,9 @@ def march(
     Cascade c is a grid of n^3 cells over the cube [-2^c, 2^c]^3; a point belongs to the finest cascade that
     holds it (max |x| < 2^c), and to none outside the last. A grid's index is [cascade, x, y, z].
 
-    occupied: cells worth visiting
-    density:  what is known of each cell, per scene unit; sums of density times length along kept samples tell when
-              a ray is spent: samples behind exp(-sum) < stop are dropped. 0 keeps all.
+    occupied: occupancy grid
+    density:  estimate for each cell, per scene unit, for early termination: samples behind exp(-sum) < stop are
+              dropped, sum that of density times length along kept samples. stop 0 keeps all
     t_near:   >= 0; a ray whose t_far <= t_near has no samples
     Not differentiable.
     """
@@ -50,7 +50,7 @@ def march(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on, without rays whose samples hang on an engine's rounding."""
+    """Test inputs for all engines, without rays whose samples depend on rounding."""
     for rays, cascades, n, filled, step, growth, stop in [
         (0, 1, 4, 0.5, 0.1, 0.0, 0.0),
         (1, 1, 1, 1.0, 0.2, 0.0, 0.0),
@@ -74,7 +74,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Rays into a cube of 128^3 cells that holds a shell, 1024 steps to its diagonal; 64 times fewer than `size`."""
+    """size / 64 rays into a cube of 128^3 cells that holds a shell, 1024 steps to its diagonal."""
     rays = size // 64
     place = (torch.arange(128) + 0.5) / 64 - 1
     radius = torch.stack(torch.meshgrid(place, place, place, indexing="ij")).norm(dim=0)
@@ -98,7 +98,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(rays, cascades, n, filled, step, growth, stop, generator):
-    """Rays from inside and outside the cubes, towards them and past them; some end before they begin."""
+    """Rays from inside and outside the cubes, towards them and past them; some with t_far before t_near."""
 
     def uniform(*shape):
         return torch.rand(shape, generator=generator)
@@ -115,7 +115,7 @@ def _inputs(rays, cascades, n, filled, step, growth, stop, generator):
 
 
 def _steady(origins, directions, t_near, t_far, occupied, density, step, growth, stop):
-    """Only the rays that keep their samples when the lattice and `stop` are nudged by more than float32 rounds."""
+    """The rays that keep their samples when the lattice and `stop` change by more than float32 rounds."""
     from .reference import run
 
     def samples(nudge):

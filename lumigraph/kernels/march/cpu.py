@@ -1,4 +1,4 @@
-"""Numba: each ray walks its lattice once and notes the indices it keeps; a second pass writes them out as distances."""
+"""Numba: each ray walks its lattice once and stores the indices of kept intervals; a second pass computes distances."""
 
 import math
 
@@ -41,7 +41,7 @@ def _index_of(t, near, step, growth, linear, bend):
 
 @njit(inline="always")
 def _exit(cell, clear, per_unit, half, origin, direction, inverse):
-    """Distance at which a ray leaves a cell, and all that is clear around it, through the side it heads for."""
+    """Distance at which a ray leaves a cell and the empty space around it, along one axis."""
     if direction == ZERO:
         return np.float32(np.inf)
     side = np.float32(cell + clear) if direction > ZERO else np.float32(cell + 1 - clear)
@@ -50,9 +50,9 @@ def _exit(cell, clear, per_unit, half, origin, direction, inverse):
 
 @njit(**FAST)
 def _walk(ox, oy, oz, dx, dy, dz, near, far, occupied, clearance, density, step, growth, depth_limit, kept, first):
-    """Note the lattice intervals of one ray that are kept, from kept[first] on; returns how many.
+    """Store the indices of one ray's kept intervals from kept[first] on; returns their number.
 
-    Takes numbers rather than rows: a row would be counted in and out, for which threads wait on each other.
+    Takes numbers rather than rows: rows are reference-counted, which makes threads wait for each other.
     """
     cascades, n = occupied.shape[:2]
     shift, block = (0, ONE) if clearance.shape[1] == n else (BLOCK_BITS, np.float32(1 << BLOCK_BITS))
@@ -116,7 +116,7 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, occupied, clearance, density, step,
 
 @njit(parallel=True, **FAST)
 def _room(o, near, far, outermost, step, growth, end, room):
-    """Where each ray ends, beyond every cascade at the latest, and at most how many samples it can have."""
+    """End of each ray, at the latest where it has left every cascade, and an upper bound of its samples."""
     for r in prange(len(near)):
         away = np.sqrt(o[r, 0] * o[r, 0] + o[r, 1] * o[r, 1] + o[r, 2] * o[r, 2])
         end[r] = min(far[r], away + TWO * outermost)
@@ -146,9 +146,10 @@ def _write(near, step, growth, begin, kept, starts, t_start, t_end):
 
 @njit(cache=True)
 def _measure(clear):
-    """Turn 0 where a block holds something, else 1, into how many blocks away the nearest such block or wall is.
+    """Distance transform: replace 0 (occupied block) and 1 (empty) by the distance to the nearest occupied block or
+                        border.
 
-    The chessboard distance, in two sweeps (Rosenfeld and Pfaltz 1968). At k, the (2k - 1)^3 blocks around are clear.
+    Chebyshev distance in two sweeps (Rosenfeld and Pfaltz 1968). At k, the (2k - 1)^3 blocks around are empty.
     """
     cascades, n = clear.shape[:2]
     for cascade in range(cascades):
@@ -173,8 +174,8 @@ _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def _clearance(occupied):
-    """(cascade, x, y, z): of how many blocks of cells around each one nothing is known but that they are empty, so
-    that a ray may leap; 0 in blocks that hold an occupied cell. Worked out once for each state of a grid.
+    """Clearance (cascade, x, y, z) of each block of cells: distance in blocks to the nearest occupied one; 0 in
+    occupied blocks. Rays skip that far. Computed once for each state of a grid.
     """
     version, clear = _known.get(occupied, (None, None))
     if version != occupied._version:

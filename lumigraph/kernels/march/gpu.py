@@ -21,7 +21,7 @@ def _lattice(k, t_near, step, knee, log_growth):
 
 @triton.jit
 def _first_at(t, t_near, step, knee, growth, log_growth, GROWS: tl.constexpr):
-    """The first interval whose midpoint lies at or beyond t, or one of the few before it: rounding must skip none."""
+    """First interval whose midpoint lies at or beyond t, or a few before it, so that rounding skips none."""
     k = (t - t_near) / step - 0.5
     if GROWS:
         t_knee = tl.fma(knee.to(tl.float32), step, t_near)
@@ -32,7 +32,7 @@ def _first_at(t, t_near, step, knee, growth, log_growth, GROWS: tl.constexpr):
 
 @triton.jit
 def _slab(o, inverse, reach):
-    """Where a ray is between the planes -reach and reach of one axis."""
+    """Distances at which a ray passes the planes -reach and reach of one axis."""
     a, b = (-reach - o) * inverse, (reach - o) * inverse
     return tl.minimum(a, b), tl.maximum(a, b)
 
@@ -51,7 +51,7 @@ def _cell(x, inverse_scale, n: tl.constexpr):
 
 @triton.jit
 def _to_face(x, i, d, inverse, scale, n: tl.constexpr):
-    """Distance along the ray to where it leaves cell i of one axis."""
+    """Distance along the ray to its exit from cell i of one axis."""
     face = ((i + (d > 0).to(tl.int32)).to(tl.float32) * (2.0 / n) - 1) * scale
     return (face - x) * inverse
 

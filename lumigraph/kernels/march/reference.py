@@ -1,4 +1,4 @@
-"""The definition: every lattice interval of every ray, (R, K), then a mask."""
+"""Reference implementation: every lattice interval of every ray, (R, K), then a mask."""
 
 import torch
 from torch import Tensor
@@ -30,7 +30,7 @@ def lattice(t_near: Tensor, t_far: Tensor, step: float, growth: float) -> Tensor
 
 
 def locate(x: Tensor, shape: tuple[int, ...]) -> tuple[tuple[Tensor, ...], Tensor]:
-    """Index [cascade, x, y, z] of the cell that each point is in, and whether any cascade holds it."""
+    """Index [cascade, x, y, z] of each point's cell, and a mask of points inside a cascade."""
     cascades, n = shape[:2]
     distance = x.abs().amax(-1)
     cascade = (distance[..., None] >= 2.0 ** torch.arange(cascades, device=x.device)).sum(-1)
@@ -41,5 +41,5 @@ def locate(x: Tensor, shape: tuple[int, ...]) -> tuple[tuple[Tensor, ...], Tenso
 
 
 def _beyond_all(origins: Tensor, cascades: int) -> Tensor:
-    """A distance at which every ray has left the last cascade."""
+    """A distance at which each ray has left the last cascade."""
     return origins.norm(dim=-1) + 3**0.5 * 2.0 ** (cascades - 1)

@@ -1,4 +1,4 @@
-"""Octree traversal: the occupied cells that each ray crosses, and between which distances."""
+"""Octree traversal: the occupied cells that each ray crosses, with entry and exit distances."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ MIN_SPEED = 1e-9  # of a direction along an axis; slower ones are set to it
 class Tree:
     """Table row of each cell of an octree over the unit cube; made by `of` or `part`.
 
-    The cube is divided in eight, and each cell again where something smaller lies in it. A cell's code begins with a 1
-    and has three bits for each level, the half along x, y and z that it lies in (1 is the upper one).
+    A node is a cell with eight children. A cell's code begins with a 1 and has three bits for each level: its half
+    along x, y and z (1 is the upper one).
 
-    cells: of each node, a divided cell, its eight: k > 0 is divided itself, as node k; 0 holds nothing; -1 - r has row
-           r. The first node is the cube; the place of (x, y, z) in a node is 4 x + 2 y + z
-    rows:  int32; the row of a table with `count` rows for each that `cells` names, -1 for none; empty where those
-           are the rows meant
-    depth: levels below the cube at most
+    cells: the eight children of each node: k > 0 is node k; 0 is empty; -1 - r is a leaf with row r. The first node is
+           the cube; child (x, y, z) of a node is at 4 x + 2 y + z
+    rows:  int32; table row for each row that `cells` names, -1 for none, in a table of `count` rows; empty for identity
+    depth: maximum number of levels below the cube
     """
 
     cells: Int32[Tensor, "node 8"]
@@ -38,8 +37,8 @@ class Tree:
 
     @classmethod
     def of(cls, codes: Int[Tensor, " row"]) -> Tree:
-        """The tree of cells with these codes, each with the row at its code's place. Raises ValueError unless all
-        differ, and none lies in another."""
+        """Tree of leaf cells with these codes, each with the index of its code as row. Raises ValueError unless all
+        differ and none contains another."""
         codes = codes.long()
         levels = levels_of(codes)
         depth = int(levels.max()) if len(codes) else 1
@@ -67,14 +66,14 @@ class Tree:
         return cls(cells, cells.new_zeros(0), len(codes), depth)
 
     def part(self, rows: Int[Tensor, " some"]) -> Tree:
-        """The same tree for a table that holds these rows alone, in this order; its other cells are empty."""
+        """The same tree for a table of only these rows, in this order; its other cells are empty."""
         here = torch.full_like(self.named, -1)
         here[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
         return Tree(self.cells, here, len(rows), self.depth)
 
     @property
     def named(self) -> Int32[Tensor, " row"]:
-        """`rows`, written out where they are left empty."""
+        """`rows`, with the identity written out."""
         return self.rows if len(self.rows) else torch.arange(self.count, dtype=torch.int32, device=self.cells.device)
 
     def to(self, device: torch.device | str) -> Tree:
@@ -83,7 +82,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Crossed:
-    """Intervals of rays in cells, packed as in `Samples`, and the row of each one's cell."""
+    """Intervals of rays in cells, packed as in `Samples`, and the row of each cell."""
 
     t_start: Float[Tensor, " sample"]
     t_end: Float[Tensor, " sample"]
@@ -104,14 +103,14 @@ def octree_cells(
     near: float = 0.0,
     stop: float = 0.0,
 ) -> Crossed:
-    """The cells with rows that rays cross, in order, and where each is entered and left.
+    """Leaf cells with rows along each ray, in order, with entry and exit distances.
 
-    A ray goes from cell to cell by whole numbers: it leaves one through the side that it meets first, into the cell
-    beyond, which holds the place where it comes in. So rounding moves sides, and loses no cell.
+    Traversal is by integer cell coordinates: a ray leaves a cell through the side that it meets first, into the
+    neighbour that contains its entry point. So rounding moves sides, but skips no cell.
 
     origins, directions, near: in units of the cube, which is [0, 1]^3; directions of unit length
-    tree:    trusted to be as its makers leave it
-    density: per side of the cube, (tree.count,); a ray ends once its light is spent
+    tree:    trusted to be unchanged since `of` or `part`
+    density: per side of the cube, (tree.count,), for early termination
     stop:    cells behind exp(-sum of density times length) < stop are left out; 0 keeps all
     Not differentiable.
     """
@@ -135,7 +134,7 @@ def levels_of(codes: Int[Tensor, " row"]) -> Int[Tensor, " row"]:
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on, without rays whose cells hang on an engine's rounding."""
+    """Test inputs for all engines, without rays whose cells depend on rounding."""
     for rays, depth, share, near, stop in [
         (0, 1, 1.0, 0.0, 0.0),
         (1, 1, 1.0, 0.0, 0.0),
@@ -155,15 +154,14 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Rays of pixels next to each other through a ball's shell of cells of 1/128, until they are spent; 16 times fewer
-    than `size`."""
+    """size / 16 rays of neighbouring pixels through a ball's shell of cells of 1/128, with early termination."""
     tree = shell(7)
     origins, directions = picture(size // 16)
     return origins, directions, tree, 400 * torch.rand(tree.count, generator=generator), 0.0, 1e-3
 
 
 def some_tree(depth: int, share: float, generator: torch.Generator) -> Tree:
-    """A tree in which a share of all cells is divided, and the same share of the others has rows, in random order."""
+    """A random tree: the share of cells that are divided, and of the others that have rows, in random order."""
     divided, codes = torch.ones(1, dtype=torch.int64), []
     for level in range(1, depth + 1):
         cells = (divided[:, None] * 8 + torch.arange(8)).flatten()
@@ -203,7 +201,7 @@ def picture(rays: int):
 
 
 def code_of(x: Tensor, y: Tensor, z: Tensor, depth: int) -> Int[Tensor, " cell"]:
-    """The codes of cells at a level, from their whole numbers along each axis."""
+    """Codes of cells at a level from their integer coordinates."""
     code = torch.ones_like(x)
     for k in range(depth - 1, -1, -1):
         code = code * 8 + ((x >> k & 1) * 4 + (y >> k & 1) * 2 + (z >> k & 1))
@@ -211,7 +209,7 @@ def code_of(x: Tensor, y: Tensor, z: Tensor, depth: int) -> Int[Tensor, " cell"]
 
 
 def steady(origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, near: float, stop: float):
-    """Only the rays that cross the same cells when they are nudged by more than float32 rounds."""
+    """The rays that cross the same cells when they move by more than float32 rounds."""
 
     def rows(nudge: float) -> tuple[Tensor, ...]:
         moved = origins.double() + nudge * torch.tensor([1.0, -0.7, 0.4])

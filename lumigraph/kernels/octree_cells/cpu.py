@@ -1,5 +1,5 @@
-"""Numba: each ray walks through the tree twice, to count its cells and to write them. A ray keeps the nodes that it is
-in, from the cube on, so that it goes up no further than to the one that holds the next cell too."""
+"""Numba: each ray traverses the tree twice, to count its cells and to write them. A stack of nodes from the cube down
+lets it go up no further than to the common ancestor with the next cell."""
 
 import math
 
@@ -17,13 +17,13 @@ FAST = {"cache": True, "error_model": "numpy"}
 
 @njit(inline="always")
 def _inverse(d, side):
-    """One over the smallest cells that a ray passes along an axis in a unit of its length."""
+    """1 / speed of a ray along an axis, in smallest cells per unit of length."""
     return ONE / ((MIN_SPEED if abs(d) < MIN_SPEED else d) * side)
 
 
 @njit(inline="always")
 def in_cells(o, d, r, side):
-    """Ray r in smallest cells: its origin, its direction, and one over that."""
+    """Origin, direction and inverse direction of ray r in units of the smallest cells."""
     dx, dy, dz = d[r, 0], d[r, 1], d[r, 2]
     ix, iy, iz = _inverse(dx, side), _inverse(dy, side), _inverse(dz, side)
     return o[r, 0] * side, o[r, 1] * side, o[r, 2] * side, dx * side, dy * side, dz * side, ix, iy, iz
@@ -40,20 +40,20 @@ def through_cube(ray, side, near):
 
 @njit(inline="always")
 def cell_at(x, low, high):
-    """The whole number of the smallest cell at a coordinate, from low to below high."""
+    """Integer coordinate of the smallest cell at x, clamped to [low, high)."""
     return min(max(np.int64(x), low), high - 1)
 
 
 @njit(inline="always")
 def place_at(ray, t, side):
-    """The smallest cell in the cube at a distance along a ray."""
+    """Smallest cell in the cube at a distance along a ray."""
     ox, oy, oz, dx, dy, dz, _, _, _ = ray
     return cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
 
 
 @njit(inline="always")
 def leaf(cells, path, level, depth, x, y, z):
-    """Value and level of the undivided cell at a place. path: the nodes down to `level`, to which it adds"""
+    """Value and level of the leaf at a cell. path: stack of nodes down to `level`, extended to the leaf"""
     node = path[level]
     while True:
         shift = depth - level - 1
@@ -67,7 +67,7 @@ def leaf(cells, path, level, depth, x, y, z):
 
 @njit(inline="always")
 def leave(x, y, z, shift, ray, t):
-    """Distance at which a ray leaves the cell of side 2^shift at a place, and the place beyond."""
+    """Distance at which a ray leaves the cell of side 2^shift, and the cell after it."""
     ox, oy, oz, dx, dy, dz, ix, iy, iz = ray
     size = np.int64(1) << shift
     lx, ly, lz = x >> shift << shift, y >> shift << shift, z >> shift << shift
@@ -88,9 +88,9 @@ def leave(x, y, z, shift, ray, t):
 
 @njit(inline="always")
 def cross(cells, rows, path, level, depth, x, y, z, ray, t):
-    """Cross the undivided cell at a place: its row, -1 for none, its level, and the results of `leave`.
+    """Cross the leaf at a cell: its row, -1 for none, its level, and the results of `leave`.
 
-    rows: `Tree.rows`; path: the nodes from the cube down to `level`, to which those below are added
+    rows: `Tree.rows`; path: stack of nodes from the cube down to `level`, extended to the leaf
     """
     value, level = leaf(cells, path, level, depth, x, y, z)
     row = np.int64(-1)
@@ -102,13 +102,15 @@ def cross(cells, rows, path, level, depth, x, y, z, ray, t):
 
 @njit(inline="always")
 def outside(u, v, w, side):
-    """True for a place beyond the cube."""
+    """True outside the cube."""
     return u < 0 or v < 0 or w < 0 or u >= side or v >= side or w >= side
 
 
 @njit(inline="always")
 def shared(level, depth, differing):
-    """The deepest level, at most this one, whose node holds two places. differing: the bits in which they do"""
+    """Level, at most this one, of the deepest common ancestor of two cells. differing: bits in which coordinates
+    differ
+    """
     while differing >> (depth - level):
         level -= 1
     return level

@@ -1,4 +1,4 @@
-"""Triton: one lane takes one ray, and goes down from the cube to each of its cells. The first pass counts them, the
+"""Triton: one lane takes one ray, and descends from the root to each of its cells. The first pass counts them, the
 second writes them."""
 
 import math
@@ -17,14 +17,16 @@ BLOCK = tl.constexpr(32)  # rays; they go together, so a program is as slow as i
 
 @triton.jit
 def cell_at(x, low, high, side):
-    """The whole number of the smallest cell at a coordinate, from low to below high."""
+    """Integer coordinate of the smallest cell at x, clamped to [low, high)."""
     inside = tl.minimum(tl.maximum(x * side, -1.0), side + 1.0)
     return tl.minimum(tl.maximum(tl.floor(inside).to(tl.int32), low), high - 1)
 
 
 @triton.jit
 def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
-    """Rays (origins, directions, one over these), where they enter the cube, which do, and their cells there."""
+    """Rays (origins, directions, inverse directions), entry distances, a mask of rays that meet the cube, and entry
+    cells.
+    """
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     ix = 1.0 / tl.where(tl.abs(dx) < MIN_SPEED, MIN_SPEED, dx)
@@ -42,7 +44,7 @@ def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
 
 @triton.jit
 def leaf(cells, x, y, z, going, DEPTH: tl.constexpr):
-    """Value of the undivided cell at a place, and the logarithm of its side."""
+    """Value of the leaf at a cell, and the logarithm of its side."""
     node = tl.zeros_like(x)
     value = tl.zeros_like(x)
     shift = tl.zeros_like(x) + DEPTH
@@ -59,7 +61,7 @@ def leaf(cells, x, y, z, going, DEPTH: tl.constexpr):
 
 @triton.jit
 def leave(x, y, z, shift, ray, t, DEPTH: tl.constexpr):
-    """Distances at which rays leave the cells of side 2^shift at their places, and the places beyond."""
+    """Distances at which rays leave their cells of side 2^shift, and the cells after them."""
     ox, oy, oz = ray[0]
     dx, dy, dz = ray[1]
     ix, iy, iz = ray[2]
@@ -84,14 +86,14 @@ def leave(x, y, z, shift, ray, t, DEPTH: tl.constexpr):
 
 @triton.jit
 def inside(u, v, w, DEPTH: tl.constexpr):
-    """True for places in the cube."""
+    """True inside the cube."""
     side = 1 << DEPTH
     return (u >= 0) & (v >= 0) & (w >= 0) & (u < side) & (v < side) & (w < side)
 
 
 @triton.jit
 def row_in(named, value, going):
-    """The row of a cell with a value of `Tree.cells`, -1 where it has none."""
+    """Table row for a value of `Tree.cells`, -1 for none."""
     there = going & (value < 0)
     return tl.load(named + tl.where(there, -1 - value, 0), mask=there, other=-1)
 

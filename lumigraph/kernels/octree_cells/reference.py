@@ -1,4 +1,4 @@
-"""The definition: all rays take a step together, each from its cell to the next."""
+"""Reference implementation: all rays step in lockstep, each from its cell to the next."""
 
 import math
 

@@ -20,16 +20,16 @@ def octree_march(
     near: float = 0.0,
     stop: float = 0.0,
 ) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-    """Accumulate the cells that a ray crosses (see `octree_cells`), each the same everywhere inside (section 4.1):
+    """Accumulate the cells that a ray crosses (see `octree_cells`), each constant inside (section 4.1):
 
         c_i = sigmoid(sum_lm Y_lm(d) harmonics_i,lm),    tau_i = density_i (t_{i+1} - t_i)
         C = sum_i T_i (1 - exp(-tau_i)) c_i,    T_i = exp(-sum_{j<i} tau_j)
 
     origins, directions, near: in units of the cube, which is [0, 1]^3; directions of unit length
-    tree:      trusted to be as its makers leave it
+    tree:      trusted to be unchanged since `of` or `part`
     density:   per side of the cube, never negative
     harmonics: 1, 4, 9 or 16 coefficients of each colour, in the order of `spherical_harmonics`
-    stop:      early termination: cells behind this transmittance weigh nothing and get no gradient
+    stop:      early termination: cells behind this transmittance get weight 0 and no gradient
 
     Returns colour (ray, 3), the accumulated distance to the middles of intervals (ray,), opacity (ray,).
     All three are differentiable in density and harmonics.
@@ -40,7 +40,7 @@ def octree_march(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: empty space, haze and walls, cells of several sizes, spent rays."""
+    """Test inputs for all engines: empty space, haze and walls, cells of several sizes, terminated rays."""
     for rays, depth, share, bands, dense, near, stop in [
         (0, 1, 1.0, 1, 1.0, 0.0, 0.0),
         (1, 1, 1.0, 2, 2.0, 0.0, 0.0),

@@ -1,4 +1,4 @@
-"""Numba: a ray goes through the tree once, and on the way back once more. What each cell gets from each ray is noted,
+"""Numba: a ray traverses the tree once forward and once backward. Gradients of each cell from each ray are stored,
 sorted by cells, and summed by one thread for each run of cells, so that no two add to one place."""
 
 import math
@@ -16,15 +16,15 @@ CELLS_PER_CHUNK = 64  # cells of a ray whose colours are worked out together
 
 
 def spread(rays):
-    """An order of chunks in which every thread, which takes a run of them, has some from all over a picture, and none
-    far from what another is at."""
+    """Order of chunks of rays that balances threads: each thread's run has chunks from all over a picture, and at any
+    time all threads work near each other."""
     threads, chunks = get_num_threads(), np.arange((rays + CHUNK - 1) // CHUNK)
     return np.concatenate([chunks[i::threads] for i in range(threads)])
 
 
 @njit(inline="always")
 def _colour(harmonics, row, y):
-    """What a cell shows along the direction whose basis is y."""
+    """Colour of a cell in the direction whose basis is y."""
     red = green = blue = ZERO
     for k in range(harmonics.shape[1]):
         red += y[k] * harmonics[row, k, 0]
@@ -35,8 +35,7 @@ def _colour(harmonics, row, y):
 
 @njit(inline="always")
 def _shown(met, weights, count, harmonics, y, asked):
-    """Sums of what some cells show by their weights. All rows are touched before any is worked out: memory then brings
-    several at a time, where it would otherwise be waited for from one to the next."""
+    """Weighted sums of cells' colours. All rows are prefetched first, so that memory latencies overlap."""
     last = harmonics.shape[1] - 1
     for i in range(count):
         asked[0] += harmonics[met[i], 0, 0] + harmonics[met[i], last // 2, 0] + harmonics[met[i], last, 2]
@@ -96,10 +95,9 @@ def _share(
     chunks, g_rgb, g_distance, g_opacity, o, d, cells, named, density, harmonics, bands, depth, near,
     rgb, distance, opacity, starts, bases, rows, rays, shares,
 ):  # fmt: skip
-    """Of each cell that each ray met: its row, and the loss's slope in its density and its three sums of harmonics.
+    """Row, density gradient and three harmonics gradients of each cell that each ray crosses.
 
-    dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss; the sum
-    over all of a ray is at hand, in its outputs.
+    dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j with g_i = dL/dw_i; the sum over all of a ray is known from its outputs.
     """
     n, side = len(o), np.int64(1) << depth
     across = np.float32(side)
@@ -143,7 +141,7 @@ def _share(
 
 @njit(cache=True)
 def _sorted(rows, firsts, order):
-    """Where the shares of each row begin when they are sorted by rows, and which ones those are, in order of rays."""
+    """Counting sort: start of each row's shares, and their indices, in order of rays."""
     for i in range(len(rows)):
         firsts[rows[i] + 1] += 1
     for row in range(len(firsts) - 1):

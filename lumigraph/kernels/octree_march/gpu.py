@@ -14,7 +14,7 @@ BLOCK = tl.constexpr(32)  # rays
 
 @triton.jit
 def _colour(harmonics, row, held, direction, BASIS: tl.constexpr):
-    """What cells show along directions."""
+    """Colours of cells along directions."""
     x, y, z = direction
     red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(BASIS):
@@ -76,7 +76,7 @@ def _backward(
     DEPTH: tl.constexpr,
     BASIS: tl.constexpr,
 ):
-    """dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss."""
+    """Gradients: dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j with g_i = dL/dw_i."""
     origins, directions = rays
     d_rgb, d_distance, d_opacity = grads
     rgb, distance, opacity = outputs

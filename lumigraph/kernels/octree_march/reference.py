@@ -1,4 +1,4 @@
-"""The definition: the cells, their colours along each ray, compositing."""
+"""Reference implementation: the cells, their colours along each ray, compositing."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Matching cost of slanted planes: how well windows around pixels agree with neighbouring photographs."""
+"""Photometric matching cost of slanted planes in neighbouring photographs, for PatchMatch stereo."""
 
 import torch
 from jaxtyping import Float, Int64
@@ -66,7 +66,7 @@ def window(radius: int) -> list[tuple[int, int]]:
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: small and flat pictures, neighbours behind, masks, other sizes."""
+    """Test inputs for all engines: small and flat pictures, neighbours behind, masks, other sizes."""
     for size, its_size, count, pixels, planes, radius in [
         ((1, 1), (1, 1), 1, 1, 1, 1),
         ((3, 2), (5, 4), 2, 0, 3, 1),
@@ -88,7 +88,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A square photograph of an eighth of so many pixels, six neighbours of which three are chosen, eight planes."""
+    """A square photograph of size / 8 pixels, three of six neighbours chosen, eight planes."""
     side = max(round((size / 8) ** 0.5), 1)
     inputs = [*_inputs((side, side), (side, side), 6, side * side, 8, 3, generator)]
     inputs[6] = inputs[6][:, :3].contiguous()
@@ -96,7 +96,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(size, its_size, count, pixels, planes, radius, generator):
-    """A smooth picture with more than one brightness, and neighbours that see about the same a little aside."""
+    """A smooth picture of varied brightness, and slightly shifted neighbours."""
     (height, width), (its_height, its_width) = size, its_size
 
     def wave(rows, columns, shift, phase):

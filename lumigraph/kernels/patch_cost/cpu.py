@@ -1,5 +1,5 @@
-"""Numba. A task takes a run of pixels. A pixel's window is weighted once, then looked up in each neighbour for each of
-its planes."""
+"""Numba. A task takes a run of pixels. A pixel's window is weighted once, then compared with each neighbour for each
+plane."""
 
 import numpy as np
 from numba import njit, prange
@@ -17,7 +17,7 @@ FAST = {"fastmath": True, "error_model": "numpy"}
 
 @njit(**FAST)
 def _window(reference, trust, row, column, dx, dy, apart, sharpness, a, w):
-    """Values of a window, less that of its centre, and their bilateral weights. Returns their sum."""
+    """Values of a window, less that of its centre, and their bilateral weights. Returns the sum of weights."""
     height, width = reference.shape
     centre, total = reference[row, column], ZERO
     for k in range(len(apart)):
@@ -34,13 +34,14 @@ def _window(reference, trust, row, column, dx, dy, apart, sharpness, a, w):
 def _cost(
     warps, n, planes, p, m, x, y, across, down, a, w, whole, shift, values, weights, rows, columns, masked, samples
 ):
-    """One less the correlation. The loop stores nothing, so that the compiler makes vectors of it, look-ups included.
-    Arrays come whole: counting the references to a row of one takes as long as the loop.
+    """One less the correlation. The loop stores nothing, so that the compiler vectorises it, look-ups included. Arrays
+    are
+    passed whole: reference counting of a view takes as long as the loop.
 
     n: number of the neighbour; p, m: of the pixel and its plane
     values, weights: the neighbours' W b and W with a border; weights are read only where `masked`
-    shift: near both pictures' values, taken from them so that squares stay small
-    samples: a tuple, one entry for each, so that their number is known when this is compiled
+    shift: near both pictures' values, subtracted so that squares stay small
+    samples: a tuple, one entry for each, so that their number is a compile-time constant
     """
     h, g, g_ = planes[p, m, 0], planes[p, m, 1], planes[p, m, 2]
     u0 = warps[n, 0, 0] * x + warps[n, 0, 1] * y + warps[n, 0, 2] + h * warps[n, 0, 3]

@@ -1,4 +1,4 @@
-"""Triton: a program takes some pixels, one plane and one view of each, and goes through their windows."""
+"""Triton: a program takes some pixels with one plane and one view of each, and loops over their windows."""
 
 import torch
 import triton
@@ -20,7 +20,7 @@ def _pixel(picture, row, column, rows, columns, here):
 
 @triton.jit
 def _between(picture, row, column, down, right, rows, columns, here):
-    """Value between four neighbouring pixels, zero outside."""
+    """Bilinear interpolation between four pixels, zero outside."""
     above = (1 - right) * _pixel(picture, row, column, rows, columns, here)
     above += right * _pixel(picture, row, column + 1, rows, columns, here)
     below = (1 - right) * _pixel(picture, row + 1, column, rows, columns, here)
@@ -30,7 +30,7 @@ def _between(picture, row, column, down, right, rows, columns, here):
 
 @triton.jit
 def _seen(warp, row, x, y, h, here):
-    """One homogeneous coordinate of (x, y) at inverse depth h; each pixel has its own warp."""
+    """One homogeneous coordinate of the warp of (x, y) at inverse depth h; each pixel has its own warp."""
     at = warp + 4 * row
     along = tl.load(at, mask=here, other=0.0) * x + tl.load(at + 1, mask=here, other=0.0) * y
     return along + tl.load(at + 2, mask=here, other=0.0) + h * tl.load(at + 3, mask=here, other=0.0)

@@ -1,4 +1,4 @@
-"""The definition: windows of all pixels at once, (P, M, samples, ...), one neighbour after the other."""
+"""Reference implementation: windows of all pixels at once, (P, M, samples, ...), one neighbour after the other."""
 
 import torch
 from torch import Tensor
@@ -37,7 +37,7 @@ def run(reference, trust, neighbours, neighbour_trust, warps, pixels, views, pla
 
 
 def look_up(pictures: Tensor, places: Tensor) -> Tensor:
-    """Values (picture, pixel, plane, sample) at homogeneous places, between four pixels; zero outside."""
+    """Bilinear interpolation (picture, pixel, plane, sample) at homogeneous coordinates; zero outside."""
     rows, columns = pictures.shape[1:]
     behind = places[..., 2:] <= BEHIND_DEPTH
     at = places[..., :2] / torch.where(behind, 1, places[..., 2:]) * (2 / places.new_tensor([columns, rows])) - 1

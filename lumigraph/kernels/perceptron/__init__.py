@@ -18,8 +18,8 @@ def perceptron(x: Float[Tensor, "sample input"], *weights: Float[Tensor, "_ _"])
         h_0 = x,  h_l = max(0, W_l h_{l-1}),  y = W_L h_{L-1}
 
     weights: W_1 to W_L, each (outputs, inputs)
-    Memory is quickest one feature of all samples after another: a (sample, feature) tensor that is the transpose of a
-    contiguous one, as `hash_encode` returns it, is not copied, and the result is such a tensor.
+    The fast layout is feature-major: a (sample, feature) tensor that is the transpose of a contiguous one, as
+    `hash_encode` returns it, is not copied, and the result is such a tensor.
     On a GPU products are taken in bfloat16 and sums in float32. Differentiable in x and the weights.
     """
     widths = [x.shape[1], *(weight.shape[0] for weight in weights)]
@@ -29,7 +29,7 @@ def perceptron(x: Float[Tensor, "sample input"], *weights: Float[Tensor, "_ _"])
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: widths and counts that registers and blocks divide, and others."""
+    """Test inputs for all engines: widths and counts that are and are not multiples of registers and blocks."""
     for samples, widths in [
         (0, (4, 3)),
         (1, (3, 2)),

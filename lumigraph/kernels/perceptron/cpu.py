@@ -1,6 +1,6 @@
-"""Numba: a thread takes a few samples through all layers before the next, so that nothing leaves its nearest cache.
+"""Numba: a thread takes a few samples through all layers before the next, so that activations stay in the L1 cache.
 
-On the way back the hidden layers are worked out again rather than kept: that is cheaper than fetching them.
+Backward recomputes the hidden layers: that is cheaper than loading them.
 """
 
 import numpy as np
@@ -80,7 +80,7 @@ def _product(values, x, depth, weights, w, down, across, count, out, y, gate, fi
 
 @njit(inline="always")
 def _fetch(planes, n, features, first, count, block, row):
-    """Samples first to first + count of all features, into a block's rows; zeros after them."""
+    """Copy samples first to first + count of all features into a block's rows, padded with zeros."""
     for f in range(features):
         if count == BLOCK:
             put(block, (row + f) * BLOCK, fetch_like(planes, f * n + first, ROW))
@@ -104,7 +104,7 @@ def _deliver(block, row, features, planes, n, first, count):
 
 @njit(inline="always")
 def _upwards(block, weights, widths, rows, last):
-    """All layers of one block; the last of the network has no ReLU."""
+    """Forward pass of one block; the network's last layer has no ReLU."""
     begin = 0
     for layer in range(last):
         depth, across, x, y = widths[layer], widths[layer + 1], rows[layer], rows[layer + 1]
@@ -117,7 +117,7 @@ def _upwards(block, weights, widths, rows, last):
 
 @njit(inline="always")
 def _downwards(block, weights, begin, depth, across, slope, target, gate, ungated):
-    """The gradient of one layer's inputs from that of its outputs."""
+    """Gradient of one layer's inputs from that of its outputs."""
     if ungated:
         _product(block, slope, depth, weights, begin, across, 1, across, block, target, target, _as_it_is)
     else:
@@ -126,7 +126,7 @@ def _downwards(block, weights, begin, depth, across, slope, target, gate, ungate
 
 @njit(inline="always")
 def _correlate(block, x, depth, slope, across, spare, sums, row):
-    """Add one layer's weight gradient: sum_s slope_os x_is. `sums` holds BLOCK inputs i of output o in a row."""
+    """Add one layer's weight gradient, sum_s slope_os x_is. `sums` has BLOCK inputs i of output o in a row."""
     for i in range(0, depth, BLOCK):
         for down in range(0, BLOCK, LANES):
             for right in range(0, BLOCK, LANES):
@@ -150,9 +150,9 @@ def _forward(x, n, weights, widths, rows, share, out):
 
 @njit(parallel=True, **FAST)
 def _backward(grad, x, n, weights, widths, rows, share, inputs, to_x, sums):
-    """A block holds each layer's values, then each layer's gradients, then what `_correlate` turns over.
+    """Gradients. A block has each layer's values, then each layer's gradients, then scratch memory of `_correlate`.
 
-    inputs: how many of the network's have a gradient, all or none
+    inputs: number of the network's inputs with a gradient, all or none
     sums: one for each part; those of a layer's weights for BLOCK inputs follow those of all layers before it
     """
     layers, total = len(widths) - 1, rows[-1]
@@ -205,14 +205,14 @@ _perceptron = differentiable(forward, backward, contiguous=False)
 
 
 def _shape(weights):
-    """All weights end to end; each layer's width; the first row of each layer's values, one below the other."""
+    """All weights concatenated; each layer's width; the first row of each layer's values."""
     flat = torch.cat([w.detach().reshape(-1) for w in weights]).numpy()
     widths = np.array([weights[0].shape[1], *(len(w) for w in weights)])
     return flat, widths, np.concatenate([[0], widths.cumsum()])
 
 
 def _share(n):
-    """Samples per thread, whole blocks of them."""
+    """Samples per thread, a multiple of the block size."""
     return max(BLOCK, -(-n // (get_num_threads() * BLOCK)) * BLOCK)
 
 

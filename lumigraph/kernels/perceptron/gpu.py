@@ -1,4 +1,4 @@
-"""Matrix products by the vendor's library, which PyTorch calls: what is left to fuse costs a GPU little."""
+"""PyTorch's matrix products: on a GPU fusing the rest would save little."""
 
 from collections.abc import Sequence
 

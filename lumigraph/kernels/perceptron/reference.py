@@ -1,4 +1,4 @@
-"""The definition."""
+"""Reference implementation."""
 
 from collections.abc import Sequence
 

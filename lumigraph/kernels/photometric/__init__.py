@@ -40,7 +40,7 @@ def photometric(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: images smaller than the window, odd sizes, equal and constant images."""
+    """Test inputs for all engines: images smaller than the window, odd sizes, equal and constant images."""
     for height, width, channels in [(1, 1, 1), (5, 7, 3), (11, 11, 1), (13, 33, 3), (18, 23, 3), (3, 90, 3)]:
         yield _inputs(height, width, channels, generator)
     a, b = _inputs(12, 13, 3, generator)
@@ -52,14 +52,14 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A square image of about so many pixels and its photograph, which wants no gradient."""
+    """A square image of about `size` pixels and its photograph, which gets no gradient."""
     side = max(round(size**0.5), 1)
     a, b = _inputs(side, side, 3, generator)
     return a.requires_grad_(), b
 
 
 def _inputs(height: int, width: int, channels: int, generator: torch.Generator):
-    """A smooth picture, and what is almost the same."""
+    """A smooth picture and a slightly different one."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     phase = 6 * torch.rand(channels, generator=generator)
     a = 0.5 + 0.4 * (0.4 * x[..., None] + 0.3 * y[..., None] + phase).sin()

@@ -1,9 +1,9 @@
 """Numba. A row is one line of width x channels numbers, whose neighbouring pixels are `channels` numbers apart, so that
 every inner loop runs along memory. A task goes down a strip of columns: it blurs one row along the line, keeps the last
-eleven of these in a near cache, and blurs across them. The images' sum of squares is one quantity, since S knows
-the variances by their sum alone.
+eleven of these in cache, and blurs across them. The images' sum of squares is one quantity, since S depends only on
+the sum of the variances.
 
-What a row amounts to does not depend on the tasks' sizes, so the result does not depend on the number of threads."""
+A row's result does not depend on the tasks' sizes, so the total does not depend on the number of threads."""
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ MEAN_A, SQUARES, PRODUCTS, MEAN_B = range(4)
 
 @njit(inline="always")
 def _window(x, at, step):
-    """The weighted sum of eleven numbers that are `step` apart."""
+    """Weighted sum of eleven numbers, `step` apart."""
     total = W0 * (x[at] + x[at + 10 * step]) + W1 * (x[at + step] + x[at + 9 * step])
     total += W2 * (x[at + 2 * step] + x[at + 8 * step]) + W3 * (x[at + 3 * step] + x[at + 7 * step])
     return total + W4 * (x[at + 4 * step] + x[at + 6 * step]) + W5 * x[at + 5 * step]
@@ -31,7 +31,7 @@ def _window(x, at, step):
 
 @njit(fastmath=True, error_model="numpy")
 def _moments(a, b, line, pixel):
-    """What is to be blurred: both images, their squares' sum, their product."""
+    """Inputs of the blur: both images, their squares' sum, their product."""
     length = STRIP + 2 * REACH * len(pixel)
     for i in range(len(a)):
         line[i] = a[i]
@@ -89,8 +89,7 @@ def _gap(a, b):
 
 @njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
 def _forward(a, b, pixel, bands, sums, gaps, maps):
-    """Sums of S and of |a - b| by strip and row; and S's derivatives, between margins of zeros, where `maps` has room
-    for them."""
+    """Sums of S and of |a - b| by strip and row; with `maps`, also the derivatives of S, between margins of zeros."""
     height, width = a.shape
     margin = REACH * len(pixel)
     length = STRIP + 2 * margin
@@ -155,7 +154,7 @@ def _gradient(rows, own, other, scale, step, out):
 
 @njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
 def _backward(own, other, maps, mean, scale, step, pixel, bands, out):
-    """Every derivative spreads to where it was gathered: the window is symmetric, so that is the same blur."""
+    """Gradient of an image: the derivatives, blurred by the same window, since it is symmetric."""
     height, width = own.shape
     strips = (width + STRIP - 1) // STRIP
     for task in prange(bands * strips):

@@ -19,14 +19,14 @@ MEAN_A, MEAN_B = 0, 3  # of the maps
 
 @triton.jit
 def _place(length):
-    """This program's row, its numbers along it, and which of them exist."""
+    """This program's row, its indices along it, and their mask."""
     x = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
     return tl.program_id(0).to(tl.int64), x, x < length
 
 
 @triton.jit
 def _across(plane, window, x, y, size, length, here):
-    """One blur across the lines, of rows that are blurred along."""
+    """Blur across the lines, of rows that are blurred along."""
     total = tl.zeros([BLOCK], tl.float32)
     for k in tl.static_range(TAPS):
         at = (y + (k - REACH)) * length + x
@@ -37,7 +37,7 @@ def _across(plane, window, x, y, size, length, here):
 
 @triton.jit(do_not_specialize=["height", "length"])
 def _moments(a, b, window, rows, height, length, C: tl.constexpr):
-    """Along the lines: both images, their squares' sum, their product."""
+    """Blur along the lines: both images, their squares' sum, their product."""
     y, x, here = _place(length)
     mean_a = tl.zeros([BLOCK], tl.float32)
     mean_b = tl.zeros([BLOCK], tl.float32)
@@ -100,7 +100,7 @@ def _along(maps, window, rows, height, length, C: tl.constexpr):
 
 @triton.jit(do_not_specialize=["height", "length", "mean"])
 def _gradient(rows, window, own, other, to_ssim, to_gap, d_own, height, length, mean, share):
-    """Every derivative spreads to where it was gathered: the window is symmetric, so that is the same blur."""
+    """Gradient of an image: the derivatives, blurred by the same window, since it is symmetric."""
     y, x, here = _place(length)
     size = height.to(tl.int64) * length
     to_mean = _across(rows + mean * size, window, x, y, size, length, here)

@@ -1,4 +1,4 @@
-"""The definition."""
+"""Reference implementation."""
 
 import torch
 from torch import Tensor

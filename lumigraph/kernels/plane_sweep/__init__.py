@@ -1,4 +1,4 @@
-"""Plane sweep: how well a photograph agrees with its neighbours at each depth that a pixel may have."""
+"""Plane sweep: matching cost of a photograph with its neighbours at each depth hypothesis."""
 
 import torch
 from jaxtyping import Float
@@ -52,14 +52,14 @@ def plane_sweep(
 
 
 def centred(pictures: Float[Tensor, "picture rows columns"], trust: Float[Tensor, "picture rows columns"]) -> Tensor:
-    """Pictures less their mean weighted by trust, and zero where trust is zero."""
+    """Pictures less their trust-weighted mean, zero where trust is zero."""
     total = trust.sum((1, 2), keepdim=True).clamp_min(1e-6)
     mean = (pictures * trust).sum((1, 2), keepdim=True) / total
     return torch.where(trust > 0, pictures - mean, 0)
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: small and flat pictures, neighbours behind, masks, other sizes."""
+    """Test inputs for all engines: small and flat pictures, neighbours behind, masks, other sizes."""
     for size, its_size, count, planes, window, best in [
         ((1, 1), (1, 1), 1, 1, 1, 1),
         ((3, 2), (5, 4), 2, 0, 3, 1),
@@ -83,13 +83,13 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A square photograph of an eighth of so many pixels, four neighbours, 32 planes."""
+    """A square photograph of size / 8 pixels, four neighbours, 32 planes."""
     side = max(round((size / 8) ** 0.5), 1)
     return _inputs((side, side), (side, side), 4, 32, 5, 2, generator)
 
 
 def _inputs(size, its_size, count, planes, window, best, generator):
-    """A smooth picture with more than one brightness, and neighbours that see about the same a little aside."""
+    """A smooth picture of varied brightness, and slightly shifted neighbours."""
     (height, width), (its_height, its_width) = size, its_size
 
     def wave(rows, columns, shift, phase):

@@ -1,5 +1,5 @@
 """Numba. A task takes one plane down all rows: it looks up a row in each neighbour, adds six quantities along windows,
-keeps as many rows of these as a window has in a near cache, and adds them across."""
+keeps as many rows of these as a window has in cache, and adds them across."""
 
 import numpy as np
 from numba import njit, prange
@@ -16,7 +16,7 @@ ZERO, HALF, ONE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float3
 
 @njit(fastmath=True, error_model="numpy")
 def _place(warp, h, y, rows, columns, u, v):
-    """Place of row y, counted from the centre of a border's first pixel; on the border if it is not seen."""
+    """Neighbour coordinates of row y, counted from the border's first pixel; on the border if invisible."""
     y = np.float32(y) + HALF
     u0 = warp[0, 1] * y + warp[0, 2] + h * warp[0, 3]
     v0 = warp[1, 1] * y + warp[1, 2] + h * warp[1, 3]
@@ -34,7 +34,7 @@ def _place(warp, h, y, rows, columns, u, v):
 
 @njit(fastmath=True, error_model="numpy")
 def _look_up(pixels, stride, u, v, seen, its):
-    """Trust, and trusted values, between four neighbouring pixels. Here the compiler finds no vectors."""
+    """Bilinear interpolation of trust, and of trust times value. The compiler does not vectorise this loop."""
     for x in range(len(u)):
         column, row = np.int32(u[x]), np.int32(v[x])
         right, down = u[x] - np.float32(column), v[x] - np.float32(row)
@@ -97,7 +97,7 @@ def _cost(total, share, cost):
 
 @njit(fastmath=True, error_model="numpy")
 def _keep_least(cost, least):
-    """Put a row of costs into its place among the least so far, which are in order."""
+    """Insert a row of costs into the sorted list of the least so far."""
     for k in range(len(least)):
         for x in range(len(cost)):
             c, lower = cost[x], least[k, x]

@@ -1,4 +1,4 @@
-"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
+"""Faults that tests seed, by name: engine, function, code, replacement. ASTRAY: out-of-bounds accesses."""
 
 FAULTS = {
     "half a pixel aside": ("cpu", "_place", "v0) * inverse + HALF", "v0) * inverse"),

@@ -1,4 +1,4 @@
-"""Triton: a program takes some pixels at one plane and one neighbour, and goes through their windows."""
+"""Triton: a program takes some pixels at one plane and one neighbour, and loops over their windows."""
 
 import triton
 import triton.language as tl
@@ -19,7 +19,7 @@ def _pixel(picture, row, column, rows, columns, here):
 
 @triton.jit
 def _between(picture, row, column, down, right, rows, columns, here):
-    """The value between four neighbouring pixels, zero outside."""
+    """Bilinear interpolation between four pixels, zero outside."""
     above = (1 - right) * _pixel(picture, row, column, rows, columns, here)
     above += right * _pixel(picture, row, column + 1, rows, columns, here)
     below = (1 - right) * _pixel(picture, row + 1, column, rows, columns, here)

@@ -1,4 +1,4 @@
-"""The definition: every hypothesis at every pixel, (P, H, W), one neighbour after the other."""
+"""Reference implementation: every hypothesis at every pixel, (P, H, W), one neighbour after the other."""
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ def run(reference, trust, neighbours, neighbour_trust, warps, hypotheses, window
     pixels = torch.stack([x.expand(height, width), y[:, None].expand(height, width), torch.ones_like(reference)], -1)
 
     def mean(values: Tensor) -> Tensor:
-        """Over the window around each pixel, zeros beyond the border."""
+        """Mean over the window around each pixel, zeros beyond the border."""
         return avg_pool2d(values[:, None], window, 1, window // 2)[:, 0] if len(values) else values
 
     def cost(picture: Tensor, its_trust: Tensor, warp: Tensor) -> Tensor:
@@ -32,7 +32,7 @@ def run(reference, trust, neighbours, neighbour_trust, warps, hypotheses, window
 
 
 def look_up(pictures: Tensor, places: Tensor) -> Tensor:
-    """Values (picture, plane, height, width) at homogeneous places, between the four nearest pixels; zero outside."""
+    """Bilinear interpolation (picture, plane, height, width) at homogeneous coordinates; zero outside."""
     planes, rows, columns = len(places), *pictures.shape[1:]
     behind = places[..., 2:] <= BEHIND_DEPTH
     at = places[..., :2] / torch.where(behind, 1, places[..., 2:]) * (2 / places.new_tensor([columns, rows])) - 1

@@ -1,4 +1,4 @@
-"""Projection: Gaussians in space become Gaussians on a picture."""
+"""Projection of 3D Gaussians to 2D Gaussians on a picture (splatting)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ MAX_ALPHA = 0.99  # no Gaussian hides more than this of what is behind it (Kerbl
 
 @dataclass(frozen=True)
 class View:
-    """One camera with a flat picture, as the kernels want it; nothing in it is differentiated.
+    """Camera with a flat picture, as tensors; not differentiated.
 
     rotation:   world to camera; +x right, +y down, +z forward
     eye:        the camera's position in the world
     focal, centre: pixels
     distortion: k1 k2 p1 p2 k3 k4 k5 k6, as `lens.OpenCV`
-    limits:     x_low, x_high, y_low, y_high on the plane z = 1, where the lens is trusted; beyond, it goes on straight
+    limits:     x_low, x_high, y_low, y_high on the plane z = 1, where the lens is valid; it is linear beyond
     size:       (width, height) in pixels
-    near:       distance in front of the eye within which nothing is seen
+    near:       near plane distance
     """
 
     rotation: Float[Tensor, "3 3"]
@@ -44,7 +44,7 @@ class View:
         return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def numbers(self) -> Float[Tensor, " 31"]:
-        """All of it in a row: rotation by rows, eye, focal, centre, distortion, limits, size, near."""
+        """All fields in a row: rotation by rows, eye, focal, centre, distortion, limits, size, near."""
         parts = self.rotation.reshape(9), self.eye, self.focal, self.centre, self.distortion, self.limits
         return torch.cat([*parts, self.eye.new_tensor([*self.size, self.near])])
 
@@ -67,14 +67,15 @@ def project(
     Float[Tensor, "gaussian 3"],
     Float[Tensor, " gaussian"],
 ]:
-    """Each Gaussian's footprint, to first order about its centre, and its colour from here (Zwicker 2002; Kerbl 2023).
+    """Each Gaussian's footprint by local affine approximation, and its view-dependent colour (Zwicker 2002; Kerbl
+    2023).
 
         p = R (mean - eye)      u = lens(p_x / p_z, p_y / p_z)      J = du / dp
         Sigma = Q diag(scale)^2 Q^T      C = J R Sigma R^T J^T + blur I
         colour = max(0, 1/2 + sum_k Y_k(d) h_k)      d = (mean - eye) / |mean - eye|
 
-    Where p_x / p_z or p_y / p_z leaves the view's limits, the lens goes on straight from there, and J is that of the
-    limit: so neither a lens's fold nor a Gaussian beside the eye makes footprints without bound.
+    Where p_x / p_z or p_y / p_z is outside the view's limits, the lens is extrapolated linearly, and J is that of the
+    limit: so neither a lens's fold nor a Gaussian beside the eye has an unbounded footprint.
 
     quaternions: (w, x, y, z) of any length but zero
     scales:      standard deviations, world units
@@ -94,7 +95,7 @@ def project(
 
 
 def cases(generator: torch.Generator):
-    """Clouds that every engine must agree on: ordinary ones, and all that could go wrong with one."""
+    """Test clouds for all engines: ordinary ones, and every degenerate Gaussian."""
     for count, bands, compensate in [(0, 1, False), (1, 4, False), (40, 3, False), (33, 4, True), (17, 1, True)]:
         yield _cloud(count, bands, compensate, generator)
     inputs = list(_cloud(40, 2, True, generator, bent=True))
@@ -146,7 +147,7 @@ def _cloud(count: int, bands: int, compensate: bool, generator: torch.Generator,
 
 
 def some_view(bent: bool = False, size: tuple[int, int] = (70, 45)) -> View:
-    """A camera at distance 3 from the origin, a little turned; behind a distorting lens if `bent`."""
+    """A camera at distance 3 from the origin, slightly rotated; with lens distortion if `bent`."""
     angle = 0.3
     rotation = torch.tensor(
         [[math.cos(angle), 0.0, -math.sin(angle)], [0.0, 1.0, 0.0], [math.sin(angle), 0.0, math.cos(angle)]]

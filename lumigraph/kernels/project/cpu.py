@@ -1,5 +1,5 @@
-"""Numba: threads share the Gaussians, of which sixteen are projected at once, one in each lane. On the way back
-everything is worked out again rather than kept, for visible ones alone."""
+"""Numba: threads share the Gaussians, of which sixteen are projected at once, one in each lane. Backward recomputes
+everything, for visible ones alone."""
 
 import numpy as np
 from numba import njit, prange
@@ -26,7 +26,7 @@ EYE, FOCAL, CENTRE, LENS, LIMITS, WIDTH, HEIGHT, NEAR = 9, 12, 14, 16, 24, 28, 2
 
 @njit(**FAST)
 def _radial(s, v):
-    """q(s), the rational factor of the lens's distortion, and its first and second derivatives."""
+    """Rational factor q(s) of the lens distortion, with first and second derivatives."""
     k1, k2, k3 = v[LENS], v[LENS + 1], v[LENS + 4]
     k4, k5, k6 = v[LENS + 5], v[LENS + 6], v[LENS + 7]
     below = ONE + s * (k4 + s * (k5 + s * k6))
@@ -39,7 +39,7 @@ def _radial(s, v):
 
 @njit(**FAST)
 def _lens(x, y, v):
-    """The bent point, and the Jacobian's entries xx, xy, yy (see `lens.bend`)."""
+    """Distorted point, and the Jacobian's entries xx, xy, yy (see `lens.bend`)."""
     p1, p2, s = v[LENS + 2], v[LENS + 3], x * x + y * y
     q, q1, _ = _radial(s, v)
     around = q + TWO * (p1 * y + p2 * x)
@@ -63,7 +63,7 @@ def _curve(x, y, v):
 
 @njit(**FAST)
 def _into_view(d, v):
-    """The camera's rotation times a vector."""
+    """Rotate a vector into camera coordinates."""
     return (
         v[0] * d[0] + v[1] * d[1] + v[2] * d[2],
         v[3] * d[0] + v[4] * d[1] + v[5] * d[2],
@@ -73,7 +73,7 @@ def _into_view(d, v):
 
 @njit(**FAST)
 def _onto_plane(mean, v):
-    """Depth, point on the plane z = 1, and the same within the view's limits."""
+    """Depth, point on the plane z = 1, and that point clamped to the view's limits."""
     x, y, z = _into_view((mean[0] - v[EYE], mean[1] - v[EYE + 1], mean[2] - v[EYE + 2]), v)
     safe = where(z > v[NEAR], z, ONE)
     px, py = x / safe, y / safe
@@ -84,7 +84,7 @@ def _onto_plane(mean, v):
 
 @njit(**FAST)
 def _rotation(some):
-    """The unit quaternion of what was taken, the length it had, and its matrix row by row."""
+    """Unit quaternion, its length before normalisation, and its rotation matrix by rows."""
     w, (x, y, z) = fetch(some, LANES * QUATERNION), _three(some, QUATERNION + 1)
     length = highest(root(w * w + x * x + y * y + z * z), TINY)
     w, x, y, z = w / length, x / length, y / length, z / length
@@ -98,7 +98,7 @@ def _rotation(some):
 
 @njit(**FAST)
 def _slopes(z, x, y, xx, xy, yy, v):
-    """The two rows of du/dmean: the lens's slope, the perspective's, and the camera's rotation."""
+    """Rows of du/dmean: lens Jacobian times perspective Jacobian times camera rotation."""
     fx, fy = v[FOCAL] / z, v[FOCAL + 1] / z
     j = fx * xx, fx * xy, ZERO - fx * (xx * x + xy * y)
     k = fy * xy, fy * yy, ZERO - fy * (xy * x + yy * y)
@@ -141,7 +141,7 @@ def _footprint(T, U, blur):
 
 @njit(**FAST)
 def _pulled(n, T, U, Un, nT, blur, det, gxx, gxy, gyy, kxx, kxy, kyy, fade, grow):
-    """Component n of the gradients of T and U: -2 K G W, and what the compensation adds."""
+    """Component n of the gradients of T and U: -2 K G W, and the term of the compensation."""
     w0, w1 = (blur * T[n] + Un[n]) / det, (blur * U[n] + nT[n]) / det
     x0, x1 = gxx * w0 + gxy * w1, gxy * w0 + gyy * w1
     to_t = grow * Un[n] - TWO * (kxx * x0 + kxy * x1) - fade * T[n]
@@ -151,7 +151,7 @@ def _pulled(n, T, U, Un, nT, blur, det, gxx, gxy, gyy, kxx, kxy, kyy, fade, grow
 
 @njit(**FAST)
 def _direction(mean, v):
-    """From the eye to a Gaussian, unit length, and the distance."""
+    """Unit vector from the eye to a Gaussian, and the distance."""
     x, y, z = mean[0] - v[EYE], mean[1] - v[EYE + 1], mean[2] - v[EYE + 2]
     length = highest(root(x * x + y * y + z * z), TINY)
     return x / length, y / length, z / length, length
@@ -159,7 +159,7 @@ def _direction(mean, v):
 
 @njit(**FAST)
 def _take(some, lane, i, means, quaternions, scales, opacities):
-    """Gaussian i's numbers into a lane of `some`."""
+    """Load Gaussian i's numbers into a lane of `some`."""
     for n in range(3):
         some[LANES * (MEAN + n) + lane] = means[i, n]
         some[LANES * (SCALE + n) + lane] = scales[i, n]
@@ -176,13 +176,13 @@ def _three(some, row):
 
 @njit(**FAST)
 def _row_of(number):
-    """Place of the lanes of one number of the harmonics, after the lanes' rows of MAX_NUMBERS were turned."""
+    """Index of the lanes of one harmonics number, after rows of MAX_NUMBERS were transposed."""
     return MAX_NUMBERS * (number % LANES) + LANES * (number // LANES)
 
 
 @njit(**FAST)
 def _turn_all(rows, numbers):
-    """Turn rows of harmonics into lanes, or back, in place."""
+    """Transpose rows of harmonics to lanes, or back, in place."""
     for first in range(0, numbers, LANES):
         turn(rows, first, first, MAX_NUMBERS)
 
@@ -195,7 +195,7 @@ def _outside(place, size):
 
 @njit(**FAST)
 def _reaches(opacity, away, variance):
-    """Mask of Gaussians that still add MIN_ALPHA so far from their centre."""
+    """Mask of Gaussians that add at least MIN_ALPHA at this distance from their centre."""
     exponent = lowest((HALF * LOG2_E) * away * away / variance, MAX_EXPONENT)
     return opacity > np.float32(MIN_ALPHA) * exp2(exponent)
 
@@ -412,7 +412,7 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
 
 @njit(**FAST)
 def _along(row, Q, n):
-    """A row times column n of the rotation."""
+    """Product of a row with column n of the rotation."""
     return row[0] * Q[0][n] + row[1] * Q[1][n] + row[2] * Q[2][n]
 
 
@@ -434,7 +434,7 @@ def backward(ctx, *grads):
 
 
 def _flat(tensors):
-    """Arrays of means, quaternions, scales, opacities and harmonics, the last with all its numbers in a row."""
+    """NumPy arrays of means, quaternions, scales, opacities and harmonics, the last flattened to a row per Gaussian."""
     *others, harmonics = (x.detach().numpy() for x in tensors)
     return *others, harmonics.reshape(len(harmonics), 3 * harmonics.shape[1])
 

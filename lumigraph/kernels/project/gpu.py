@@ -95,7 +95,7 @@ def _matrix(q):
 
 @triton.jit
 def _matrix_backward(q, inverse, D):
-    """From a matrix's gradient to that of the quaternion before it was given unit length."""
+    """Gradient of the quaternion before normalisation, from that of the rotation matrix."""
     w, x, y, z = q
     dw = 2 * (x * (D[2][1] - D[1][2]) + y * (D[0][2] - D[2][0]) + z * (D[1][0] - D[0][1]))
     dx = 2 * (y * (D[0][1] + D[1][0]) + z * (D[0][2] + D[2][0]) + w * (D[2][1] - D[1][2])) - 4 * x * (D[1][1] + D[2][2])
@@ -131,7 +131,7 @@ def _radial(s, view):
 
 @triton.jit
 def _bend(x, y, view):
-    """The lens's distortion of (x, y, 1), and its slope (xx, xy, yy), as `lens.bend`."""
+    """Distorted (x, y, 1), and the distortion's Jacobian (xx, xy, yy), as `lens.bend`."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
     s = x * x + y * y
     q, slope, _ = _radial(s, view)
@@ -144,7 +144,7 @@ def _bend(x, y, view):
 
 @triton.jit
 def _bend_backward(x, y, d_xx, d_xy, d_yy, view):
-    """The gradient in (x, y) by way of the slope, whose own is symmetric: xx_y = xy_x, yy_x = xy_y."""
+    """Gradient of (x, y) through the distortion's symmetric Jacobian: xx_y = xy_x, yy_x = xy_y."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
     _, slope, curve = _radial(x * x + y * y, view)
     xxx, yyy = x * (3 * slope + x * x * curve) + 6 * p2, y * (3 * slope + y * y * curve) + 6 * p1
@@ -154,13 +154,13 @@ def _bend_backward(x, y, d_xx, d_xy, d_yy, view):
 
 @triton.jit
 def _held(X, low):
-    """A coordinate of the plane z = 1 within its limits."""
+    """Clamp a coordinate of the plane z = 1 to the view's limits."""
     return tl.minimum(tl.maximum(X, tl.load(low)), tl.load(low + 1))
 
 
 @triton.jit
 def _lens(X, Y, z, view):
-    """u, the lens's slope S in pixels by rows, and J = S O."""
+    """u, the lens Jacobian S in pixels by rows, and J = S O."""
     fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
     x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
     bent_x, bent_y, xx, xy, yy = _bend(x, y, view)
@@ -174,7 +174,7 @@ def _lens(X, Y, z, view):
 
 @triton.jit
 def _lens_backward(X, Y, z, S, J, d_u, d_J, view):
-    """The gradient in p = z (X, Y, 1)."""
+    """Gradient of p = z (X, Y, 1)."""
     fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
     x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
     d_xx = fx * ((d_J[0][0] - x * d_J[0][2]) / z + d_u[0] * (X - x))
@@ -199,7 +199,7 @@ def _covariance(T, blur):
 
 @triton.jit
 def _covariance_backward(T, d_conic, d_share, blur):
-    """The gradient in T, of the conic K = C^-1 and of the share of det that is left without the blur."""
+    """Gradient of T, from those of the conic K = C^-1 and of the compensation share |n|^2 / det."""
     a, b, c, det, n = _covariance(T, blur)
     xx, xy, yy = c / det, -b / det, a / det
     up, down = _cross(T[1], n), _cross(n, T[0])  # half the slope of |n|^2 in T_0, in T_1
@@ -216,7 +216,7 @@ def _covariance_backward(T, d_conic, d_share, blur):
 
 @triton.jit
 def _colour(harmonics, i, d, seen, K: tl.constexpr, BANDS: tl.constexpr):
-    """1/2 + sum_k Y_k(d) h_k, before what is negative is cut off."""
+    """1/2 + sum_k Y_k(d) h_k, before clamping at zero."""
     half = 0.5 + 0 * d[0]
     colour = half, half, half
     for k in tl.static_range(BANDS * BANDS):
@@ -232,7 +232,7 @@ def _direction(v):
 
 @triton.jit
 def _reaches(u, extent, size):
-    """Whether along one axis a footprint comes to the picture's pixel centres."""
+    """True if a footprint reaches the picture along one axis."""
     return (u + extent >= 0.5) & (u - extent <= size - 0.5)
 
 

@@ -1,4 +1,4 @@
-"""Rasterising: footprints become a picture, front to back."""
+"""Rasterisation: footprints of Gaussians are composited front to back."""
 
 import torch
 from jaxtyping import Float
@@ -24,11 +24,11 @@ def rasterize(
     """Composite each pixel's Gaussians in the order of its tile's list (Kerbl 2023, eq. 3 and appendix C).
 
         a_i = min(0.99, opacity_i exp(-d^T conic_i d / 2))      d from its centre to the pixel's; 0 if below 1/255
-        T_i = prod_{j<i} (1 - a_j)      light that comes through to i
+        T_i = prod_{j<i} (1 - a_j)      transmittance
         w_i = a_i T_i                   0 once T_i < stop
 
     Returns sum_i w_i colour_i (H, W, 3), sum_i w_i depth_i (H, W) and sum_i w_i (H, W). All are differentiable in the
-    five tensors; where 0.99 cuts a_i off, nothing flows back through it.
+    five tensors; a_i clamped to 0.99 has no gradient.
     """
     require(len(tiles.starts) == tiles.across * tiles.down + 1, "the tiles do not cover their picture")
     require_starts("tiles.starts", tiles.starts, len(tiles.order))
@@ -37,7 +37,7 @@ def rasterize(
 
 
 def cases(generator: torch.Generator):
-    """Pictures that every engine must agree on, without pixels at which 1/255, 0.99 or `stop` hang on rounding."""
+    """Test pictures for all engines, without pixels near the thresholds 1/255, 0.99 and `stop`."""
     for count, size, side, stop in [
         (0, (9, 5), 16, 1e-4),
         (1, (1, 1), 32, 1e-4),
@@ -72,7 +72,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _steady(centres, conics, opacities, depths, size, side, stop, generator):
-    """Only the Gaussians that no pixel sees at a threshold; what remains is looked at again, for T changes with it."""
+    """The Gaussians without pixels near a threshold. Repeated until none is removed, since removal changes T."""
     from ..tile.reference import run as tile_
     from .reference import light
 

@@ -1,7 +1,7 @@
-"""Numba: a thread takes a run of tiles; blocks of 4 x 4 pixels are sixteen lanes; each Gaussian visits the blocks that
-its ellipse touches and that still want light.
+"""Numba: a thread takes a run of tiles; blocks of 4 x 4 pixels are sixteen lanes; each Gaussian is drawn in the blocks
+that its ellipse touches and that have not terminated.
 
-Gradients of one Gaussian from one tile are summed in registers and kept by themselves; a second pass adds them up in
+Gradients of one Gaussian from one tile are summed in registers and stored separately; a second pass adds them up in
 the order of tiles, so that no two threads add to one place and the result is the same each time.
 """
 
@@ -52,7 +52,7 @@ X, Y, ALONG, SKEW, DOWN, BRIGHT, RED, GREEN, BLUE, DEPTH, MAX_REACH, LIMIT = ran
 
 @njit(parallel=True, **FAST)
 def _pack(centres, conics, opacities, colours, depths, rows):
-    """What the loops want of each Gaussian, in a row of sixteen numbers."""
+    """Pack each Gaussian's parameters into a row of sixteen numbers."""
     for i in prange(len(centres)):
         row = rows[i * LANES : (i + 1) * LANES]
         a, b, c = np.float64(conics[i, 0]), np.float64(conics[i, 1]), np.float64(conics[i, 2])
@@ -74,7 +74,7 @@ def _pack(centres, conics, opacities, colours, depths, rows):
 
 @njit(inline="always")
 def _blocks(rows, i, left, top, table):
-    """Which blocks of a tile hold a pixel that the ellipse may touch: bit 8 r + c for column c of row r."""
+    """Bit mask of a tile's blocks that the ellipse may touch: bit 8 r + c for column c of row r."""
     above = top + HALF - rows[i + Y]
     sign = fetch(table, 17 * LANES)
     upper = fetch(table, 16 * LANES) + above
@@ -89,8 +89,8 @@ def _blocks(rows, i, left, top, table):
 
 @njit(inline="always")
 def _frame(rows, i, left, top):
-    """The exponent's two roots as functions of a pixel in the tile: slopes of the first, slope of the second, and what
-    both are at the tile's corner."""
+    """The exponent as two squares of linear functions of a pixel in the tile: slopes of the first, slope of the second,
+    and both values at the tile's corner."""
     along, down = rows[i + ALONG], rows[i + DOWN]
     slant = along * rows[i + SKEW]
     x, y = np.float32(left) - rows[i + X], np.float32(top) - rows[i + Y]
@@ -99,7 +99,7 @@ def _frame(rows, i, left, top):
 
 @njit(inline="always")
 def _bell(rows, i, frame, table, block):
-    """The roots, and the exponent of 2 in opacity exp(-q / 2), at pixels of a block."""
+    """The two linear functions, and the exponent of 2 in opacity exp(-q / 2), at pixels of a block."""
     along, slant, down, u, v = frame
     x, y = fetch(table, (block & 7) * LANES), fetch(table, (8 + (block >> 3)) * LANES)
     u, v = along * x + (slant * y + u), down * y + v
@@ -113,13 +113,13 @@ def _alpha(exponent, light, stop):
 
 @njit(inline="always")
 def _span(n, side, first):
-    """How many rows or columns of blocks of a tile lie on the picture."""
+    """Number of a tile's rows or columns of blocks inside the picture."""
     return (min(side, n - first) + 3) // 4
 
 
 @njit(inline="always")
 def _place(x, y, planes):
-    """The index of a pixel's number in plane 0 of its block, where each block holds `planes` planes of 16 numbers."""
+    """Index of a pixel in plane 0 of its block, where each block has `planes` planes of 16 numbers."""
     return (y // 4 * 8 + x // 4) * planes * LANES + y % 4 * 4 + x % 4
 
 
@@ -183,12 +183,11 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
 def _backward(
     to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, starts, shares, size, side, stop, table, masks, sums
 ):
-    """With c_i what one unit of weight is worth to the loss, and a_i = opacity exp(-q / 2) where that counts,
+    """Gradients, with c_i = dL/dw_i and a_i = opacity exp(-q / 2) where that is not clamped,
 
         dL / d ln a_i = w_i c_i - a_i / (1 - a_i) sum_{j>i} w_j c_j
 
-    which is then weighted by 1, dx, dy, dx^2, dx dy, dy^2 and summed over pixels; beside them sum w_i dL/drgb and
-    sum w_i dL/ddepth.
+    weighted by 1, dx, dy, dx^2, dx dy, dy^2 and summed over pixels; beside them sum w_i dL/drgb and sum w_i dL/ddepth.
     """
     width, height = size
     across = (width + side - 1) // side
@@ -241,7 +240,7 @@ def _backward(
 
 @njit(parallel=True, **FAST)
 def _gather(sums, masks, order, rows, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
-    """Each thread adds up its own Gaussians' sums, in the order of tiles, and makes gradients of them."""
+    """Gradients from the sums. Each thread adds up its own Gaussians, in the order of tiles."""
     n = len(to_depths)
     for part in prange(parts):
         begin, end = n * part // parts, n * (part + 1) // parts
@@ -270,7 +269,7 @@ def _gather(sums, masks, order, rows, opacities, parts, to_centres, to_conics, t
 
 
 def _shares(work):
-    """Runs of tiles, one for each thread, with about as much work."""
+    """Runs of tiles, one for each thread, of about equal work."""
     threads, done = get_num_threads(), np.cumsum(work)
     cuts = np.searchsorted(done, done[-1] * np.arange(1, threads) / threads)
     return np.concatenate([[0], cuts, [len(work)]])

@@ -23,7 +23,7 @@ GAUSSIANS = tl.constexpr(
 
 @triton.jit
 def _pixels(width, height, SIDE: tl.constexpr, SQUARE: tl.constexpr):
-    """The program's tile, its pixels' centres and places in the picture, and which of them are inside."""
+    """Tile, centres and indices of the program's pixels, and a mask of those inside the picture."""
     shares: tl.constexpr = (SIDE // SQUARE) * (SIDE // SQUARE)
     k, share = tl.program_id(0) // shares, tl.program_id(0) % shares
     across = (width + SIDE - 1) // SIDE
@@ -47,7 +47,7 @@ def _gaussians(i, here, order, gaussians):
 
 @triton.jit
 def _steady(conic):
-    """q as a sum of squares, a (dx + b/a dy)^2 + (c - b^2/a) dy^2: along a needle its three terms would cancel."""
+    """q as a sum of squares, a (dx + b/a dy)^2 + (c - b^2/a) dy^2, which avoids cancellation along thin ellipses."""
     a, b, c = conic
     a = tl.maximum(a, 1e-30)
     square = b * b
@@ -57,7 +57,7 @@ def _steady(conic):
 
 @triton.jit
 def _light(dx, dy, conic, opacity, through, stop):
-    """Gaussian by pixel: opacity before and after the thresholds, the light T before and behind each, and w."""
+    """Gaussian by pixel: opacity before and after thresholds, transmittance T before and behind each, and weight w."""
     a, tilt, rest = _steady(conic)
     t = tl.fma(tilt[:, None], dy, dx)
     raw = opacity[:, None] * tl.exp(-0.5 * (a[:, None] * t * t + rest[:, None] * dy * dy))
@@ -102,7 +102,7 @@ def _forward(gaussians, order, starts, outputs, width, height, stop, SIDE: tl.co
 
 @triton.jit
 def _add(pointer, n, value, here):
-    """Zeros, which most are where a Gaussian is small, need not travel."""
+    """Atomic add that skips zeros, which are most where a Gaussian is small."""
     tl.atomic_add(pointer + n, value, mask=here & (value != 0), sem="relaxed")
 
 

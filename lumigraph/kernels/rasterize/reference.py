@@ -1,4 +1,4 @@
-"""The definition: every pixel of a tile against every Gaussian of its list, (P, M)."""
+"""Reference implementation: every pixel of a tile against every Gaussian of its list, (P, M)."""
 
 from collections.abc import Iterator
 
@@ -28,7 +28,7 @@ def light(
     centres: Tensor, conics: Tensor, opacities: Tensor, tiles: Tiles, stop: float
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """For each tile: numbers of its Gaussians (M,), its pixels' columns and rows (P, 2), opacity exp(-q / 2) before any
-    threshold (P, M), and the light T that comes through to each (P, M)."""
+    threshold (P, M), and transmittance T (P, M)."""
     width, height = tiles.size
     for k in range(tiles.across * tiles.down):
         numbers = tiles.order[tiles.starts[k] : tiles.starts[k + 1]].long()

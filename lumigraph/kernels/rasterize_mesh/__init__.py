@@ -28,14 +28,14 @@ def rasterize_mesh(
         M = [h_0 h_1 h_2]      the corners of a triangle, h = K x in the camera's frame: pixels times depth, depth
         u = M^-1 (x, y, 1)     at a pixel's centre; inside where all are at least 0
         b = u / sum u          barycentric coordinates, perspective-correct
-        z = 1 / sum u          depth; the triangle whose z is least, and beyond `near`, is seen
+        z = 1 / sum u          depth; the triangle of least z beyond `near` is visible
 
     corners: h of each vertex
-    faces:   both sides are seen; a triangle that is seen edge-on is not
+    faces:   two-sided; a triangle seen edge-on is invisible
     size:    (width, height) of the picture in pixels
     Returns sum b_i attributes_i, sum b_i z_i and the triangle's number (int32), or 0, 0 and -1 where there is none.
-    Attributes and depth are differentiable in corners and attributes. Which triangle is seen is not: see `antialias`.
-    Neighbours leave no gap, for a pixel on their common edge belongs to both, and equal depths to the lower number.
+    Attributes and depth are differentiable in corners and attributes. Visibility is not: see `antialias`.
+    Neighbours leave no gap: a pixel on their common edge belongs to both, and equal depths to the lower number.
     """
     require(min(size) > 0, f"a picture cannot have {size[0]} x {size[1]} pixels")
     require(attributes.shape[1] > 0, "attributes have no channels")
@@ -44,7 +44,7 @@ def rasterize_mesh(
 
 
 def cases(generator: torch.Generator):
-    """Pictures that every engine must agree on, without pixels that an edge or a tie of depths passes too closely."""
+    """Test pictures for all engines, without pixels close to an edge or to equal depths."""
     scenes = [(0, (5, 3), 2), (5, (1, 1), 3), (8, (9, 7), 1), (40, (31, 40), 5), (400, (40, 37), 3)]
     for count, size, channels in scenes:
         yield _steady(*ball(count, size, generator), size, channels, generator)
@@ -59,7 +59,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A square picture of `size` pixels before a ball of a triangle for every 8 of them, with six attributes."""
+    """A square picture of `size` pixels with six attributes: a ball with one triangle for every 8 pixels."""
     width = round(size**0.5)
     corners, faces = ball(size // 16, (width, width), generator)
     attributes = torch.rand(len(corners), 6, generator=generator)
@@ -67,7 +67,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def ball(count: int, size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Projected corners of so many vertices, and faces, of a closed, dented ball that fills most of a picture."""
+    """Projected corners of `count` vertices, and faces, of a closed, dented ball that fills most of a picture."""
     height = 1 - 2 * (torch.arange(count) + 0.5) / max(count, 1)
     angle, rim = torch.arange(count) * 2.399963, (1 - height**2).sqrt()  # golden angle
     points = torch.stack([rim * angle.cos(), rim * angle.sin(), height], -1)
@@ -84,7 +84,7 @@ def ball(count: int, size: tuple[int, int], generator: torch.Generator) -> tuple
 
 
 def _steady(corners, faces, size, channels, generator):
-    """The scene, moved a little until no pixel's centre lies on an edge and no two triangles meet there."""
+    """The scene, shifted until no pixel's centre lies on an edge and no two triangles have equal depth at one."""
     from .reference import planes
 
     attributes = torch.rand(len(corners), channels, generator=generator)

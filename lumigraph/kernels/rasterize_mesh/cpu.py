@@ -1,8 +1,8 @@
-"""Numba: bands of rows share out the picture, and each draws its part of every triangle, row by row, into a buffer of
-1 / z. Values follow from the triangles that are left.
+"""Numba: bands of rows share the picture, and each draws its part of every triangle, row by row, into a buffer of
+1 / z. Values are computed for visible triangles alone.
 
-Backward, triangles are shared out: each finds the pixels that it is seen at, so that no two threads add to one place.
-A second pass adds up the corners of vertices in the order of triangles.
+Backward, threads share the triangles: each finds the pixels where it is visible, so that no two threads add to one
+place. A second pass adds up the corners of vertices in the order of triangles.
 """
 
 import math
@@ -41,7 +41,7 @@ def _pixels(low, high, size):
 
 @njit(parallel=True, **FAST)
 def _measure(corners, faces, near, size, planes, boxes):
-    """M^-1 of each triangle, and its first and last column and row; none for one that is not seen."""
+    """M^-1 of each triangle, and its first and last column and row; an empty range for an invisible one."""
     for f in prange(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         first, second, third, volume = _adjugate(corners, a, b, c)
@@ -63,7 +63,7 @@ def _measure(corners, faces, near, size, planes, boxes):
 
 @njit(**FAST)
 def _span(planes, f, y, begin, end):
-    """Part of the columns from begin to end of a row at height y at which u >= 0 in all three rows of M^-1."""
+    """Columns of a row at height y, between begin and end, at which u >= 0 in all three rows of M^-1."""
     low, high = begin + 0.5, end + 0.5
     for k in range(3):
         slope, rest = planes[f, 3 * k], planes[f, 3 * k + 1] * y + planes[f, 3 * k + 2]
@@ -78,7 +78,7 @@ def _span(planes, f, y, begin, end):
 
 @njit(parallel=True, **FAST)
 def _draw(planes, boxes, lists, starts, near, size, found):
-    """lists: triangles that touch each band of rows, in their order, from starts[band] on"""
+    """Draw triangles into bands. lists: triangles that touch each band of rows, in their order, from starts[band] on"""
     width, height = size
     farthest = 1 / near
     for band in prange(len(starts) - 1):
@@ -117,7 +117,7 @@ def _lists(boxes, bands):
 
 @njit(**FAST)
 def _barycentric(planes, f, x, y):
-    """b_0, b_1, b_2 and z at a place of the picture."""
+    """b_0, b_1, b_2 and z at a point of the picture."""
     u = planes[f, 0] * x + planes[f, 1] * y + planes[f, 2]
     v = planes[f, 3] * x + planes[f, 4] * y + planes[f, 5]
     w = planes[f, 6] * x + planes[f, 7] * y + planes[f, 8]
@@ -143,7 +143,7 @@ def _fill(planes, faces, attributes, found, values, depth):
 
 @njit(**FAST)
 def _sum_up(f, n, place, b, slope, to_values, to_depth, corners, attributes, faces, planes, own):
-    """Add n pixels of a triangle to the sums of its corners. place: of each pixel; b: its coordinates"""
+    """Add n pixels of a triangle to the gradients of its corners. place: of each pixel; b: barycentric coordinates"""
     i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
     for m in range(n):
         far = np.float64(to_depth[place[m]])
@@ -178,8 +178,8 @@ def _sum_up(f, n, place, b, slope, to_values, to_depth, corners, attributes, fac
 
 @njit(parallel=True, **FAST)
 def _backward(to_values, to_depth, corners, attributes, faces, planes, boxes, found, parts, sums):
-    """With g_i = dL / db_i and M u = p, dL / du = z (g - sum_k g_k b_k) and dL / dh_i = -u_i M^-T dL / du, to which
-    depth adds its b_i. Sums of each triangle's three corners: h, then attributes."""
+    """Gradients of each triangle's three corners: h, then attributes. With g_i = dL / db_i and M u = p,
+    dL / du = z (g - sum_k g_k b_k) and dL / dh_i = -u_i M^-T dL / du, to which depth adds its b_i."""
     width = found.shape[1]
     for part in prange(parts):
         place, b, slope = np.empty(PIXELS, np.int64), np.empty((3, PIXELS)), np.empty((3, PIXELS))

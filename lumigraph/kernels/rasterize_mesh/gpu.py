@@ -1,7 +1,7 @@
 """Triton: a lane draws a triangle, some pixels of its box at a time, into a buffer of 1 / z and number, by an atomic
-maximum of both as one whole number. Then a lane takes a pixel. Gradients meet in atomic adds.
+maximum of both as one integer. Then a lane takes a pixel. Gradients meet in atomic adds.
 
-Where triangles are is computed in double precision, as on the CPU: few numbers, and neighbours must leave no gap.
+Coverage is computed in double precision, as on the CPU: neighbours must leave no gap.
 """
 
 import torch
@@ -23,7 +23,7 @@ def _cross(a, b):
 
 @triton.jit
 def _corners(corners, faces, f, here):
-    """Numbers and places of a triangle's corners."""
+    """Vertex numbers and positions of a triangle's corners."""
     i, j, k = load_row(faces, f, here)
     x, y, z = load_row(corners, i, here)
     a = x.to(tl.float64), y.to(tl.float64), z.to(tl.float64)
@@ -51,7 +51,7 @@ def _at(plane, x, y):
 
 @triton.jit
 def _range(a, b, c, axis: tl.constexpr, whole, pixels):
-    """First pixel along an axis whose centre a triangle may hold, and how many; all of them where `whole`."""
+    """First pixel along an axis whose centre a triangle may cover, and their number; all of them where `whole`."""
     u, v = a[axis] / tl.where(whole, 1.0, a[2]), b[axis] / tl.where(whole, 1.0, b[2])
     w = c[axis] / tl.where(whole, 1.0, c[2])
     low, high = tl.minimum(tl.minimum(u, v), w), tl.maximum(tl.maximum(u, v), w)
@@ -90,7 +90,7 @@ def _draw(corners, faces, buffer, F, width, height, near):
 
 @triton.jit
 def _pixel(buffer, P, width):
-    """Numbers of the program's pixels, a mask of those that show a triangle, its number, and their centres."""
+    """Indices of the program's pixels, a mask of covered ones, their triangles, and their centres."""
     p, here = indices(P, PIXELS)
     f = tl.load(buffer + p, mask=here, other=-1).to(tl.int64)
     return p, here, here & (f >= 0), f, (p % width).to(tl.float64) + 0.5, (p // width).to(tl.float64) + 0.5
@@ -124,7 +124,7 @@ def _add(pointer, value, here):
 
 @triton.jit
 def _pull(d_corners, n, share, pull, far, seen):
-    """The gradient of a corner h: -b M^-T dL / du, and that of its depth."""
+    """Add the gradient of a corner h: -b M^-T dL / du, and that of its depth."""
     _add(d_corners + 3 * n, -share * pull[0], seen)
     _add(d_corners + 3 * n + 1, -share * pull[1], seen)
     _add(d_corners + 3 * n + 2, far * share - share * pull[2], seen)

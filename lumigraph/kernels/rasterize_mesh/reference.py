@@ -1,4 +1,4 @@
-"""The definition: every triangle against every pixel, (F, 3, P)."""
+"""Reference implementation: every triangle against every pixel, (F, 3, P)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(corners: Tensor, attributes: Tensor, faces: Tensor, size: tuple[int, int
 
 
 def nearest(corners: Tensor, faces: Tensor, pixels: Tensor, near: float) -> Tensor:
-    """Number of the triangle that is seen at each pixel; -1 for none."""
+    """Number of the visible triangle at each pixel; -1 for none."""
     if not len(faces):
         return torch.full((len(pixels),), -1, dtype=torch.int32, device=pixels.device)
     matrix, steep = planes(corners[faces.long()])
@@ -38,7 +38,7 @@ def nearest(corners: Tensor, faces: Tensor, pixels: Tensor, near: float) -> Tens
 
 
 def planes(corners: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse of each triangle's matrix M of corners, whose row i gives u_i, and a mask of those that have one."""
+    """Inverse of each triangle's matrix M of corners, whose row i gives u_i, and a mask of invertible ones."""
     a, b, c = corners.unbind(1)
     adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], 1)
     volume = (adjugate[:, 0] * a).sum(-1)

@@ -1,4 +1,4 @@
-"""Proposal sampling: from a coarse grid of density to the intervals of each ray at which a field is evaluated."""
+"""Proposal sampling: intervals of each ray for the field, from a coarse density grid."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ Frustum = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Resampling:
-    """The numbers of the inverse transform from the grid's weights to intervals.
+    """Parameters of the inverse transform from the grid's weights to intervals.
 
-    bins:            intervals of a ray in whose middles the grid is looked up
-    samples:         intervals that are returned
+    bins:            intervals of a ray at whose middles the grid is evaluated
+    samples:         number of returned intervals
     sharpness:       exponent of the weights, from 0, which spreads samples evenly, to 1 (annealing)
-    uniform_share:   share of all weight that is spread evenly over the bins
-    min_weight:      weight that each bin has besides, > 0
+    uniform_share:   share of the total weight that is spread evenly over the bins
+    min_weight:      weight added to each bin, > 0
     max_log_density: upper limit of the grid's values
     """
 
@@ -44,7 +44,7 @@ def sample_proposals(
     resampling: Resampling,
     frustum: Frustum | None = None,
 ) -> Float[Tensor, "ray edge"]:
-    """Distances of the edges of a field's intervals along each ray, by a proposal grid (Barron 2022, section 3.1).
+    """Interval edges of a field's samples along each ray, by a proposal grid (Barron 2022, section 3.1).
 
     [near, far] is divided into bins of equal length in s. At the middle of bin i, of coordinates c_i, the grid gives
 
@@ -71,7 +71,7 @@ def sample_proposals(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: one bin, more bins than samples and fewer, walls, rays that leave the
+    """Test inputs for all engines: one bin, more bins than samples and fewer, walls, rays that leave the
     frustum, rays of no length, more rays than a block."""
     for rays, size, bins, samples, sharpness, frustum in [
         (0, (2, 2, 2), 4, 2, 1.0, None),
@@ -98,8 +98,8 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(rays, size, bins, samples, sharpness, frustum, generator):
-    """Rays from around the origin, towards +z in a frustum. Values rise and fall gently: noise between corners would
-    only measure how each engine rounds a coordinate."""
+    """Rays from around the origin, towards +z in a frustum. Densities are smooth: with noise the comparison would only
+    measure rounding of coordinates."""
     spread = torch.tensor([1.0, 1.0, 1.0] if frustum is None else [0.8, 0.4, 0.1])
     ahead = torch.tensor([0.0, 0.0, 0.0 if frustum is None else 1.0])
     origins = 0.3 * torch.randn(rays, 3, generator=generator)

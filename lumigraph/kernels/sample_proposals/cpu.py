@@ -1,5 +1,5 @@
-"""Numba: one thread takes a block of rays. All bins of a ray go through each stage together, so that the compiler takes
-sixteen of them at a time."""
+"""Numba: one thread takes a block of rays. All bins of a ray go through each stage together, so that the compiler
+vectorises it."""
 
 import numpy as np
 from numba import njit, prange
@@ -12,7 +12,7 @@ BLOCK = 64  # rays that share their memory
 
 @njit(inline="always")
 def _cell(x, size):
-    """Along one axis of corners that span [-1, 1]: the corner below a coordinate, and how far it is to the next."""
+    """Along one axis of corners that span [-1, 1]: the corner below a coordinate, and the fraction towards the next."""
     s = min(max((x + np.float32(1)) * (np.float32(0.5) * np.float32(size - 1)), np.float32(0)), np.float32(size - 1))
     corner = max(min(np.int32(s), np.int32(size - 2)), np.int32(0))  # the last also where x is no number
     return corner, s - np.float32(corner)
@@ -34,7 +34,7 @@ def _interpolated(values, size, x, y, z):
 
 @njit(inline="always")
 def _distance(share, near, far, first, last, forward):
-    """Distance at a share of the way from near to far. first, last: depths of its ends in a frustum, else their s."""
+    """Distance at s between near (0) and far (1). first, last: depths of the ends in a frustum, else their s"""
     one = np.float32(1)
     if forward:
         return near + (far - near) * (share * first / (share * first + (one - share) * last))
@@ -44,7 +44,7 @@ def _distance(share, near, far, first, last, forward):
 
 @njit(inline="always")
 def exponential(x):
-    """e^x to seven digits, in operations that the compiler does sixteen at a time; at least 2^-126."""
+    """e^x to seven digits, at least 2^-126, in operations that the compiler vectorises."""
     doublings = max(x * np.float32(1.4426950409), np.float32(-126))
     whole = np.int32(doublings + np.float32(0.5)) if doublings > 0 else np.int32(doublings - np.float32(0.5))
     f = doublings - np.float32(whole)
@@ -56,7 +56,7 @@ def exponential(x):
 
 @njit(inline="always")
 def _look_up(edges, origin, direction, values, size, frustum, found, length):
-    """Along one ray, the grid's value in the middle of each bin, and the bin's length in coordinates."""
+    """Grid value in the middle of each bin along one ray, and the bin's length in coordinates."""
     one, forward = np.float32(1), len(frustum) > 0
     ox, oy, oz = origin
     dx, dy, dz = direction
@@ -77,7 +77,7 @@ def _look_up(edges, origin, direction, values, size, frustum, found, length):
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _sample(bins, origins, directions, near, far, values, size, frustum, limits, edges):
-    """frustum: scale of x, of y, near plane, and the factor of |det J|^(1/3); empty in a contraction
+    """Edges of rays. frustum: scale of x, of y, near plane, and the factor of |det J|^(1/3); empty for a contraction
     limits: numbers of the Resampling, from max_log_density on
     """
     one, forward, count = np.float32(1), len(frustum) > 0, edges.shape[1] - 1

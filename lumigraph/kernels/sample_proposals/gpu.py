@@ -13,7 +13,7 @@ EDGES = tl.constexpr(16)
 
 @triton.jit
 def _axis(x, size):
-    """Along one axis of corners that span [-1, 1]: the corner below each coordinate, and the place up to the next."""
+    """Along one axis of corners that span [-1, 1]: the corner below each coordinate, and the fraction to the next."""
     s = tl.minimum(tl.maximum((x + 1.0) * (0.5 * (size - 1).to(tl.float32)), 0.0), (size - 1).to(tl.float32))
     corner = tl.minimum(tl.maximum(s.to(tl.int32), 0), size - 2)
     return corner, s - corner.to(tl.float32)
@@ -34,7 +34,7 @@ def _interpolated(values, X, Y, Z, x, y, z, here):
 
 @triton.jit
 def _distance(share, near, far, first, last, FORWARD: tl.constexpr):
-    """Distance at a share of the way from near to far. first, last: depths of its ends in a frustum, else their s."""
+    """Distance at s between near (0) and far (1). first, last: depths of the ends in a frustum, else their s"""
     s = first + share * (last - first)
     t = tl.where(s < 1, s, 1 / tl.maximum(2 - s, 1e-6))
     if FORWARD:

@@ -1,4 +1,4 @@
-"""The definition: all bins of all rays, (R, bins), then the inverse of each ray's distribution function."""
+"""Reference implementation: all bins of all rays, (R, bins), then the inverse of each ray's distribution function."""
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ def run(origins, directions, near, far, log_density, resampling, frustum) -> Ten
 
 
 def distance(share, origins, directions, near, far, frustum) -> Tensor:
-    """Distances at a share of the way from near to far, (R, share), as s measures it."""
+    """Distances (R, share) at s between near (0) and far (1)."""
     if frustum is not None:
         first, last = ((origins[:, 2:] + t * directions[:, 2:]).clamp_min(frustum[2]) for t in (near, far))
         return near + (far - near) * (share * first / (share * first + (1 - share) * last))

@@ -1,4 +1,4 @@
-"""Semi-global matching: disparities whose costs, and whose changes from pixel to pixel, are least together."""
+"""Semi-global matching: disparities of least matching cost and smoothness penalty."""
 
 import torch
 from jaxtyping import Float, UInt8
@@ -43,7 +43,7 @@ def semi_global(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: one pixel, one disparity, ties, flat and strong penalties."""
+    """Test inputs for all engines: one pixel, one disparity, ties, flat and strong penalties."""
     for height, width, count, first in [(1, 1, 1, 0), (1, 6, 5, -2), (7, 9, 16, 0), (8, 3, 3, 2), (4, 10, 33, -9)]:
         yield _inputs(height, width, count, first, generator)
     costs, guide, penalties, slope, first = _inputs(5, 8, 7, 0, generator)
@@ -53,7 +53,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """A picture of so many pixels, 64 disparities."""
+    """A picture of `size` pixels, 64 disparities."""
     side = max(round(size**0.5), 1)
     return _inputs(side, side, 64, 0, generator)
 

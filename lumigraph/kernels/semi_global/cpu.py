@@ -1,5 +1,5 @@
-"""Numba. One sweep down takes four of the directions, one up the other four; both keep a row of L for each. Costs of a
-path are bytes, which compilers pack into vectors."""
+"""Numba. One sweep down takes four of the directions, one up the other four; both keep a row of L for each. Path costs
+are bytes, which compilers vectorise well."""
 
 import numpy as np
 from numba import njit, prange
@@ -14,8 +14,8 @@ DIRECTIONS = 4  # of a sweep: along the row, and from the three nearest pixels o
 
 @njit(**FAST)
 def _advance(L, before, here, least, costs, at, total, count, slope, jump):
-    """L at a pixel, added to the total. Returns its least. Places in L, costs and the total are unsigned, so that no
-    negative index must be looked for."""
+    """Add L at a pixel to the total and return its minimum. Indices are unsigned, which saves the test for negative
+    ones."""
     lowest, limit = NO_COST, np.uint8(least + jump)
     for k in range(count):
         beside = np.uint8(min(L[before + k - ONE], L[before + k + ONE]) + slope)
@@ -28,8 +28,8 @@ def _advance(L, before, here, least, costs, at, total, count, slope, jump):
 
 @njit(**FAST)
 def _sweep(costs, guide, penalties, slope, count, total, back):
-    """costs, total: flat. Rows of L have a pixel more at both ends, and a pixel two disparities more, which are never
-    least; L is 0 where no pixel comes before."""
+    """Aggregate four directions. costs, total: flat. Rows of L are padded by a pixel at both ends, and pixels by two
+    disparities, which are never least; L is 0 before the first pixel."""
     height, width = guide.shape
     pixel = count + 2
     row = (width + 2) * pixel

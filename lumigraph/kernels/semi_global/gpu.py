@@ -16,8 +16,8 @@ def _path(
     costs, guide, penalties, total, line, height, width, count, slope, DX: tl.constexpr, DY: tl.constexpr,
     LANES: tl.constexpr,
 ):  # fmt: skip
-    """line: room for each path's L, with a place at both ends that is never least. A path that leaves the picture to a
-    side goes on at the other side as a new one."""
+    """Aggregate along paths. line: buffer of each path's L, padded at both ends by values that are never least. A path
+    that leaves the picture sideways goes on at the other side as a new one."""
     number, k = tl.program_id(0), tl.arange(0, LANES)
     here = k < count
     line += number * (count + 2) + 1

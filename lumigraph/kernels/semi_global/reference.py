@@ -1,4 +1,4 @@
-"""The definition: a row after the other, of the picture turned so that each direction leads down."""
+"""Reference implementation: one row after the other, of the picture turned so that each direction leads down."""
 
 import torch
 from torch import Tensor

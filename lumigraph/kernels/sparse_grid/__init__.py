@@ -1,4 +1,4 @@
-"""Trilinear lookup in a sparse grid: few nodes have values, and those lie end to end in a table."""
+"""Trilinear interpolation in a sparse grid: a table has rows for the occupied nodes only."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 2), typical=2, compi
 class Nodes:
     """Table row of each node of a grid over the unit cube; made by `of`, `all` or `part`.
 
-    The nodes (x, y, z) of a grid of X Y Z of them stand at (x / (X - 1), y / (Y - 1), z / (Z - 1)), the first and the
-    last on the cube's faces. A node's number is (x Y + y) Z + z.
+    Node (x, y, z) of X Y Z is at (x / (X - 1), y / (Y - 1), z / (Z - 1)); the first and the last are on the cube's
+    faces. A node's number is (x Y + y) Z + z.
 
-    index: a row for each node, -1 where it has none; no row belongs to two nodes
-    rows:  int32; the row of a table with `count` rows for each that `index` names, -1 for none; empty where those
-           are the rows meant
+    index: row of each node, -1 for none; no row belongs to two nodes
+    rows:  int32; table row for each row that `index` names, -1 for none, in a table of `count` rows; empty for identity
     """
 
     index: Int32[Tensor, "x y z"]
@@ -31,7 +30,7 @@ class Nodes:
 
     @classmethod
     def of(cls, numbers: Int[Tensor, " row"], shape: tuple[int, int, int]) -> Nodes:
-        """Nodes of these numbers, each with the row at its number's place. Raises ValueError unless all differ."""
+        """Nodes of these numbers, each with the index of its number as row. Raises ValueError unless all differ."""
         require(min(shape) >= 2 and shape[0] * shape[1] * shape[2] < 1 << 31, f"a grid cannot have {shape} nodes")
         total = shape[0] * shape[1] * shape[2]
         inside = len(numbers) == 0 or (int(numbers.min()) >= 0 and int(numbers.max()) < total)
@@ -44,18 +43,18 @@ class Nodes:
 
     @classmethod
     def all(cls, shape: tuple[int, int, int]) -> Nodes:
-        """A dense grid: every node has a row, that of its number."""
+        """A dense grid: the row of every node is its number."""
         return cls.of(torch.arange(shape[0] * shape[1] * shape[2]), shape)
 
     def part(self, rows: Int[Tensor, " some"]) -> Nodes:
-        """The same nodes for a table that holds these rows alone, in this order. The index is shared."""
+        """The same nodes for a table of only these rows, in this order. The index is shared."""
         here = torch.full_like(self.named, -1)
         here[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
         return Nodes(self.index, here, len(rows))
 
     @property
     def named(self) -> Int32[Tensor, " row"]:
-        """`rows`, written out where they are left empty."""
+        """`rows`, with the identity written out."""
         return self.rows if len(self.rows) else torch.arange(self.count, dtype=torch.int32, device=self.index.device)
 
     def to(self, device: torch.device | str) -> Nodes:
@@ -69,7 +68,7 @@ def sparse_grid(
     """Trilinear interpolation of the values at the eight nodes around each point; a node without a row counts as 0.
 
     points: in the unit cube; those outside are clamped to it. The point 1.0 belongs to the last cell
-    nodes:  which row each node has; trusted to be as its makers leave it
+    nodes:  table row of each node; trusted to be unchanged since it was made
     values: (nodes.count, channel)
     Differentiable in the values and in the points (a clamped coordinate gets no gradient).
     """
@@ -78,7 +77,7 @@ def sparse_grid(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: odd shapes, empty tables, every border of the cube, and beyond it."""
+    """Test inputs for all engines: odd shapes, empty tables, every border of the cube, and beyond it."""
     for samples, shape, share, channels in [
         (0, (4, 4, 4), 0.5, 2),
         (1, (2, 2, 2), 1.0, 1),
@@ -97,15 +96,15 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18, channels: int = 12):
-    """Samples along rays as a training step has them: runs of 16 through a shell in a grid of 129^3 nodes, half a cell
-    from one to the next. Points ask for no gradient there."""
+    """Samples as in a training step: runs of 16 through a shell in a grid of 129^3 nodes, half a cell apart. Points get
+    no gradient there."""
     nodes = shell(129)
     values = torch.randn(nodes.count, channels, generator=generator)
     return through_the_shell(size, 0.5 / 128, generator), nodes, values.requires_grad_()
 
 
 def some_nodes(shape: tuple[int, int, int], share: float, generator: torch.Generator) -> Nodes:
-    """A random share of all nodes, in random order."""
+    """A random share of all nodes, with rows in random order."""
     total = shape[0] * shape[1] * shape[2]
     order = torch.randperm(total, generator=generator)
     return Nodes.of(order[: int(share * total)], shape)

@@ -1,5 +1,5 @@
-"""Numba. Looking up, threads share out the samples. Spreading gradients, they share out slabs of the grid: first every
-other one, then those between, so that no two threads add to one node and the sum is the same every time."""
+"""Numba. Forward, threads share the samples. For gradients they share slabs of the grid: first every other one, then
+those between, so that no two threads add to one node and the sum is the same every time."""
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ CHUNK = 1 << 10  # samples a thread takes at a time
 
 @njit(inline="always")
 def cell_of(x, cells):
-    """Cell and place within it along one axis; what lies outside is clamped onto the border."""
+    """Cell and fractional position within it along one axis; clamped to the grid."""
     s = min(max(x, ZERO), ONE) * np.float32(cells)
     cell = min(np.int64(s), np.int64(cells - 1))
     cell = max(cell, np.int64(0))  # also where x is no number
@@ -30,7 +30,7 @@ def row_of(index, rows, x, y, z):
 
 @njit(inline="always")
 def corners(points, i, index, rows, at, weights):
-    """Rows and weights of those of the eight nodes around sample i that have a row; returns how many there are."""
+    """Rows and trilinear weights of the occupied ones of the eight nodes around sample i; returns their number."""
     cx, fx = cell_of(points[i, 0], index.shape[0] - 1)
     cy, fy = cell_of(points[i, 1], index.shape[1] - 1)
     cz, fz = cell_of(points[i, 2], index.shape[2] - 1)
@@ -51,10 +51,10 @@ def corners(points, i, index, rows, at, weights):
 
 @njit(cache=True)
 def slabs_of(first, cells):
-    """Samples by slabs of cells, in their order: as cut, so that each slab has about as many samples.
+    """Samples sorted by slabs of cells, with about as many samples in each slab.
 
     first: each sample's cell along x.
-    Returns the samples' numbers, and where those of each slab begin; the slabs are an even number.
+    Returns the samples' indices, and the start of each slab; the number of slabs is even.
     """
     counts = np.zeros(cells + 1, np.int64)
     for i in range(len(first)):
@@ -110,7 +110,7 @@ def _look_up(points, index, rows, values, out):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _look_up_one(points, index, rows, values, out):
-    """Of a single channel."""
+    """Look up a single channel."""
     n = len(out)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights = np.empty(9, np.int64), np.empty(9, np.float32)
@@ -138,7 +138,7 @@ def _value_gradient(grad, points, index, rows, order, starts, out):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _point_gradient(grad, points, index, rows, values, out):
-    """The slope of the trilinear blend along each axis: nodes' values, signed by side."""
+    """Gradient of points: derivative of the interpolation along each axis."""
     channels = grad.shape[1]
     cells = index.shape[0] - 1, index.shape[1] - 1, index.shape[2] - 1
     for i in prange(len(points)):

@@ -12,7 +12,7 @@ BLOCK = tl.constexpr(64)
 
 @triton.jit
 def _along(x, cells):
-    """Along one axis: the cell that holds each point, and its place in the cell."""
+    """Along one axis: the cell of each point, and the fractional position within it."""
     x = tl.minimum(tl.maximum(x, 0.0), 1.0) * cells
     cell = tl.minimum(x.to(tl.int32), cells - 1)
     return cell, x - cell.to(tl.float32)
@@ -20,7 +20,9 @@ def _along(x, cells):
 
 @triton.jit
 def cell_of(points, i, here, X, Y, Z):
-    """Cell of X Y Z that holds each point, its place in the cell, and the axes along which it lies in the cube."""
+    """Cell of each point in a grid of X Y Z nodes, fractional position within it, and the axes along which it is in
+    the cube.
+    """
     x, y, z = load_row(points, i, here)
     cx, fx = _along(x, X)  # one pair a line: Triton 3.6 assigns to no nested tuple
     cy, fy = _along(y, Y)
@@ -52,7 +54,7 @@ def weight_of(k: tl.constexpr, f):
 
 @triton.jit
 def slope_of(k: tl.constexpr, f):
-    """The slope of `weight_of` along each axis."""
+    """Derivative of `weight_of` along each axis."""
     x, y, z = _shares(k, f)
     return (k % 2 * 2 - 1) * y * z, (k // 2 % 2 * 2 - 1) * x * z, (k // 4 * 2 - 1) * x * y
 

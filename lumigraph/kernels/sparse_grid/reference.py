@@ -1,4 +1,4 @@
-"""The definition: eight nodes, looked up and blended."""
+"""Reference implementation: trilinear interpolation of eight nodes."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""Real spherical harmonics: a direction as smooth features."""
+"""Real spherical harmonics of directions."""
 
 from math import pi, sqrt
 
@@ -31,7 +31,7 @@ def spherical_harmonics(directions: Float[Tensor, "ray 3"], bands: int) -> Float
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on."""
+    """Test inputs for all engines: directions for each number of bands."""
     axes = torch.cat([torch.eye(3), -torch.eye(3)])
     yield axes, 4
     for rays, bands in [(0, 4), (1, 1), (1, 4), (63, 2), (129, 3), (200, 4)]:
@@ -39,7 +39,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Directions of a training step's samples, for the four bands that Instant-NGP uses."""
+    """Directions of a training step's samples, in four bands as in Instant-NGP."""
     return _directions(size, generator).requires_grad_(), 4
 
 

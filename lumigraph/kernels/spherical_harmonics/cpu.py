@@ -1,4 +1,4 @@
-"""Numba: threads share the directions. One coefficient of all directions after another, as networks like them."""
+"""Numba: threads share the directions. Output is coefficient-major, the layout for networks."""
 
 import numpy as np
 from numba import njit, prange
@@ -13,7 +13,7 @@ BLOCK = 64  # directions whose coefficients go to their places together: far apa
 
 
 def keep(out, k, x):
-    """out[k] = x, where x may be lanes and `out` rows of lanes."""
+    """Store out[k] = x; x may be lanes and `out` rows of lanes."""
     if np.ndim(x):
         put(out, LANES * k, x)
     else:
@@ -21,7 +21,7 @@ def keep(out, k, x):
 
 
 def kept(out, k, like):
-    """out[k], where `like` may be lanes and `out` rows of lanes."""
+    """Load out[k]; `like` may be lanes and `out` rows of lanes."""
     return fetch(out, LANES * k) if np.ndim(like) else out[k]
 
 
@@ -42,7 +42,7 @@ def _kept(out, k, like):
 
 @njit(inline="always")
 def basis(x, y, z, bands, out):
-    """The polynomials at one direction, or at one in each lane."""
+    """Write the polynomials at one direction, or at one in each lane."""
     keep(out, 0, 0.0 * x + K00)
     if bands > 1:
         keep(out, 1, -K1 * y)

@@ -52,7 +52,7 @@ def harmonic(k: tl.constexpr, x, y, z):
 
 @triton.jit
 def harmonic_slope(k: tl.constexpr, x, y, z):
-    """The gradient of Y_k in x, y and z."""
+    """Gradient of Y_k in x, y and z."""
     zero = tl.zeros_like(x)
     if k == 0:
         dY = zero, zero, zero

@@ -1,4 +1,4 @@
-"""The definition: K_lm q_lm(z) times the real or imaginary part of (x + i y)^|m| (Sloan 2013)."""
+"""Reference implementation: K_lm q_lm(z) times the real or imaginary part of (x + i y)^|m| (Sloan 2013)."""
 
 import torch
 from torch import Tensor

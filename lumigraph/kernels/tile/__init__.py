@@ -1,4 +1,4 @@
-"""Tiling: the Gaussians that touch each square of the picture, nearest first."""
+"""Tiling: list of the Gaussians that touch each tile of the picture, sorted by depth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIDE = 32  # pixels along a tile
 
 @dataclass(frozen=True)
 class Tiles:
-    """Tile k, row by row, has Gaussians order[starts[k] : starts[k + 1]], front to back.
+    """Gaussians of each tile: tile k, row by row, has order[starts[k] : starts[k + 1]], front to back.
 
     size: (width, height) of the picture; side: pixels along a tile. The last tile of a row or column may stick out.
     """
@@ -53,8 +53,8 @@ def tile(
 ) -> Tiles:
     """Lists of the Gaussians that reach 1/255 somewhere between the outermost pixel centres of each tile.
 
-    A footprint is the ellipse d^T conic d <= 2 ln(255 opacity), as large as its opacity asks for and no larger
-    (a fixed 3 sigma is both too much and too little). Equal depths keep the order of their numbers.
+    A footprint is the ellipse d^T conic d <= 2 ln(255 opacity), tighter than a fixed 3 sigma. Equal depths keep the
+    order of their numbers.
 
     size: (width, height) of the picture in pixels
     side: of a tile, in pixels: 4, 8, 16 or 32
@@ -68,7 +68,7 @@ def tile(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on, without ellipses that end upon a tile's border."""
+    """Test inputs for all engines, without ellipses that end on a tile's border."""
     many = (60, (70, 45), 16), (60, (70, 45), 32), (50, (33, 65), 8), (120, (27, 22), 4)
     for count, size, side in ((0, (70, 45), 16), (1, (5, 3), 32), *many):
         yield _steady(*footprints(count, size, generator), size, side)
@@ -101,7 +101,7 @@ def footprints(count: int, size: tuple[int, int], generator: torch.Generator) ->
 
 
 def _steady(centres, conics, opacities, depths, size, side):
-    """Only the Gaussians whose tiles stay the same when their opacity changes by more than float32 rounds."""
+    """The Gaussians whose tiles stay the same when their opacity changes by more than float32 rounds."""
     from .reference import touches
 
     fewer, more = (

@@ -1,4 +1,4 @@
-"""Numba: Gaussians are sorted by depth once; then each thread takes some rows of tiles and hands out in that order."""
+"""Numba: Gaussians are sorted by depth once; then each thread fills the lists of some rows of tiles in that order."""
 
 import math
 
@@ -16,7 +16,9 @@ HALF, ONE = np.float32(0.5), np.float32(1)
 
 @njit(**FAST)
 def _near_first(depths, opacities):
-    """Numbers of the visible Gaussians by depth; equal depths keep their order. Bits of floats >= 0 sort as they do."""
+    """Indices of the visible Gaussians by depth; equal depths keep their order. Bits of floats >= 0 sort as the
+    floats do.
+    """
     bits = depths.view(np.uint32)
     order = np.flatnonzero(opacities > MIN_ALPHA).astype(np.int32)
     other = np.empty_like(order)
@@ -35,8 +37,8 @@ def _near_first(depths, opacities):
 
 @njit(parallel=True, **FAST)
 def _measure(order, centres, conics, opacities, size, side, ellipses, rows):
-    """Of each Gaussian, by depth: its ellipse as `_span` wants it, its first and last row of tiles, and how many
-    columns it may touch."""
+    """Ellipse parameters for `_span`, first and last row of tiles, and maximum number of columns of each Gaussian,
+    by depth."""
     down, across = (size[1] + side - 1) // side, (size[0] + side - 1) // side
     for k in prange(len(order)):
         i = order[k]
@@ -60,7 +62,7 @@ def _measure(order, centres, conics, opacities, size, side, ellipses, rows):
 
 @njit(inline="always")
 def _span(ellipse, top, bottom):
-    """How far left and right an ellipse reaches between two heights, from its centre; right < left if nowhere."""
+    """Left and right extent of an ellipse between two heights, from its centre; right < left for none."""
     upper, lower = top - ellipse[1], bottom - ellipse[1]
     y = min(max(ellipse[5], upper), lower)
     room = ellipse[2] - ellipse[3] * y * y
@@ -74,7 +76,7 @@ def _span(ellipse, top, bottom):
 
 @njit(parallel=True, **FAST)
 def _hand_out(order, ellipses, rows, size, side, bands, room, counts, tiles, pairs, used):
-    """Each band of rows writes its pairs (tile, Gaussian), nearest first, from room[band] on, and counts them."""
+    """Write the pairs (tile, Gaussian) of each band of rows by depth, from room[band] on, and count them."""
     width, height = size
     across = (width + side - 1) // side
     for band in prange(len(bands) - 1):
@@ -98,7 +100,7 @@ def _hand_out(order, ellipses, rows, size, side, bands, room, counts, tiles, pai
 
 @njit(parallel=True, **FAST)
 def _sort(tiles, pairs, room, used, starts, out):
-    """Pairs into their tiles' lists; within each they stay in order."""
+    """Sort pairs into their tiles' lists, stably."""
     for band in prange(len(room) - 1):
         for at in range(room[band], used[band]):
             tile = tiles[at]
@@ -108,7 +110,7 @@ def _sort(tiles, pairs, room, used, starts, out):
 
 @njit(cache=True)
 def _room(rows, bands):
-    """Where each band may begin to write."""
+    """Write offset of each band."""
     room = np.zeros(len(bands), np.int64)
     for k in range(len(rows)):
         for band in range(len(bands) - 1):

@@ -16,7 +16,7 @@ BLOCK = tl.constexpr(32)  # Gaussians; they go through their tiles together, so 
 
 @triton.jit
 def _span(centre, extent, side, tiles):
-    """The first tile along one axis that an ellipse may touch, and how many. Its border has half a pixel to spare."""
+    """First tile along one axis that an ellipse may touch, and their number, with half a pixel of margin."""
     first = tl.maximum(tl.floor((centre - extent) / side), 0.0)
     last = tl.minimum(tl.floor((centre + extent) / side), tiles - 1.0)
     most = tl.maximum(last - first + 1, 0.0)
@@ -25,7 +25,7 @@ def _span(centre, extent, side, tiles):
 
 @triton.jit
 def _edges(k, centre, side, pixels):
-    """From the ellipse's centre to the first and the last pixel centre of tile k along one axis."""
+    """Offsets of the first and the last pixel centre of tile k from the ellipse's centre, along one axis."""
     low = k * side + 0.5
     return low - centre, tl.minimum(low + (side - 1), pixels - 0.5) - centre
 
@@ -37,7 +37,7 @@ def _nearest(x, low, high):
 
 @triton.jit
 def _least_on(x, y0, y1, c, tilt, rest):
-    """The least of c (y + tilt x)^2 + rest x^2 for y from y0 to y1."""
+    """Minimum of c (y + tilt x)^2 + rest x^2 for y from y0 to y1."""
     bottom = -tilt * x
     off = _nearest(bottom, y0, y1) - bottom
     return c * off * off + rest * x * x

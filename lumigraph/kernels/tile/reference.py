@@ -1,4 +1,4 @@
-"""The definition: every Gaussian against every tile, (N, K)."""
+"""Reference implementation: every Gaussian against every tile, (N, K)."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Total variation of a grid: how much neighbouring nodes differ."""
+"""Total variation of a grid."""
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ def total_variation(
     """Mean over the chosen nodes of sum_channels sqrt(dx^2 + dy^2 + dz^2 + 1e-9), where dx is the value of the next
     node along x less this one's (Rudin 1992; Fridovich-Keil and Yu 2022, eq. 3).
 
-    Of nodes that have no row nothing is known: one that is chosen counts as 0, and so does the difference from one.
+    A chosen node without a row counts as 0, and so does a difference to one.
 
     chosen: numbers of nodes; those that the step touched, or random ones. A dense grid is `Nodes.all`
     values: (nodes.count, channel)
@@ -31,7 +31,7 @@ def total_variation(
 
 
 def cases(generator: torch.Generator):
-    """Inputs that every engine must agree on: dense and sparse, no node, one more than once, every border."""
+    """Test inputs for all engines: dense and sparse, no node, one more than once, every border."""
     for chosen, shape, share, channels in [
         (0, (4, 4, 4), 0.5, 2),
         (1, (2, 2, 2), 1.0, 1),

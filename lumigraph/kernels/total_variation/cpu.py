@@ -1,5 +1,5 @@
-"""Numba. Value and slope are found in one pass. Threads share out slabs of the grid as in `sparse_grid`, so that no two
-add to one node."""
+"""Numba. Value and gradient are computed in one pass. Threads share slabs of the grid as in `sparse_grid`, so that no
+two add to one node."""
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ EPSILON_ = np.float32(EPSILON)
 
 @njit(inline="always")
 def _after(index, rows, x, y, z, here):
-    """The row of the node at (x, y, z), or `here` where there is none, from which nothing differs then."""
+    """Row of the node at (x, y, z), or `here` for none, which makes the difference 0."""
     if x >= index.shape[0] or y >= index.shape[1] or z >= index.shape[2]:
         return here
     row = row_of(index, rows, x, y, z)
@@ -24,7 +24,7 @@ def _after(index, rows, x, y, z, here):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _vary(chosen, index, rows, values, order, starts, sloped, sums, out):
-    """Sums of each slab, and where the slope is wanted, it in `out`, which begins as zeros."""
+    """Sums of each slab, and the gradient in `out` (zeros before) where wanted."""
     channels, (_, ny, nz) = values.shape[1], index.shape
     for half in range(2):
         for pair in prange((len(starts) - 1) // 2):

@@ -15,7 +15,7 @@ BLOCK = tl.constexpr(64)
 
 @triton.jit
 def _after(index, rows, x, y, z, row, X, Y, Z):
-    """Rows of the nodes at (x, y, z), or each node's own `row` where there is none, from which nothing differs then."""
+    """Rows of the nodes at (x, y, z), or each node's own `row` for none, which makes the difference 0."""
     inside = (row >= 0) & (x < X) & (y < Y) & (z < Z)
     after = row_of(index, rows, (x, y, z), inside, Y, Z)
     return tl.where(after >= 0, after, row)

@@ -1,4 +1,4 @@
-"""The definition: differences along three axes."""
+"""Reference implementation: differences along three axes."""
 
 import torch
 from torch import Tensor

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ... import files, methods
 from ...errors import LumigraphError
-from ...evaluation import file_name
+from ...evaluation.views import file_name
 from ...figures import Row as Line
 from ...figures import contact_sheet, save_picture
 from ...figures.charts import line_chart, standalone

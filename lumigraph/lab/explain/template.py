@@ -13,7 +13,8 @@ from torch import Tensor
 
 from ... import methods
 from ...datasets.scene import Scene
-from ...derive.conversion import ConversionTarget, check, convert, new_student, shown, take_over
+from ...derive.conversion import check, convert, new_student, shown, take_over
+from ...derive.options import ConvertOptions
 from ...figures import Row, contact_sheet, save_picture
 from ...figures.charts import Series, line_chart, standalone
 from ...files import write_bytes, write_json
@@ -60,7 +61,7 @@ def stages_of(
     teacher = run.method()
     around = teacher.refined(run.cameras()["train"])
     first = scene.cameras[shown_photograph(scene)]
-    aim = ConversionTarget(None, None, seconds, source=scene.source, views=views, seed=run.settings.seed)
+    aim = ConvertOptions(seconds, scene=scene.source, views=views, seed=run.settings.seed)
 
     def stage(method: Method, name: str, spent: float) -> TemplateStage:
         seen = shown(method.eval(), scene, first, views)
@@ -72,7 +73,7 @@ def stages_of(
     trained = run.state.seconds
     found = [stage(teacher, "trained", trained)]
     for name in into:
-        student = new_student(methods.find(name), teacher, aim, teacher.device)
+        student = new_student(methods.find(name), teacher, teacher.device, seed=aim.seed)
         moved = trained + take_over(teacher, student, scene, around, as_taken=True)
         found.append(stage(student, "moved", moved))
         made = convert(run, name, runs / name, aim, teacher.device)

@@ -119,15 +119,6 @@ class ProbeGrid:
         """Linear irradiance E(n) at points of surfaces: pi times the radiance of white chalk there."""
         return self._interpolated(points, normals, normals, convolved)
 
-    def radiance_at(
-        self,
-        points: Float[Tensor, "point 3"],
-        directions: Float[Tensor, "point 3"],
-        normals: Float[Tensor, "point 3"],
-    ) -> Float[Tensor, "point 3"]:
-        """Linear radiance that arrives from directions, at points of surfaces with normals."""
-        return self._interpolated(points, normals, directions, lambda found: found)
-
     def coefficients(
         self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point coefficient 3"]:

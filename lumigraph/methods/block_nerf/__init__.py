@@ -5,26 +5,27 @@ The field of one block learns from any scene. `large.compositing` makes one pict
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
-from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, HashNumbers
+from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.schedules import RISE, held_decay
+from ...components.training.schedules import RISE
 from ...datasets.scene import Batch, Frame, Photograph, Scene
-from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, between
+from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, changed
 from ...method import FieldMethod, seeded
 from ...method.field import Directions, Points
 from ...volume import composite
@@ -35,16 +36,16 @@ from .parts import Exposures, Moving, Visibility
 class Config:
     """The paper's numbers, with where it gives them; `BlockNeRF.preset` has a CPU's."""
 
-    network: NetworkNumbers = NetworkNumbers(position_frequencies=16)  # mip-NeRF's
+    backbone: BackboneNumbers = BackboneNumbers(
+        NetworkNumbers(position_frequencies=16),  # mip-NeRF's
+        hidden_width=512,  # this and all below: appendix
+        learning_rate=2e-3,
+        final_learning_rate=2e-5,
+    )
     rays: RayNumbers = RayNumbers(256, 512, rays_per_step=16_384)  # appendix
-    table: HashNumbers = HashNumbers()
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers()
-    proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers(match_photographs=False)  # section 4.2.2
     pose_penalty: NonNegative = 1e5  # weight of the squares of refined poses' changes at first, appendix; 0: none
     final_pose_penalty: NonNegative = 0.1  # that weight at the end of the budget, reached linearly; 0: none
-    field: Literal["hash", "network"] = "network"  # field of the block: Mip-NeRF's network, or a faster hash table
     appearance: bool = True  # learn an appearance code for each photograph, section 4.2.1; off: one light
     appearance_code: CodeWidth = 32  # numbers of an appearance code, section 4.2.1; more fit its light more closely
     exposure: bool = True  # log exposure as an input, where photographs state it, section 4.2.3; off: ignored
@@ -55,26 +56,21 @@ class Config:
     visibility_width: Width = 128  # channels of the visibility network; wider costs time
     residual_masks: bool = False  # exclude parts of photographs with large errors, in addition to given masks
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
-    own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
-    hidden_width: Width = 512  # channels of a layer, appendix; wider holds more detail, and costs time
     head_layers: Layers = 3  # of the network: hidden colour layers, appendix; more cost time
     head_width: Width = 128  # of the network: channels of a hidden colour layer, appendix; wider costs time
-    learning_rate: LearningRate = 2e-3  # Adam's learning rate at first, appendix; higher: faster, may diverge
-    final_learning_rate: LearningRate = 2e-5  # learning rate at the end of the budget, reached exponentially
     warmup_steps: Steps = 1024  # steps in which the learning rate rises, appendix; more begin more carefully
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
-    resample_padding: NonNegative = 0.01  # of the network: least weight of a frustum; higher samples more evenly
     coarse_loss_weight: NonNegative = 0.1  # of the network: weight of the coarse colours; 0: it only guides
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
+OWN_SKIES = True  # a sky for each photograph behind open captures, by hash table
 FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 
 
 class BlockNeRF(FieldMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
     network: HashField | FrustumField
     in_blocks = True
 
@@ -90,38 +86,37 @@ class BlockNeRF(FieldMethod):
         self.appearance = AppearanceCodes(*codes) if c.appearance else None
         self.moving = Moving(photographs) if c.residual_masks else None
         code = (c.appearance_code if c.appearance else 0) + (self.exposures.width if self.exposures else 0)
-        joining = self.poses.weights if self.poses else None
+        b, joining = c.backbone, self.poses.weights if self.poses else None
+        network = partial(FrustumField, head=[c.head_width] * c.head_layers, padding=0.0)
         with seeded(c.seed):
-            if c.field == "hash":
-                self.network = HashField(c.table, c.hidden_width, space, frame.reach, code, joining)
-                self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
-                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
+            self.network = b.build(frame, space, network=network, code=code, joining=joining)
+            if b.hashed:
+                self.sky = sky_for(frame, OWN_SKIES, b.table.sh_bands, code, b.hidden_width)
+                self.sampler = b.sampler(frame, space)
             else:
-                head = [c.head_width] * c.head_layers
-                common: dict[str, Any] = {"code": code, "joining": joining, "head": head, "padding": 0.0}
-                self.network = FrustumField(c.network, c.hidden_width, space, **common)
-                learns_coarse, padding = c.coarse_loss_weight > 0, c.resample_padding
-                self.sampler = ConeSampler(space, c.rays, learns_coarse=learns_coarse, resample_padding=padding)
-                self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
+                self.sampler = ConeSampler(
+                    space, c.rays, learns_coarse=c.coarse_loss_weight > 0, rays_per_chunk=RAYS_WITH_FEATURES
+                )
             shape = c.visibility_frequencies, c.visibility_layers, c.visibility_width
             self.sight = Visibility(space, *shape) if c.visibility else None
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        return Config(
-            **CPU_HASH, field="hash", hidden_width=32, visibility_layers=2, visibility_width=64,
-            rays=RayNumbers(128, 128), head_layers=1, head_width=16, pose_penalty=0.0, final_pose_penalty=0.0,
-            learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE, decay_start=0.3, huber_delta=0.3,
+        return changed(
+            Config(), **CPU_BACKBONE, coarse_samples=128, fine_samples=128, rays_per_step=4096,
+            visibility_layers=2, visibility_width=64, head_layers=1, head_width=16,
+            pose_penalty=0.0, final_pose_penalty=0.0, warmup_steps=RISE, huber_delta=0.3,
         )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with tiny networks, every part of it, within some twenty quick steps."""
-        poses = PoseNumbers(refine_cameras=True, match_photographs=False)
-        c = Config(**TINY_HASH, field="hash", poses=poses, hidden_width=16, residual_masks=True, appearance_code=4)
-        c = replace(c, exposure_frequencies=2, visibility_frequencies=3, visibility_layers=1, visibility_width=16)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, warmup_steps=RISE, pose_penalty=1.0)
+        return changed(
+            Config(), **TINY_BACKBONE, refine_cameras=True, residual_masks=True, appearance_code=4,
+            exposure_frequencies=2, visibility_frequencies=3, visibility_layers=1, visibility_width=16,
+            warmup_steps=RISE, pose_penalty=1.0,
+        )  # fmt: skip
 
     # Learning
 
@@ -162,13 +157,9 @@ class BlockNeRF(FieldMethod):
         return weights
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        rate, codes = self.config.learning_rate, [self.appearance.codes] if self.appearance else []
-        if isinstance(self.network, HashField):
-            groups = [{"params": codes, "scale": CODES_RATE}]
-            groups += [{"params": [*self.sky.parameters()], "scale": OPEN_RATE}] if self.sky else []
-            own = self.network.optimizers_at(rate, scale=OPEN_RATE, groups=groups)
-        else:
-            own = [torch.optim.Adam([*self.network.parameters(), *codes], rate)]
+        groups = [{"params": [self.appearance.codes] if self.appearance else [], "scale": CODES_RATE}]
+        groups += [{"params": [*self.sky.parameters()], "scale": OPEN_RATE}] if self.sky else []
+        own = self.config.backbone.optimizers(self.network, groups=groups, scale=OPEN_RATE)
         return [*own, *super().optimizers()]
 
     def codes(self, image: Int[Tensor, " ray"]) -> Float[Tensor, "ray code"]:

@@ -26,7 +26,6 @@ from ...errors import LumigraphError
 from ...files.ranges import (
     BatchSize,
     Cells,
-    Layers,
     LearningRate,
     NonNegative,
     Positive,
@@ -48,17 +47,11 @@ class Config:
     table: TableNumbers = TableNumbers()
     field: Literal["network", "hash"] = "network"  # occupancy and texture: the paper's network, or a faster hash table
     hidden_width: Width = 512  # channels of a hidden layer; wider holds more detail, and costs time
-    blocks: Layers = 5  # residual blocks of the network; more cost time
-    threshold: Annotated[float, between(0.001, 0.999)] = 0.5  # tau, occupancy at the surface; higher: thinner
     march_steps: MarchSteps = 128  # steps along the diagonal of [-1, 1]^3 in the end; more find thinner things, slower
     first_march_steps: MarchSteps = 16  # steps at first, which double until they are march_steps
     march_settling: Share = 0.5  # share of the budget after which there are march_steps
-    secant_steps: Annotated[int, between(1, 64)] = 8  # evaluations that narrow a crossing down, section 3.2
     hull_cells: Cells = 0  # cells per axis of the visual hull, outside of which rays do not look; 0: they look anywhere
     rays_per_step: BatchSize = 2048  # rays of a step; more reduce noise, and cost time
-    colour_weight: NonNegative = 1.0  # weight of L_rgb, eq. 3
-    freespace_weight: NonNegative = 1.0  # weight of L_freespace, for rays beside the object
-    occupancy_weight: NonNegative = 1.0  # weight of L_occupancy, for rays of the object that miss the surface
     depth_weight: NonNegative = 0.0  # weight of L_depth, for photographs with depth; 0: depth is not read
     normal_weight: NonNegative = 0.05  # weight of L_normal; higher smooths the surface
     neighbour_distance: Positive = 2e-3  # side of the cube around a point from which L_normal draws its neighbour
@@ -77,6 +70,12 @@ class Config:
             )
 
 
+BLOCKS = 5  # residual blocks of the network
+THRESHOLD = 0.5  # tau, occupancy at the surface
+SECANT_STEPS = 8  # evaluations that narrow a crossing down, section 3.2
+COLOUR_WEIGHT = 1.0  # weight of L_rgb, eq. 3
+FREESPACE_WEIGHT = 1.0  # weight of L_freespace, for rays beside the object
+OCCUPANCY_WEIGHT = 1.0  # weight of L_occupancy, for rays of the object that miss the surface
 DIAGONAL = 2 * math.sqrt(3)  # of [-1, 1]^3
 HULL_CELLS = 32  # per axis, of the hull that the first sphere is found from
 SPHERE_RADIUS = 0.6  # of the first sphere, of that around the hull
@@ -100,7 +99,7 @@ class DVR(SurfaceMethod):
         with seeded(c.seed):
             joining = self.bands.weights if self.bands else None
             self.network = (
-                TableField(c.table, c.hidden_width, joining) if hashed else OccupancyField(c.hidden_width, c.blocks)
+                TableField(c.table, c.hidden_width, joining) if hashed else OccupancyField(c.hidden_width, BLOCKS)
             )
         self.cells = OccupancyGrid(1.0, max(c.hull_cells, 1))
         self._march_steps = c.march_steps
@@ -108,21 +107,24 @@ class DVR(SurfaceMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table whose levels join one by one; rays look within the visual hull alone."""
-        c = Config(table=CPU_LEVELS, field="hash", hidden_width=32, hull_cells=64, march_steps=192)
-        c = replace(c, first_march_steps=96, march_settling=0.3, rays_per_step=2048, coarse_to_fine=0.5)
-        c = replace(c, neighbour_distance=1e-2, difference_step=1e-2)
-        return replace(c, learning_rate=1e-2, final_learning_rate=1e-3)
+        return Config(
+            CPU_LEVELS, field="hash", hidden_width=32, hull_cells=64, march_steps=192, first_march_steps=96,
+            march_settling=0.3, coarse_to_fine=0.5, neighbour_distance=1e-2, difference_step=1e-2,
+            learning_rate=1e-2, final_learning_rate=1e-3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(table=TINY_LEVELS, field="hash", hidden_width=16, hull_cells=16, march_steps=32)
-        c = replace(c, rays_per_step=256, neighbour_distance=0.05, difference_step=0.05, coarse_to_fine=0.5)
-        return replace(c, learning_rate=2e-2, final_learning_rate=5e-3)
+        return Config(
+            TINY_LEVELS, field="hash", hidden_width=16, hull_cells=16, march_steps=32, rays_per_step=256,
+            coarse_to_fine=0.5, neighbour_distance=0.05, difference_step=0.05,
+            learning_rate=2e-2, final_learning_rate=5e-3,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         """Activations of a step: at the surface, and at the differences of two normals there."""
-        layers = 2 if config.field == "hash" else 2 * config.blocks
+        layers = 2 if config.field == "hash" else 2 * BLOCKS
         return 4 * config.rays_per_step * (3 + 12) * config.hidden_width * layers * learning
 
     # Learning
@@ -161,7 +163,7 @@ class DVR(SurfaceMethod):
         points = rays[met].at(t[met])
         rgb, right = self.colour(points), inside[met]
         off = (rgb - batch.rgb[met])[right].abs().sum(-1)
-        terms = {"colour": c.colour_weight * off.sum() / count}
+        terms = {"colour": COLOUR_WEIGHT * off.sum() / count}
         if c.depth_weight:
             error = (t[met] - batch.extra["depth"][met])[right].abs()
             terms["depth"] = c.depth_weight * error[error.isfinite()].sum() / count
@@ -185,7 +187,7 @@ class DVR(SurfaceMethod):
     ) -> dict[str, Tensor]:
         """L_freespace and L_occupancy: cross-entropy where rays beside the object meet a surface, or at a random place
         of the box, and at a random place of rays that should meet one and do not."""
-        c, hit = self.config, t.isfinite()
+        hit = t.isfinite()
         enter, leave = rays.through_box(torch.tensor(self.frame.bounds, device=self.device))
         share = torch.rand(len(rays), generator=generator).to(t)
         anywhere = torch.lerp(enter.clamp_min(self.frame.near), leave, share)
@@ -196,8 +198,8 @@ class DVR(SurfaceMethod):
         free = self.logits(rays[beside].at(torch.where(hit, t, anywhere)[beside]))
         full = self.logits(rays[missed].at(held))
         return {
-            "freespace": c.freespace_weight * softplus(free).sum() / len(rays),
-            "occupancy": c.occupancy_weight * softplus(-full).sum() / len(rays),
+            "freespace": FREESPACE_WEIGHT * softplus(free).sum() / len(rays),
+            "occupancy": OCCUPANCY_WEIGHT * softplus(-full).sum() / len(rays),
         }
 
     def _differences(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
@@ -227,7 +229,7 @@ class DVR(SurfaceMethod):
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Logit of the threshold less that of points, by LOGIT_SCALE: it has the sign and the zero level of a distance,
         and not its length."""
-        level = math.log(self.config.threshold / (1 - self.config.threshold))
+        level = math.log(THRESHOLD / (1 - THRESHOLD))
         return (level - self.logits(points)) / LOGIT_SCALE
 
     def met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"]]:
@@ -251,7 +253,7 @@ class DVR(SurfaceMethod):
             a = (b - step).clamp_min(self.frame.near)
             at_a = self.distance(met.at(a))
             entered = at_a >= 0  # not where a ray begins inside
-            crossing = regula_falsi(self.distance, met, a, b, at_a, at_b, self.config.secant_steps)
+            crossing = regula_falsi(self.distance, met, a, b, at_a, at_b, SECANT_STEPS)
             found = torch.where(entered, crossing, b)
         if torch.is_grad_enabled() and bool(entered.any()):
             found = found.index_put((entered,), with_gradient(self.distance, met[entered], found[entered]))

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays
-from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ...components.fields.hash_field import HashField, HashNumbers
-from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampling_bytes
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.hash_field import HashNumbers
+from ...components.sampling.occupancy_sampler import StepNumbers
+from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import Box
 from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
-from ...files.ranges import LearningRate, Seed, Width, between, changed
+from ...files.ranges import Seed, changed
 from ...method import FieldMethod, Pass, seeded
 from ...method.field import Colours, Densities, Directions, Points
 from ...method.sampler import Density
@@ -35,25 +34,19 @@ PROBED_MOMENTS = 8  # at which an update of the occupancy grid asks for density
 class Config:
     """Numbers of the release for ZJU-MoCap, chungyiweng/humannerf, configs/default.yaml."""
 
-    network: NetworkNumbers = NetworkNumbers()
-    table: HashNumbers = HashNumbers(sh_bands=1)
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers(256)
+    backbone: BackboneNumbers = BackboneNumbers(
+        table=HashNumbers(sh_bands=1), steps=StepNumbers(256), final_learning_rate=5e-4 * 0.1**0.8
+    )
     bones: BoneNumbers = BoneNumbers()
     weights: WeightNumbers = WeightNumbers()
     nonrigid: NonRigidNumbers = NonRigidNumbers()
-    field: Literal["hash", "network"] = "network"  # canonical field: the paper's network, or a faster hash table
-    hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
-    learning_rate: LearningRate = 5e-4  # Adam's learning rate of the canonical field at first
-    final_learning_rate: LearningRate = 5e-4 * 0.1**0.8  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class HumanNeRF(Articulated, FieldMethod):
     """A canonical field, and the way to it from a body in any pose."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
     network: PosedField
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -62,21 +55,17 @@ class HumanNeRF(Articulated, FieldMethod):
         space = Box(frame.bounds, frame.near)
         with seeded(c.seed):
             self.bones = BoneMotion(frame, c.bones)
-            canonical: Any
-            if c.field == "hash":
-                canonical = HashField(c.table, c.hidden_width, space, max(frame.reach, 1.0))
-            else:
-                canonical = CoordinateField(c.network, c.hidden_width, space)
+            canonical = c.backbone.build(frame, space)
             offset = NonRigidOffset(self.bones.given_angles.shape[1], c.nonrigid)
             self.network = PosedField(canonical, WeightVolume(frame, c.weights), offset)
-        self.sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps=c.steps)
+        self.sampler = c.backbone.sampler(frame, space)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical field, a learnt volume of weights, a small offset, and higher rates."""
         return changed(
-            Config(**CPU_HASH), field="hash", hidden_width=32, sh_bands=1, samples_per_step=1 << 13,
-            occupancy_resolution=64, learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+            changed(Config(), **CPU_BACKBONE), sh_bands=1, samples_per_step=1 << 13, occupancy_resolution=64,
+            learning_rate=1e-2,
             weight_cells=24, weight_code=0, weights_lr=1e-2,
             pose_correction="table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True,
             nonrigid_depth=2, nonrigid_width=32, nonrigid_skip=1, nonrigid_frequencies=4,
@@ -87,10 +76,10 @@ class HumanNeRF(Articulated, FieldMethod):
     def smallest(cls) -> Any:
         """A tiny table under tiny motions within some twenty quick steps."""
         return changed(
-            Config(**TINY_HASH), field="hash", hidden_width=16, samples_per_step=1024, learning_rate=2e-2,
-            final_learning_rate=1e-3, weight_cells=8, weight_code=4, weights_lr=1e-2, bone_radius=0.2, pose_lr=1e-3,
-            pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2, nonrigid_width=8, nonrigid_skip=1,
-            nonrigid_frequencies=2, nonrigid_from=0.0, nonrigid_until=0.5, nonrigid_lr=1e-3,
+            changed(Config(), **TINY_BACKBONE), samples_per_step=1024, weight_cells=8, weight_code=4, weights_lr=1e-2,
+            bone_radius=0.2, pose_lr=1e-3, pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2,
+            nonrigid_width=8, nonrigid_skip=1, nonrigid_frequencies=2, nonrigid_from=0.0, nonrigid_until=0.5,
+            nonrigid_lr=1e-3,
         )  # fmt: skip
 
     # Moments
@@ -139,9 +128,4 @@ class HumanNeRF(Articulated, FieldMethod):
         return {"colour": error, **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        c, canonical = self.config, self.network.canonical
-        if isinstance(canonical, HashField):
-            own = canonical.optimizers_at(c.learning_rate)
-        else:
-            own = [torch.optim.Adam(canonical.parameters(), c.learning_rate)]
-        return [*own, *super().optimizers()]
+        return [*self.config.backbone.optimizers(self.network.canonical), *super().optimizers()]

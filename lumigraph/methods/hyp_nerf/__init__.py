@@ -26,7 +26,19 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import (
+    BatchSize,
+    Count,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Positive,
+    Seed,
+    Share,
+    Width,
+    between,
+    changed,
+)
 from ...geometry import look_at, turning
 from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
@@ -56,7 +68,6 @@ class Config:
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512  # samples across the diagonal; fewer are faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates; higher is faster, less exact
     occupancy_resolution: Annotated[int, between(4, 256)] = 64  # cells per axis of the occupancy grid; more skip more
-    occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty; higher skips more
     members_per_step: Annotated[int, between(1, 1024)] = 1  # members in a step; more reduce noise, and cost time
     rays_per_member: BatchSize = 4096  # rays of each member in a step; more reduce noise, and cost time
     targets: Annotated[int, between(1, 64)] = 4  # photographs of a member that a step's rays come from
@@ -69,10 +80,8 @@ class Config:
     denoiser_start: Share = 0.7  # share of the budget before the denoiser is trained; later leaves it fewer steps
     # Fitting one scene.
     code_steps: Tally = 200  # steps that fit the code of a new scene, section 3.3; more take longer
-    code_learning_rate: LearningRate = 0.1  # rate of that fit, in deviations of the learnt codes
     code_prior: NonNegative = 1e-3  # weight of a new code's distance from the average; higher: closer to learnt ones
     tune_steps: Tally = 60  # steps that tune the field to the photographs, section 3.3; 0: code alone
-    tune_learning_rate: LearningRate = 2e-3  # learning rate of tuning; higher changes the field more
     denoise_views: Tally = 12  # denoised renderings around the object to tune on, section 3.3; 0: none
     denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -117,6 +126,9 @@ class TensorChanges(torch.nn.Module):
         return [kept.rows[0] for kept in self.kept]  # type: ignore[index]
 
 
+OCCUPANCY_THRESHOLD = 0.05  # optical thickness of a cell below which it is empty
+CODE_LEARNING_RATE = 0.1  # rate of fitting a code, in deviations of the learnt codes
+TUNE_LEARNING_RATE = 2e-3  # rate of tuning a field
 PATCH_PIXELS = 64  # side of the pictures from which the denoiser learns, at most
 GRID_UPDATES = 6  # of the occupancy grid of a field that is rendered
 EMPTY_LENGTH = 1 / 16  # scene units over which density in empty space absorbs light
@@ -156,21 +168,23 @@ class HypNeRF(RayMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller codes, tables and networks of the same design."""
-        table = HashNumbers(5, 4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2)
-        c = Config(table, shape_code=64, colour_code=32, code_deviation=0.1, hyper_width=96, hidden_width=32)
-        c = replace(c, steps_per_diagonal=112, transmittance_threshold=1e-3, occupancy_resolution=32, members=1024)
-        c = replace(c, members_per_step=4, rays_per_member=192, targets=2, empty_points=256)
-        return replace(c, learning_rate=4e-3, final_learning_rate=4e-4, denoiser_start=0.8)
+        return changed(
+            Config(), levels=5, features_per_level=4, log2_hashmap_size=12, base_resolution=8, max_resolution=64,
+            sh_bands=2, shape_code=64, colour_code=32, code_deviation=0.1, hyper_width=96, hidden_width=32,
+            steps_per_diagonal=112, transmittance_threshold=1e-3, occupancy_resolution=32, members=1024,
+            members_per_step=4, rays_per_member=192, targets=2, empty_points=256,
+            learning_rate=4e-3, final_learning_rate=4e-4, denoiser_start=0.8,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        table = HashNumbers(3, 2, log2_hashmap_size=9, base_resolution=4, max_resolution=16)
-        table = replace(table, geometry_features=8, sh_bands=1)
-        c = Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1)
-        c = replace(c, hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64)
-        c = replace(c, members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3)
-        c = replace(c, denoiser_width=4, denoiser_start=0.0, denoise_views=2, denoise_steps=4)
-        return replace(c, code_steps=8, tune_steps=4)
+        return changed(
+            Config(), levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8,
+            sh_bands=1, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1,
+            hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64,
+            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3,
+            denoiser_width=4, denoiser_start=0.0, denoise_views=2, denoise_steps=4, code_steps=8, tune_steps=4,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -311,7 +325,7 @@ class HypNeRF(RayMethod):
             return instance.density(points) * self._inside(points)
 
         for _ in range(GRID_UPDATES):
-            cells.update(density, c.occupancy_threshold, generator, decay=1.0)
+            cells.update(density, OCCUPANCY_THRESHOLD, generator, decay=1.0)
         return cells
 
     def _told(self) -> HashInstance:
@@ -397,7 +411,7 @@ class HypNeRF(RayMethod):
         if not len(axes):
             return average
         start = self.codes.along(self._nearest(seen))
-        return average + fitted(start, error, self.config.code_steps, self.config.code_learning_rate) @ axes
+        return average + fitted(start, error, self.config.code_steps, CODE_LEARNING_RATE) @ axes
 
     @torch.no_grad()
     def _nearest(self, seen: Seen) -> Float[Tensor, " code"]:
@@ -415,7 +429,7 @@ class HypNeRF(RayMethod):
         """Tensors of a field after so many steps of learning from photographs, and from denoised views after them."""
         tuned = [tensor.detach().clone().requires_grad_() for tensor in tensors]
         adam, generator = torch.optim.Adam(tuned, eps=1e-15), self.random(number)
-        instance, rate = HashInstance(self.shape, tuned), self.config.tune_learning_rate
+        instance, rate = HashInstance(self.shape, tuned), TUNE_LEARNING_RATE
         for step in range(steps):
             adam.param_groups[0]["lr"] = rate * (1 - step / steps)
             adam.zero_grad()

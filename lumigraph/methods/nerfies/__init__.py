@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -13,18 +13,17 @@ from torch.nn.functional import pad, softplus
 
 from ...camera.rays import Rays
 from ...components.fields.appearance import AppearanceCodes
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
 from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.hash_field import CODES_RATE, HashNumbers
+from ...components.fields.hash_field import CODES_RATE
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import BandSchedule, held_decay, joining_of
+from ...components.training.schedules import BandSchedule, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import (
     Layers,
-    LearningRate,
     NonNegative,
     Octaves,
     PositiveShare,
@@ -44,6 +43,8 @@ from .warp import MomentCodes, Motion, MotionField, SliceField
 
 Code = Annotated[int, between(0, 1024)]  # numbers of a code; 0 for none
 FIRST_MOMENTS = 0.1  # share of the capture that is learnt from at first, where moments join
+ELASTIC_SCALE = 0.03  # c of the elastic term's robust loss, section 3.3
+BACKGROUND_WEIGHT = 1.0  # weight of background points that must not move, section 3.4
 BACKGROUND_SCALE = 0.001  # c of the background's robust loss, in scene units (the authors' release)
 
 
@@ -61,9 +62,7 @@ class DeformationNumbers:
     annealing: Share = 0.32  # share of the budget in which octaves join, 80k of 250k steps, section 3.5; 0: at once
     elastic_weight: NonNegative = 1e-3  # lambda, weight of the elastic loss at first, section 4; higher: more rigid
     elastic_until: Share = 0.2  # share of the budget before that weight falls, 50k of 250k steps
-    elastic_scale: PositiveShare = 0.03  # c of the robust loss, section 3.3; higher: large stretches count for more
     elastic_samples: Annotated[int, between(1, 1 << 20)] = 8192  # samples of a step where it is measured
-    background_weight: NonNegative = 1.0  # weight of background points that must not move, section 3.4
     background_points: Annotated[int, between(1, 1 << 20)] = 16384  # of them in a step
     growth: Share = 0.0  # share of the budget in which later moments join the first (Pumarola 2021); 0: at once
     slice_dimensions: Annotated[int, between(0, 16)] = 0  # ambient dimensions of HyperNeRF's slice; 0: none
@@ -74,28 +73,23 @@ class DeformationNumbers:
 class Config:
     """The paper's numbers; `Nerfies.preset` has those of a plain CPU."""
 
-    network: NetworkNumbers = NetworkNumbers(position_frequencies=8)  # the authors' release
+    backbone: BackboneNumbers = BackboneNumbers(
+        NetworkNumbers(position_frequencies=8),  # the authors' release
+        learning_rate=1e-3,  # section 4
+        final_learning_rate=1e-4,
+    )
     rays: RayNumbers = RayNumbers(128, 128, rays_per_step=6144)  # section 4
-    table: HashNumbers = HashNumbers()
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers()
-    proposals: ProposalNumbers = ProposalNumbers()
     deformation: DeformationNumbers = DeformationNumbers()
     table_annealing: Share = 0.0  # share of the budget in which levels of the hash table join; 0: at once
-    field: Literal["hash", "network"] = "network"  # canonical scene: the paper's networks, or a faster hash table
     appearance_code: Code = 8  # numbers of a photograph's appearance, section 3.1; 0: all have the same
-    hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
-    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first, section 4; higher: faster, may diverge
-    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     deformation_rate: PositiveShare = 1.0  # share of the learning rate that the deformation and its codes learn at
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class Nerfies(FieldMethod):
     """A canonical scene, and a field of motions from each moment to it."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
     network: WarpedField
     background_points: Tensor
     grows = ("background_points",)
@@ -103,20 +97,16 @@ class Nerfies(FieldMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        d, space = c.deformation, space_of(frame)
+        b, d, space = c.backbone, c.deformation, space_of(frame)
         shape, ambient = (d.deformation_depth, d.deformation_width, d.deformation_skip), d.slice_dimensions
-        first = None
+        self.levels = BandSchedule(c.table_annealing) if c.table_annealing and b.hashed else None
+        kinds = SlicedHash, partial(SlicedNetwork, activation=softplus, keep_input=True)
+        common: dict[str, Any] = {"code": c.appearance_code, "joining": joining_of(self.levels), "ambient": ambient}
+        rays = partial(HierarchicalSampler, space, c.rays, rays_per_chunk=RAYS_WITH_FEATURES)
+        self.sampler = b.sampler(frame, space) if b.hashed else rays()
         with seeded(c.seed):
-            if c.field == "hash":
-                self.levels = BandSchedule(c.table_annealing) if c.table_annealing else None
-                hash_of = partial(SlicedHash, c.table, c.hidden_width, space, frame.reach, c.appearance_code)
-                canonical: Any = hash_of(joining=joining_of(self.levels), ambient=ambient)
-                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
-            else:
-                build = partial(SlicedNetwork, c.network, c.hidden_width, space, code=c.appearance_code)
-                canonical, first = (build(ambient=ambient, activation=softplus, keep_input=True) for _ in range(2))
-                self.sampler = HierarchicalSampler(space, c.rays)
-                self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
+            canonical = b.build(frame, space, *kinds, **common)
+            first = None if b.hashed else b.build(frame, space, *kinds, **common)
             self.moment_codes = MomentCodes(frame, d.moment_code, d.moment_waves)
             bands = d.deformation_frequencies, d.moment_code
             motion = None if d.motion == "none" else MotionField(space, d.motion, *bands, shape, d.annealing)
@@ -130,21 +120,19 @@ class Nerfies(FieldMethod):
     def cpu_preset(cls) -> Any:
         """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
         return changed(
-            Config(**CPU_HASH), field="hash", hidden_width=32, appearance_code=0, samples_per_step=1 << 13,
-            occupancy_resolution=64, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5,
+            changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, samples_per_step=1 << 13, occupancy_resolution=64,
+            appearance_code=0, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5,
             elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True,
             deformation_frequencies=4, growth=0.5, table_annealing=0.5, deformation_rate=0.3,
-            learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
         )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under a tiny deformation with a slice, within some twenty quick steps."""
         return changed(
-            Config(**TINY_HASH), field="hash", hidden_width=16, appearance_code=2, deformation_depth=2,
-            deformation_width=16, deformation_skip=1, moment_code=2, deformation_frequencies=4, elastic_samples=64,
-            background_points=64, slice_dimensions=1, slice_width=16, learning_rate=2e-2, final_learning_rate=1e-3,
-            deformation_rate=0.1,
+            Config(), **TINY_BACKBONE, appearance_code=2, deformation_depth=2, deformation_width=16,
+            deformation_skip=1, moment_code=2, deformation_frequencies=4, elastic_samples=64, background_points=64,
+            slice_dimensions=1, slice_width=16, deformation_rate=0.1,
         )  # fmt: skip
 
     # Codes
@@ -220,8 +208,8 @@ class Nerfies(FieldMethod):
         motion = self.network.motion
         if motion is not None and (weight := self.elastic_weight()):
             terms["elastic"] = weight * self.stretching(motion, batch.rays, passes[-1], code, generator)
-        if motion is not None and len(self.background_points) and self.config.deformation.background_weight:
-            terms["background"] = self.config.deformation.background_weight * self.restlessness(motion, generator)
+        if motion is not None and len(self.background_points):
+            terms["background"] = BACKGROUND_WEIGHT * self.restlessness(motion, generator)
         return terms
 
     def stretching(
@@ -237,7 +225,7 @@ class Nerfies(FieldMethod):
         ray = seen.samples.ray_index[drawn]
         points = rays.origins[ray] + seen.samples.t[drawn, None] * rays.directions[ray]
         jacobian = motion.jacobian(points, code[ray, self.network.appearance :])
-        return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
+        return total / len(rays) * elastic_loss(jacobian, ELASTIC_SCALE).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
         """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""
@@ -249,19 +237,15 @@ class Nerfies(FieldMethod):
         return geman_mcclure(away.square().sum(-1), BACKGROUND_SCALE).mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        c, canonical = self.config, self.network.canonical
-        moving = [part for part in (self.network.motion, self.network.ambient) if part is not None]
+        c, b, network = self.config, self.config.backbone, self.network
+        moving = [part for part in (network.motion, network.ambient) if part is not None]
         deformation = {"params": [p for part in moving for p in part.parameters()], "scale": c.deformation_rate}
         codes = {"params": [self.moment_codes.codes], "scale": c.deformation_rate}
         groups = [group for group in (deformation, codes) if group["params"]]
         if self.appearance is not None:
-            groups.append({"params": [self.appearance.codes], "scale": CODES_RATE if c.field == "hash" else 1.0})
-        if isinstance(canonical, SlicedHash):
-            own = canonical.optimizers_at(c.learning_rate)
-        else:
-            both = [canonical, self.network.first] if self.network.first is not None else [canonical]
-            own = [torch.optim.Adam([p for each in both for p in each.parameters()], c.learning_rate)]
-        return [*own, torch.optim.Adam(groups, c.learning_rate), *super().optimizers()]
+            groups.append({"params": [self.appearance.codes], "scale": b.scale(CODES_RATE)})
+        own = b.optimizers(*(x for x in (network.canonical, network.first) if x is not None))
+        return [*own, torch.optim.Adam(groups, b.learning_rate), *super().optimizers()]
 
     # Motion
 

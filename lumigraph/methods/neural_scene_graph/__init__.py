@@ -12,26 +12,25 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from ...camera.rays import Look, Rays
-from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ...components.fields.hash_field import CODES_RATE, HashField, HashNumbers
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.coordinate_field import CoordinateField
+from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.sampling import stratified
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.schedules import held_decay
 from ...composition.composed import union
 from ...datasets.scene import Batch, Frame, Scene
 from ...datasets.tracks import BoxTrack, GraphNode, TrackEdit, TrackEdits, nodes_of
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
+from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
 from ...method import FieldMethod, Pass, frozen, seeded
 from ...method.controls import Control, Value, blend, moment
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .fields import ClassField, HashClassField, NetworkClassField
+from .fields import CUBE, ClassField, HashClassField, NetworkClassField
 from .nodes import BoxStretches, NodeNumbers, PoseTable, TrackCorrections, crossings, inside
 
 REMOVED = "removed"  # choice of an instance's control
@@ -42,18 +41,12 @@ CODE_STEPS, CODE_RAYS, CODE_RATE = 200, 512, 2e-2  # of finding the codes of uns
 class Config:
     """The release's numbers (example_configs/config_kitti_0006_example_train.txt); `preset` has a plain CPU's."""
 
-    network: NetworkNumbers = NetworkNumbers()
+    backbone: BackboneNumbers = BackboneNumbers()
     rays: RayNumbers = RayNumbers(rays_per_step=8192)
-    table: HashNumbers = HashNumbers()
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers()
-    proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers()
     nodes: NodeNumbers = NodeNumbers()
-    field: Literal["hash", "network"] = "network"  # fields of background and classes: the paper's, or hash tables
     class_log2_hashmap_size: Annotated[int, between(1, 28)] = 17  # log2 of entries of a level of a class's hash table
     class_max_resolution: Annotated[int, between(1, 1 << 20)] = 256  # cells along a box of its finest level
-    hidden_width: Width = 256  # channels of a layer, as in NeRF; wider holds more detail, and costs time
     code_width: Annotated[int, between(1, 1024)] = 256  # numbers of an instance's latent code; more tell more apart
     code_weight: NonNegative = 1e-4  # weight of codes squared, eq. 10; higher: instances are more alike
     box_samples: Annotated[int, between(2, 512)] = 7  # samples of a ray in a box, section 4.2; more are sharper, slower
@@ -61,9 +54,6 @@ class Config:
     pose_input: Literal["location", "heading"] = "location"  # of a box, that colour depends on besides the direction
     symmetric: bool = False  # left and right sides of boxes are alike, so that either one shows the other
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
-    learning_rate: LearningRate = 5e-4  # Adam's learning rate at first; higher: faster, may diverge
-    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -75,7 +65,7 @@ class NeuralSceneGraph(FieldMethod):
     found:       tracks and codes of instances that were found in another scene's photographs
     """
 
-    Config, learning_rate, accepts = Config, held_decay, (Scene, TrackEdits)
+    Config, learning_rate, accepts = Config, backbone_decay, (Scene, TrackEdits)
     further_bytes = staticmethod(sampling_bytes)
     network: HashField | CoordinateField
     rays_per_chunk: ClassVar[int] = 4096  # type: ignore[misc]
@@ -91,21 +81,14 @@ class NeuralSceneGraph(FieldMethod):
         self.categories = tuple(dict.fromkeys(track.category for track in frame.tracks))
         self.poses = poses_for(frame, c.poses)
         space = space_of(frame)
-        joining = self.poses.weights if self.poses else None
+        b, joining = c.backbone, self.poses.weights if self.poses else None
         with seeded(c.seed):
-            if c.field == "hash":
-                self.network = HashField(c.table, c.hidden_width, space, frame.reach, joining=joining)
-                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
-                sizes = c.class_log2_hashmap_size, c.class_max_resolution
-                numbers = replace(c.table, log2_hashmap_size=sizes[0], max_resolution=sizes[1])
-                classes: list[ClassField] = [
-                    HashClassField(numbers, c.hidden_width, c.code_width) for _ in self.categories
-                ]
-            else:
-                self.network = CoordinateField(c.network, c.hidden_width, space, joining=joining)
-                self.sampler = HierarchicalSampler(space, c.rays)
-                classes = [NetworkClassField(c.network, c.hidden_width, c.code_width) for _ in self.categories]
-            self.classes = nn.ModuleList(classes)
+            self.network = b.build(frame, space, joining=joining)
+            self.sampler = b.sampler(frame, space) if b.hashed else HierarchicalSampler(space, c.rays)
+            small = changed(b, log2_hashmap_size=c.class_log2_hashmap_size, max_resolution=c.class_max_resolution)
+            kinds = HashClassField, NetworkClassField
+            made = (small.build(Frame(), CUBE, *kinds, latent=c.code_width) for _ in self.categories)
+            self.classes = nn.ModuleList(made)
             self.codes = nn.Parameter(0.1 * torch.randn(len(frame.tracks), c.code_width))
         self.nodes = TrackCorrections(frame.tracks, c.nodes)
         self.found: tuple[tuple[BoxTrack, ...], Tensor] = (), torch.zeros(0, c.code_width)
@@ -115,18 +98,19 @@ class NeuralSceneGraph(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, code_width=16, box_samples=16)
-        c = replace(c, class_log2_hashmap_size=15, class_max_resolution=96, box_scale=1.1, pose_input="heading")
-        c = replace(c, symmetric=True, huber_delta=0.3, code_weight=1e-3)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
+        return changed(
+            Config(), **CPU_BACKBONE, class_log2_hashmap_size=15, class_max_resolution=96, code_width=16,
+            code_weight=1e-3, box_samples=16, box_scale=1.1, pose_input="heading", symmetric=True, huber_delta=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and networks with corrections of poses, within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, code_width=4, box_samples=8)
-        c = replace(c, class_log2_hashmap_size=10, class_max_resolution=16)
-        c = replace(c, nodes=NodeNumbers(refine_tracks=True), box_scale=1.1, pose_input="heading")
-        return replace(c, learning_rate=2e-2, final_learning_rate=2e-3)
+        return changed(
+            Config(), **TINY_BACKBONE | {"final_learning_rate": 2e-3}, class_log2_hashmap_size=10,
+            class_max_resolution=16, code_width=4, box_samples=8, box_scale=1.1, pose_input="heading",
+            refine_tracks=True,
+        )  # fmt: skip
 
     # The graph
 
@@ -288,15 +272,10 @@ class NeuralSceneGraph(FieldMethod):
         return terms | {"codes": c.code_weight * self.codes.square().mean()} | self.nodes.terms()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        c = self.config
-        rate = CODES_RATE if c.field == "hash" else 1.0
-        codes: list[dict[str, Any]] = [{"params": [self.codes], "scale": rate}]
-        if isinstance(self.network, HashField):
-            own = self.network.optimizers_at(c.learning_rate, groups=codes)
-        else:
-            groups = [{"params": list(self.network.parameters())}, *codes]
-            own = [torch.optim.Adam(groups, c.learning_rate, eps=1e-7)]
-        classes = [optimizer for field in self.class_fields for optimizer in field.optimizers_at(c.learning_rate)]
+        b = self.config.backbone
+        codes = {"params": [self.codes], "scale": b.scale(CODES_RATE)}
+        own = self.network.optimizers_at(b.learning_rate, groups=[codes])
+        classes = [optimizer for field in self.class_fields for optimizer in field.optimizers_at(b.learning_rate)]
         return [*own, *classes, *super().optimizers()]
 
     # Editing

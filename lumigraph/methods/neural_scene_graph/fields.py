@@ -16,9 +16,9 @@ from torch.nn.functional import softplus
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.coordinate_network import CoordinateNetwork
 from ...components.fields.encodings import FrequencyEncoding
-from ...components.fields.hash_field import HashField, HashNumbers, side_by_side
+from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP, in_chunks, truncated_exp
-from ...components.sampling.spaces import Box
+from ...components.sampling.spaces import Box, Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
@@ -34,7 +34,7 @@ class NetworkClassField(Field):
 
     deforms = True
 
-    def __init__(self, numbers: NetworkNumbers, hidden_width: int, latent: int):
+    def __init__(self, numbers: NetworkNumbers, hidden_width: int, space: Space, latent: int):
         super().__init__()
         self.latent = latent
         self.encode_position = FrequencyEncoding(3, numbers.position_frequencies)
@@ -75,12 +75,12 @@ class HashClassField(HashField):
 
     deforms = True
 
-    def __init__(self, numbers: HashNumbers, hidden_width: int, latent: int):
+    def __init__(self, numbers: HashNumbers, hidden_width: int, space: Space, reach: float, latent: int):
         numbers = replace(numbers, sh_bands=min(numbers.sh_bands, MAX_BANDS))
-        super().__init__(numbers, hidden_width, CUBE, 1.0, code=POSE_NUMBERS)
+        super().__init__(numbers, hidden_width, space, reach, code=POSE_NUMBERS)
         self.latent = latent
         self.modulation = nn.Linear(latent, numbers.width, bias=False)
-        widths = [hidden_width] * numbers.density_layers
+        widths = [hidden_width] * DENSITY_LAYERS
         self.density_network = MLP(numbers.width + latent, *widths, numbers.geometry_features)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:

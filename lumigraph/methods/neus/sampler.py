@@ -58,7 +58,7 @@ class SectionSampler(Sampler):
         self.samples_per_step = samples_per_step
         self.register_buffer("rays_per_step", torch.tensor(numbers.rays_per_step))
         self.is_open = around is not None  # type: ignore[misc]  # of an instance
-        self.empty = OccupancyMask(mask.occupancy_resolution, mask.occupancy_threshold)
+        self.empty = OccupancyMask(mask.occupancy_resolution)
 
     @property
     def batch_size(self) -> int:  # type: ignore[override]

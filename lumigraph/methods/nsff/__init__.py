@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera.rays import Rays, Rendering, Samples
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.hash_field import HashNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import (
-    BatchSize,
-    LearningRate,
     NonNegative,
     PositiveShare,
-    RaySamples,
     Seed,
-    Width,
     between,
     changed,
 )
@@ -37,8 +31,12 @@ from ...method.sampler import Density
 from ...volume import composite
 from .fields import BlendedField, NetworkField, StaticHash, TimeHash
 from .priors import DepthSource, MotionPriors, seen
-from .sampler import EvenSampler
+from .sampler import EvenNumbers, EvenSampler
 
+OCCLUSION_WEIGHT = 0.1  # beta_w, of disocclusion weights that differ from 1, eq. 6
+CYCLE_WEIGHT = 1.0  # weight of flow forward and back that do not cancel, eq. 7
+SMOOTH_WEIGHT = 0.1  # weight of flow that differs between samples of a ray, or between moments
+MIN_WEIGHT = 0.01  # weight of flow itself
 ROWS = 288  # of the pictures in whose pixels the release measures errors of flow
 PRIOR_FALL = 10.0  # factor by which the weights of flow and depth fall each time (the authors' release)
 LAST_SCALE = 0.005  # of those weights, below which they are 0
@@ -53,10 +51,6 @@ class FlowNumbers:
     neighbours: Annotated[int, between(0, 2)] = 2  # moments to either side that are warped; 0: time is a mere input
     both_ways: bool = True  # warp forward and back in each step; off: one of them at random, in half the time
     max_flow: PositiveShare = 1.0  # largest flow to the next moment along an axis, in coordinates of the space
-    occlusion_weight: NonNegative = 0.1  # beta_w, of disocclusion weights that differ from 1, eq. 6
-    cycle_weight: NonNegative = 1.0  # of flow forward and back that do not cancel, eq. 7
-    smooth_weight: NonNegative = 0.1  # of flow that differs between samples of a ray, or between moments
-    min_weight: NonNegative = 0.01  # of flow itself
     flow_weight: NonNegative = 0.02  # of optical flow at first, per pixel of 288 rows; 0: without OpenCV
     depth_weight: NonNegative = 0.04  # of depth at first; 0: none
     depth_source: DepthSource = "sweeps"  # depth of what stands still by plane sweeps, or files of depth
@@ -67,20 +61,10 @@ class FlowNumbers:
 class Config:
     """The paper's numbers; `NSFF.preset` has those of a plain CPU."""
 
-    network: NetworkNumbers = NetworkNumbers()
-    table: HashNumbers = HashNumbers()
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers()
-    proposals: ProposalNumbers = ProposalNumbers()
+    backbone: BackboneNumbers = BackboneNumbers(final_learning_rate=5e-6)
+    rays: EvenNumbers = EvenNumbers()
     flow: FlowNumbers = FlowNumbers()
-    field: Literal["hash", "network"] = "network"  # the paper's networks, or faster hash tables
     static_field: bool = True  # a static field beside the dynamic one; off: the dynamic one shows everything
-    hidden_width: Width = 256  # channels of a layer; wider holds more detail, and costs time
-    samples: RaySamples = 128  # samples of a ray, section 4; of the paper's networks
-    rays_per_step: BatchSize = 1024  # rays of a step; of the paper's networks
-    learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 4; higher: faster, may diverge
-    final_learning_rate: LearningRate = 5e-6  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -100,28 +84,24 @@ class Hop(NamedTuple):
 class NSFF(FieldMethod):
     """Two fields: one stands still, and one knows for each point and moment where it was and where it goes."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
     network: BlendedField
     known_moments: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        space = self.space = space_of(frame)
+        b, space = c.backbone, space_of(frame)
+        self.space, moments = space, max(frame.train_count or frame.image_count, 2)
+        self.sampler = b.sampler(frame, space) if b.hashed else EvenSampler(space, c.rays)
         with seeded(c.seed):
-            if c.field == "hash":
-                static: Any = StaticHash(c.table, c.hidden_width, space, frame.reach)
-                moments = max(frame.train_count or frame.image_count, 2)
-                dynamic: Any = TimeHash(c.table, c.hidden_width, space, frame.reach, moments)
-                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
-            else:
-                static = NetworkField(c.network, c.hidden_width, space, 3, 1)
-                dynamic = NetworkField(c.network, c.hidden_width, space, 4, 8)
-                self.sampler = EvenSampler(space, c.samples, c.rays_per_step)
+            static = b.build(frame, space, StaticHash, partial(NetworkField, inputs=3, heads=1))
+            kinds = partial(TimeHash, moments=moments), partial(NetworkField, inputs=4, heads=8)
+            dynamic = b.build(frame, space, *kinds)
         self.network = BlendedField(static if c.static_field else None, dynamic)
         self.warps = c.flow.neighbours > 0 and frame.times is not None
         if not self.warps:
-            for parameter in (dynamic.motion if c.field == "hash" else dynamic.heads).parameters():
+            for parameter in (dynamic.motion if b.hashed else dynamic.heads).parameters():
                 parameter.requires_grad_(False)
         flows = self.warps and c.flow.flow_weight > 0
         source = c.flow.depth_source if self.warps and c.flow.depth_weight else None
@@ -134,16 +114,15 @@ class NSFF(FieldMethod):
     def cpu_preset(cls) -> Any:
         """Hash tables instead of networks, one neighbour in a step, fewer levels, samples and cells."""
         return changed(
-            Config(**CPU_HASH), field="hash", hidden_width=32, levels=6, max_resolution=192, steps_per_diagonal=192,
-            samples_per_step=1 << 13, occupancy_resolution=64, both_ways=False, neighbours=1, max_flow=0.3,
-            prior_interval=0.3, learning_rate=1e-2, final_learning_rate=1e-3, decay_start=0.3,
+            changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, levels=6, max_resolution=192,
+            steps_per_diagonal=192, samples_per_step=1 << 13, occupancy_resolution=64,
+            both_ways=False, neighbours=1, max_flow=0.3, prior_interval=0.3,
         )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables, within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
-        return changed(c, both_ways=False, max_flow=0.3, prior_interval=0.3)
+        return changed(Config(), **TINY_BACKBONE, both_ways=False, max_flow=0.3, prior_interval=0.3)
 
     # Codes: a time from 0 to 1, and what is added to the blending weight
 
@@ -234,8 +213,8 @@ class NSFF(FieldMethod):
         between = packed.ray_index.diff() == 0
         near = torch.exp(-NEIGHBOURS * points.diff(dim=0).norm(dim=-1))
         unlike = near * (forward.diff(dim=0).abs() + back.diff(dim=0).abs()).sum(-1)
-        terms["smooth"] = c.smooth_weight * (seen(between, unlike) + (forward + back).square().sum(-1).mean() / 2)
-        terms["least"] = c.min_weight * (forward.abs().mean() + back.abs().mean())
+        terms["smooth"] = SMOOTH_WEIGHT * (seen(between, unlike) + (forward + back).square().sum(-1).mean() / 2)
+        terms["least"] = MIN_WEIGHT * (forward.abs().mean() + back.abs().mean())
         if len(self.priors.depth.rows) and self.prior_scale > LAST_SCALE:
             terms["depth"] = c.depth_weight * self.prior_scale * self.depth_error(batch, packed, density, moving)
         return terms
@@ -289,8 +268,8 @@ class NSFF(FieldMethod):
             flow, (back, _) = self.toward(at.motion, way[ray])[0], self.toward(there.motion, 1 - way[ray])
             values = {
                 "photometric": seen(known, certain * (picture.rgb - target).square().mean(-1)),
-                "occlusion": c.occlusion_weight * seen(known[ray], 1 - weight[:, 0]),
-                "cycle": c.cycle_weight * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
+                "occlusion": OCCLUSION_WEIGHT * seen(known[ray], 1 - weight[:, 0]),
+                "cycle": CYCLE_WEIGHT * seen(known[ray], weight[:, 0] * (flow + back).abs().mean(-1)),
             }
             if not hop and len(self.priors.flow.rows) and self.prior_scale > LAST_SCALE:
                 own = composite(packed, at.density, at.rgb, None, place=there.places)
@@ -324,7 +303,10 @@ class NSFF(FieldMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         fields = [x for x in (self.network.static, self.network.dynamic) if x is not None]
-        return [*(o for x in fields for o in x.optimizers_at(self.config.learning_rate)), *super().optimizers()]
+        return [
+            *(o for x in fields for o in x.optimizers_at(self.config.backbone.learning_rate)),
+            *super().optimizers(),
+        ]
 
     # Motion
 

@@ -13,7 +13,7 @@ from ... import kernels
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.coordinate_network import CoordinateNetwork, SkipNetwork
 from ...components.fields.encodings import FrequencyEncoding
-from ...components.fields.hash_field import HashField, HashNumbers, new_table, side_by_side
+from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, new_table, side_by_side
 from ...components.fields.layers import MLP, Dense, in_chunks
 from ...components.sampling.spaces import Space
 from ...components.training.row_optimizers import LazyAdam
@@ -111,7 +111,7 @@ class TimeHash(HashField):
         self.time_levels, self.time_scale = coarse, min(1.0, moments / coarse.finest)
         self.time_tables = nn.ParameterList(new_table(coarse) for _ in PLANES)
         width = n.width + len(PLANES) * coarse.levels * coarse.features
-        self.density_network = MLP(width, *[hidden_width] * n.density_layers, n.geometry_features)
+        self.density_network = MLP(width, *[hidden_width] * DENSITY_LAYERS, n.geometry_features)
         self.motion = MotionNetwork(MOTION_BANDS, *MOTION_SHAPE)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:

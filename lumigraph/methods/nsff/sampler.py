@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
 from ...camera.rays import Rays, Samples
 from ...components.sampling.sampling import stratified
 from ...components.sampling.spaces import Space
+from ...files.ranges import BatchSize, RaySamples
 from ...method import Field, Pass, Sampler
 from ...method.sampler import RayCodes, codes_at
+
+
+@dataclass(frozen=True)
+class EvenNumbers:
+    """A Config's numbers of rays of the paper's networks (section 4)."""
+
+    samples: RaySamples = 128  # samples of a ray; more find thinner things, slower
+    rays_per_step: BatchSize = 1024  # rays of a step; more reduce noise, and cost memory and time
+
+    @property
+    def samples_per_step(self) -> int:
+        """Number of samples of all rays."""
+        return self.samples * self.rays_per_step
 
 
 class EvenSampler(Sampler):
@@ -16,10 +32,10 @@ class EvenSampler(Sampler):
 
     rays_per_chunk = 1024
 
-    def __init__(self, space: Space, samples: int, rays_per_step: int):
+    def __init__(self, space: Space, numbers: EvenNumbers):
         super().__init__()
-        self.space, self.samples = space, samples
-        self.batch_size = self.expected_rays = rays_per_step
+        self.space, self.samples = space, numbers.samples
+        self.batch_size = self.expected_rays = numbers.rays_per_step
 
     def sample(
         self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None

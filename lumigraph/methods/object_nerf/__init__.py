@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from functools import partial
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,19 +18,18 @@ from torch.nn.functional import max_pool3d
 
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.appearance import CodeWidth
-from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ...components.fields.hash_field import CODES_RATE, HashField, HashNumbers
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.coordinate_field import CoordinateField
+from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.fields.instance_codes import InstanceCodes
 from ...components.instances import ALONE, Edit, check_labels, edit_controls, edit_of, labels_of, layers_of
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
+from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import huber
-from ...components.training.schedules import held_decay
 from ...composition.composed import kept, union
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
+from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
 from ...geometry import Similarity
 from ...method import FieldMethod, seeded
 from ...method.controls import Control
@@ -42,31 +42,21 @@ from .fields import InstanceBoxes, ObjectNetwork, ObjectTable, SceneWithout
 class Config:
     """The numbers of the authors' release (zju3dv/object_nerf, config/); those of the paper have their section."""
 
-    network: NetworkNumbers = NetworkNumbers()
+    backbone: BackboneNumbers = BackboneNumbers(learning_rate=1e-3, final_learning_rate=1e-5)
     rays: RayNumbers = RayNumbers(64, 64, rays_per_step=2048)
-    table: HashNumbers = HashNumbers()
-    occupancy: OccupancyNumbers = OccupancyNumbers()
-    steps: StepNumbers = StepNumbers()
-    proposals: ProposalNumbers = ProposalNumbers()
-    field: Literal["hash", "network"] = "network"  # both branches: the paper's networks, or faster hash tables
-    hidden_width: Width = 256  # channels of the scene branch; wider holds more detail, and costs time
-    object_layers: Layers = 4  # hidden layers of the object branch; more cost time
-    object_width: Width = 128  # channels of the object branch; wider costs time
     instances: Annotated[int, between(1, 256)] = 64  # instances that there is room for, labels 0 to one below
     code: CodeWidth = 64  # numbers of an instance's code
-    object_colour_weight: NonNegative = 1.0  # weight of an instance's colours, eq. 6
-    object_opacity_weight: NonNegative = 10.0  # weight of an instance's opacity against its mask, eq. 6
-    outside_weight: Share = 0.05  # weight of pixels outside a mask in that, section 3.3
     guided: bool = True  # samples behind the scene's surface teach an object nothing, section 3.4; off: they do
-    guard_margin: PositiveShare = 0.05  # distance behind that surface from which on they do not, scene units
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
-    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
-    final_learning_rate: LearningRate = 1e-5  # learning rate at the end of the budget, reached exponentially
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of both tables, towards a density of 1
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
+OBJECT_LAYERS, OBJECT_WIDTH = 4, 128  # hidden layers of the object branch's network, and their channels
+OBJECT_COLOUR_WEIGHT = 1.0  # weight of an instance's colours, eq. 6
+OBJECT_OPACITY_WEIGHT = 10.0  # weight of an instance's opacity against its mask, eq. 6
+OUTSIDE_WEIGHT = 0.05  # weight of pixels outside a mask in that, section 3.3
+GUARD_MARGIN = 0.05  # scene units behind a surface, from which on samples teach an object nothing
 CODE_DEVIATION = 1.0  # of codes at first
 OWN_SHARE = 0.5  # of rays that teach the instance they show; the others teach one at random what it does not cover
 COUNT_AFTER = 0.3  # share of the budget from which on surfaces count for boxes
@@ -78,25 +68,19 @@ REGION_DILATION = 2  # cells around, whose soft edge goes along
 class ObjectNeRF(FieldMethod):
     """A scene that can be taken apart by the instances of its photographs' masks."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
     network: HashField | CoordinateField
     branch: ObjectTable | ObjectNetwork
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        space = space_of(frame)
+        b, space = c.backbone, space_of(frame)
         with seeded(c.seed):
-            if c.field == "hash":
-                self.network = HashField(c.table, c.hidden_width, space, frame.reach)
-                self.branch = ObjectTable(c.table, c.hidden_width, space, frame.reach, c.code)
-                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
-            else:
-                shape = c.network, c.hidden_width, space
-                coarse = CoordinateField(*shape, keep_input=True)
-                self.network = CoordinateField(*shape, keep_input=True, coarse=coarse)
-                self.branch = ObjectNetwork(c.network, c.object_layers, c.object_width, space, c.code)
-                self.sampler = HierarchicalSampler(space, c.rays)
+            self.network = b.build(frame, space, network=partial(CoordinateField.twice, keep_input=True))
+            narrow = b if b.hashed else changed(b, depth=OBJECT_LAYERS, hidden_width=OBJECT_WIDTH)
+            self.branch = narrow.build(frame, space, ObjectTable, ObjectNetwork, latent=c.code)
+        self.sampler = b.sampler(frame, space) if b.hashed else HierarchicalSampler(space, c.rays)
         self.codes = InstanceCodes(c.instances, c.code)
         self.boxes = InstanceBoxes(c.instances, frame.bounds)
         self._regions: dict[tuple[int, int], Tensor] = {}
@@ -104,14 +88,12 @@ class ObjectNeRF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Two hash tables with Instant-NGP's numbers."""
-        c = Config(**CPU_HASH, field="hash", hidden_width=32, code=8, huber_delta=0.3)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, hash_weight_decay=0.3)
+        return changed(Config(), **CPU_BACKBONE, code=8, huber_delta=0.3, hash_weight_decay=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """Two tiny tables with tiny networks, within some twenty quick steps."""
-        c = Config(**TINY_HASH, field="hash", hidden_width=16, instances=4, code=4, huber_delta=0.1)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3)
+        return changed(Config(), **TINY_BACKBONE, instances=4, code=4, huber_delta=0.1)
 
     # Learning
 
@@ -154,15 +136,15 @@ class ObjectNeRF(FieldMethod):
         mask = (labels == asked).float()
         look = self.instance_look(rays, asked, generator)
         if c.guided:  # the visible instance itself may lie behind the depth that the scene branch has so far
-            guard = torch.where(mask > 0, torch.inf, seen.depth.detach() + c.guard_margin)
+            guard = torch.where(mask > 0, torch.inf, seen.depth.detach() + GUARD_MARGIN)
             look = kept(look, look.samples.t < guard[look.samples.ray_index])
         own = composite(look.samples, look.density, look.rgb)
-        weight = known * torch.where(mask > 0, 1.0, c.outside_weight)
+        weight = known * torch.where(mask > 0, 1.0, OUTSIDE_WEIGHT)
         colour = (known * mask)[:, None] * (own.rgb - target).square()
         opacity = weight * (own.opacity - mask).square()
         return {
-            "object colour": c.object_colour_weight * colour.mean(),
-            "object opacity": c.object_opacity_weight * opacity.mean(),
+            "object colour": OBJECT_COLOUR_WEIGHT * colour.mean(),
+            "object opacity": OBJECT_OPACITY_WEIGHT * opacity.mean(),
         }
 
     def asked(self, labels: Int[Tensor, " ray"], generator: torch.Generator) -> Int[Tensor, " ray"]:
@@ -180,16 +162,10 @@ class ObjectNeRF(FieldMethod):
         return self.sampler.sample(rays, self.branch, codes, generator)[-1].look(self.branch, codes)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        c = self.config
-        if isinstance(self.network, CoordinateField) or isinstance(self.branch, ObjectNetwork):
-            every = [*self.network.parameters(), *self.branch.parameters(), *self.codes.parameters()]
-            return [torch.optim.Adam(every, c.learning_rate, eps=1e-7), *super().optimizers()]
-        codes = {"params": [*self.codes.parameters()], "scale": CODES_RATE}
-        tables = [
-            *self.network.optimizers_at(c.learning_rate, c.hash_weight_decay),
-            *self.branch.optimizers_at(c.learning_rate, c.hash_weight_decay, groups=[codes]),
-        ]
-        return [*tables, *super().optimizers()]
+        c, codes = self.config, {"params": [*self.codes.parameters()], "scale": CODES_RATE}
+        fields = self.network, self.branch
+        own = c.backbone.optimizers(*fields, groups=[codes], eps=1e-7, weight_decay=c.hash_weight_decay)
+        return [*own, *super().optimizers()]
 
     # Editing
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.coordinate_network import CoordinateNetwork
 from ...components.fields.encodings import FrequencyEncoding
-from ...components.fields.hash_field import HashField, HashNumbers, side_by_side
+from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP, in_chunks
 from ...components.sampling.spaces import Space
 from ...method import Field
@@ -31,13 +31,13 @@ class ObjectNetwork(Field):
 
     deforms, coarse = True, None
 
-    def __init__(self, numbers: NetworkNumbers, layers: int, width: int, space: Space, code: int):
+    def __init__(self, numbers: NetworkNumbers, hidden_width: int, space: Space, latent: int):
         super().__init__()
         self.space = space
         self.encode_position = FrequencyEncoding(3, numbers.position_frequencies, True)
         self.encode_direction = FrequencyEncoding(3, numbers.direction_frequencies, True)
-        sizes = layers, width, max(1, layers // 2), not numbers.bfloat16
-        self.network = CoordinateNetwork(self.encode_position.width + code, self.encode_direction.width, *sizes)
+        sizes = numbers.depth, hidden_width, max(1, numbers.depth // 2), not numbers.bfloat16
+        self.network = CoordinateNetwork(self.encode_position.width + latent, self.encode_direction.width, *sizes)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
         assert code is not None
@@ -61,10 +61,10 @@ class ObjectTable(HashField):
 
     deforms = True
 
-    def __init__(self, numbers: HashNumbers, hidden_width: int, space: Space, reach: float, code: int):
+    def __init__(self, numbers: HashNumbers, hidden_width: int, space: Space, reach: float, latent: int):
         super().__init__(numbers, hidden_width, space, reach)
-        layers = [hidden_width] * numbers.density_layers
-        self.density_network = MLP(numbers.width + code, *layers, numbers.geometry_features)
+        layers = [hidden_width] * DENSITY_LAYERS
+        self.density_network = MLP(numbers.width + latent, *layers, numbers.geometry_features)
 
     def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
         assert code is not None

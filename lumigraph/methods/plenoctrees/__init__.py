@@ -37,6 +37,7 @@ from ...files.ranges import (
     Share,
     Width,
     between,
+    changed,
 )
 from ...method import Field, FieldMethod, Sampler, seeded
 from ...method.capabilities import HasField, HasLooks, can
@@ -44,8 +45,6 @@ from ...volume import composite, weights_of
 from .baking import Baking, averaged_harmonics, bake, fill, met
 from .harmonic_field import HarmonicHash, HarmonicNetwork, HarmonicTeacher
 from .leaves import LeafSampler, Leaves, ask_for_octree
-
-DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,6 @@ class Config:
     occupancy: OccupancyNumbers = OccupancyNumbers(transmittance_threshold=0.01)  # of all stages; section 4.2
     field: Literal["hash", "network"] = "network"  # first field: the paper's network, or a faster hash table
     depth: Depth = 8  # hidden layers of the network, as in NeRF; more hold more detail, and cost time
-    skip_layer: Layers = 5  # layer of the network whose activation the input is concatenated to again
     position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
     hidden_width: Width = 256  # channels of a hidden layer, of either field; wider costs memory and time
     hidden_layers: Layers = 2  # hidden layers after the hash table; more cost time
@@ -73,13 +71,12 @@ class Config:
     leaf_points: Annotated[int, between(1, 4096)] = 256  # points of a leaf that are averaged, section 4.1
     weight_threshold: PositiveShare = 1e-3  # least weight of a leaf on some ray, section 4.1; higher drops more leaves
     rays_per_step: BatchSize = 4096  # rays in a step of the last stage; more reduce noise, and cost time
-    density_learning_rate: DensityRate = 10.0  # rate of the leaves' density at first, per scene unit
-    final_density_learning_rate: DensityRate = 1.0  # rate of the leaves' density at the end
-    harmonics_learning_rate: LearningRate = 0.02  # rate of the leaves' harmonics at first
-    final_harmonics_learning_rate: LearningRate = 0.002  # rate of the leaves' harmonics at the end
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
+SKIP_LAYER = 5  # layer of the network whose activation the input is concatenated to again
+DENSITY_LEARNING_RATE, FINAL_DENSITY_LEARNING_RATE = 10.0, 1.0  # of the leaves, per scene unit
+HARMONICS_LEARNING_RATE, FINAL_HARMONICS_LEARNING_RATE = 0.02, 0.002  # of the leaves
 ROWS_PER_CELL = 16  # leaves of most scenes, for each cell of one face of the cube
 
 
@@ -108,7 +105,7 @@ class PlenOctrees(FieldMethod):
             if c.field == "hash":
                 self.teacher = HarmonicHash(c.table, c.hidden_layers, c.hidden_width, c.sh_bands)
             else:
-                layers = c.depth, c.hidden_width, c.skip_layer
+                layers = c.depth, c.hidden_width, SKIP_LAYER
                 self.teacher = HarmonicNetwork(c.position_frequencies, *layers, c.sh_bands)
         space, steps = Box(frame.bounds, frame.near), StepNumbers(c.steps_per_diagonal)
         self.teacher_sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps)
@@ -122,10 +119,11 @@ class PlenOctrees(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table, three bands, and a shallower octree."""
-        occupancy = OccupancyNumbers(1 << 15, transmittance_threshold=0.01, occupancy_threshold=0.15)
-        c = Config(CPU_LEVELS, occupancy, field="hash", hidden_width=32, sh_bands=3, steps_per_diagonal=384)
-        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, sparsity_points=1024)
-        return replace(c, teacher_share=0.5, octree_depth=8, leaf_points=8)
+        return changed(
+            Config(CPU_LEVELS), samples_per_step=1 << 15, occupancy_threshold=0.15, field="hash", hidden_width=32,
+            sh_bands=3, steps_per_diagonal=384, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3,
+            sparsity_points=1024, teacher_share=0.5, octree_depth=8, leaf_points=8,
+        )  # fmt: skip
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
@@ -135,10 +133,11 @@ class PlenOctrees(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
-        occupancy = OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16)
-        c = Config(TINY_LEVELS, occupancy, field="hash", hidden_width=16, hidden_layers=1, sh_bands=2)
-        c = replace(c, steps_per_diagonal=128, learning_rate=2e-2, final_learning_rate=1e-2, sparsity_points=64)
-        return replace(c, teacher_share=0.5, octree_depth=4, leaf_points=2, rays_per_step=128)
+        return changed(
+            Config(TINY_LEVELS), samples_per_step=2048, occupancy_resolution=16, field="hash", hidden_width=16,
+            hidden_layers=1, sh_bands=2, steps_per_diagonal=128, learning_rate=2e-2, final_learning_rate=1e-2,
+            sparsity_points=64, teacher_share=0.5, octree_depth=4, leaf_points=2, rays_per_step=128,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -308,10 +307,9 @@ class PlenOctrees(FieldMethod):
         return {"": held(c.learning_rate, c.final_learning_rate, step, over, c.decay_start), **rates}
 
     def _rates(self, progress: float) -> dict[str, float]:
-        c = self.config
         return {
-            "density": falling(c.density_learning_rate, c.final_density_learning_rate, progress),
-            "harmonics": falling(c.harmonics_learning_rate, c.final_harmonics_learning_rate, progress),
+            "density": falling(DENSITY_LEARNING_RATE, FINAL_DENSITY_LEARNING_RATE, progress),
+            "harmonics": falling(HARMONICS_LEARNING_RATE, FINAL_HARMONICS_LEARNING_RATE, progress),
         }
 
     def before_step(self, step: int, progress: float) -> None:

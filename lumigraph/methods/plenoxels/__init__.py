@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -50,11 +50,10 @@ class Config:
         samples_per_step=1 << 20,
         occupancy_resolution=256,
         occupancy_threshold=1e-2,
-        occupancy_interval=64,
-        occupancy_decay=0.9,
     )
     proposals: ProposalNumbers = ProposalNumbers()
     measured: DepthNumbers = DepthNumbers()
+    occupancy_interval: Steps = 64  # steps between updates of the occupancy grid, of all its cells; more are faster
     base_resolution: Resolution = 256  # voxels per axis at first, section 3.3; more cost time early
     max_resolution: Resolution = 512  # voxels per axis in the end, by doublings; more give detail, cost memory
     open_base_resolution: Resolution = 128  # voxels per axis at first where there is no bound, the release's
@@ -92,7 +91,10 @@ class Config:
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
 WEIGHT_DECAY = 0.9  # of a voxel's remembered weight, from one update of the occupancy grid to the next
-SCHEDULE = GridSchedule(begins=1e-9, early_steps=0, probes=1.0)  # the whole grid, but not in the first step
+OCCUPANCY_DECAY = 0.9  # share of a cell's density kept at each update of the occupancy grid
+SCHEDULE = GridSchedule(
+    begins=1e-9, early_steps=0, probes=1.0, decay=OCCUPANCY_DECAY
+)  # the whole grid, but not in the first step
 NOTE_INTERVAL = 4  # steps between those whose samples' weights are remembered for pruning
 MIN_DENSITY = 1e-2  # density of a node at least, where another method is taken over: what is not above 0 learns nothing
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
@@ -154,8 +156,9 @@ class Plenoxels(FieldMethod):
         super().__init__(frame, c)
         space = space_of(frame)
         self.network = HarmonicField(c, frame, space)
+        schedule = replace(SCHEDULE, interval=c.occupancy_interval)
         self.sampler = sampler_for(
-            frame, space, c.occupancy, c.proposals, SCHEDULE, max_rays=c.rays_per_step, adapts=False
+            frame, space, c.occupancy, c.proposals, schedule, max_rays=c.rays_per_step, adapts=False
         )
         learns_gains = c.exposure_correction != "no"
         self.exposure = Exposure(frame.image_count, c.exposure_correction, "harmonics") if learns_gains else None
@@ -291,7 +294,7 @@ class Plenoxels(FieldMethod):
             if isinstance(sampler, OccupancySampler):
                 sampler.grid.density.zero_()
                 sampler.stale = True
-        if step % c.occupancy.occupancy_interval == 0:
+        if step % c.occupancy_interval == 0:
             self.voxels.weights *= WEIGHT_DECAY
         super().before_step(step, progress)
 

@@ -35,7 +35,7 @@ from ...components.training.regularizers import (
 )
 from ...components.training.schedules import BandSchedule, falling, held, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
+from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between, changed
 from ...method import FieldMethod, seeded
 from ...volume import composite
 from .patch_flow import SIDE, PatchFlow, backdrops
@@ -65,21 +65,18 @@ class Config:
     occlusion_range: Share = 0.1  # share of each ray that counts as right before its camera
     random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
     annealing: Share = 512 / 69_768  # share of the budget in which samples spread along rays, eq. 10
-    annealing_start: PositiveShare = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
-    forward_annealing_start: PositiveShare = 1e-4  # the same of forward-facing captures, from the far plane on
-    seed: Seed = 0  # seed of all random numbers; another seed gives another run
+    forward_annealing_start: PositiveShare = 1e-4  # share of forward-facing rays, from the far plane on, at first
+    seed: Seed = 0
     # Of the network.
     hidden_width: Width = 256  # channels of a layer
     density_noise: NonNegative = 1.0  # deviation of noise on raw density in training; 0: none
     gradient_clip: NonNegative = 0.1  # largest gradient of a weight, and largest norm of all; 0: no limit
-    resample_padding: NonNegative = 0.01  # weight that every frustum has at least
     coarse_loss_weight: NonNegative = 0.1  # 0: the coarse pass only guides the fine one
     learning_rate: LearningRate = 2e-3  # learning rate of the network at first; higher: faster, may diverge
     final_learning_rate: LearningRate = 2e-5  # learning rate of the network at the end of the budget
     warmup: Share = 512 / 69_768  # share of the budget in which the learning rate grows
     # Of the hash table and its networks.
     table_learning_rate: LearningRate = 1e-2  # learning rate of the hash table and its networks at first
-    final_table_learning_rate: LearningRate = 1e-3  # learning rate of the hash table and its networks at the end
     table_coarse_to_fine: Share = 0.0  # share of the budget in which finer levels of the table are added; 0: at once
     table_width: Width = 64  # neurons of a hidden layer behind the hash table; wider costs time
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # of the hash table: samples in a step
@@ -103,6 +100,8 @@ class Config:
         return ProposalNumbers(sweep_weight=self.sweep_weight)
 
 
+ANNEALING_START = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
+FINAL_TABLE_LEARNING_RATE = 1e-3  # learning rate of the hash table and its networks at the end
 DECAY_START = 0.3  # share of the budget before the table's learning rate falls
 FLOWING = 0.05  # of a budget of seconds: the share that learning what is likely may take
 MIN_TABLE_VIEWS = 6  # photographs of an object from which a table is ahead of the network (docs/methods/regnerf.md)
@@ -144,9 +143,7 @@ class RegNeRF(FieldMethod):
             self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         else:
             self.network = FrustumField(c.network, c.hidden_width, space, joining=joining, noise=c.density_noise)
-            self.sampler = ConeSampler(
-                space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding
-            )
+            self.sampler = ConeSampler(space, c.rays, c.mask, c.coarse_loss_weight > 0)
             self.sampler.sampled_from = 1.0 if isinstance(space, NDC) else 0.5
         with seeded(c.seed):
             self.flow = PatchFlow() if c.likelihood_weight else None
@@ -155,19 +152,20 @@ class RegNeRF(FieldMethod):
     def cpu_preset(cls) -> Any:
         """A hash table, for after a laptop's minutes a network is still a blur; a smaller network for objects of few
         photographs. Fewer patches, and a larger share of the budget for what the paper does in its first steps."""
-        network = NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16)
-        c = Config(**CPU_NETWORK, network=network, unseen_patches=8, annealing=0.25, depth_settling=0.25)
-        c = replace(c, depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5)
-        c = replace(c, density_noise=0.0, gradient_clip=0.0, coarse_to_fine=0.9)
-        c = replace(c, field="auto", table=CPU_HASH["table"], steps=CPU_HASH["steps"], table_width=32)
-        c = replace(c, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15)
-        return replace(c, table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
+        return changed(
+            Config(**CPU_NETWORK), depth=6, skip_layer=3, unseen_patches=8, annealing=0.25, depth_settling=0.25,
+            depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5, density_noise=0.0,
+            gradient_clip=0.0, coarse_to_fine=0.9, field="auto", table=CPU_HASH["table"], steps=CPU_HASH["steps"],
+            table_width=32, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15,
+            table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny networks and two patches: every part, within some twenty quick steps."""
-        network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6)
-        return Config(**TINY_NETWORK, network=network, unseen_patches=2, flow_steps=8)
+        return changed(
+            Config(**TINY_NETWORK), depth=3, skip_layer=2, position_frequencies=6, unseen_patches=2, flow_steps=8
+        )
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -262,14 +260,14 @@ class RegNeRF(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
         if self.by_table:
-            return held(c.table_learning_rate, c.final_table_learning_rate, step, progress, DECAY_START)
+            return held(c.table_learning_rate, FINAL_TABLE_LEARNING_RATE, step, progress, DECAY_START)
         return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
         c = self.config
         grown = progress / c.annealing if progress < c.annealing else 1.0
-        forward = isinstance(self.network.space, NDC)
-        self.sampler.sampled_share = max(grown, c.forward_annealing_start if forward else c.annealing_start)
+        first: Any = c.forward_annealing_start if isinstance(self.network.space, NDC) else ANNEALING_START
+        self.sampler.sampled_share = max(grown, first)
         super().before_step(step, progress)
 
 

@@ -17,7 +17,7 @@ from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.teacher import teacher_of
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ...components.sampling.occupancy_sampler import OCCUPANCY_INTERVAL, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
 from ...components.training.photometric import backdrop, huber, residuals
@@ -38,6 +38,7 @@ from ...files.ranges import (
     Share,
     Width,
     between,
+    changed,
 )
 from ...geometry import unit
 from ...kernels.block_march import ALPHA, CHANNELS
@@ -77,7 +78,6 @@ class Config:
     hidden_layers: Layers = 8  # hidden layers of the field's network; more cost time
     hidden_width: Width = 512  # channels of the field's hidden layers, the release's; wider costs memory and time
     # Of the paper's network.
-    skip_layer: Layers = 5  # layer whose activation the input is concatenated to again
     position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
@@ -87,6 +87,7 @@ class Config:
 FIELD, VOXELS, ATLAS = 0, 1, 2  # stages
 TAUGHT_VOXEL_SHARE = 0.7  # least share of the rest of the budget in which voxels of a teacher learn: they have no
 # features yet
+SKIP_LAYER = 5  # layer of the network whose activation the input is concatenated to again
 VOXELS_PER_PIXEL = 2  # voxels along the grid, for each pixel of a photograph's longer side, at most
 SLAB_VOXELS = 1 << 22  # voxels of a slab that is baked together
 POINTS_PER_CHUNK = 1 << 18  # points at which a field is evaluated together
@@ -136,14 +137,14 @@ class SNeRG(FieldMethod):
             if c.field == "hash":
                 self.network = HashDeferred(c.table, c.hidden_layers, c.hidden_width, space, frame.reach)
             else:
-                layers = c.hidden_layers, c.hidden_width, c.skip_layer
+                layers = c.hidden_layers, c.hidden_width, SKIP_LAYER
                 self.network = NetworkDeferred(c.position_frequencies, *layers, space)
             self.view = ViewDependence(c.view_width)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         contracted = contraction_of(frame) if c.whole and frame.is_open else None
         self.voxel_space = contracted or Box(frame.bounds, frame.near)
         cells = c.visibility_resolution * (2 if contracted else 1)
-        self.visibility = VisibilityGrid(cells, c.occupancy.occupancy_interval)
+        self.visibility = VisibilityGrid(cells, OCCUPANCY_INTERVAL)
         self.voxels, self.tuned = BakedVoxels(c.block_size - 2, contracted), VoxelParameters()
         self.register_buffer("stage", torch.tensor(FIELD))
         self.register_buffer("began", torch.tensor(-1.0))
@@ -155,10 +156,12 @@ class SNeRG(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table, fewer voxels in smaller blocks, and voxels that learn on after baking."""
-        c = Config(**CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32)
-        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3)
-        c = replace(c, deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128)
-        return replace(c, rays_per_step=4096, hash_weight_decay=0.3, huber_delta=0.3, sparsity_weight=1e-4)
+        return Config(
+            **CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32,
+            learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3,
+            deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128, rays_per_step=4096,
+            hash_weight_decay=0.3, huber_delta=0.3, sparsity_weight=1e-4,
+        )  # fmt: skip
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
@@ -168,12 +171,12 @@ class SNeRG(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table, a grid of three sizes and a few thousand voxels, in all stages within some twenty steps."""
-        occupancy = OccupancyNumbers(2048, transmittance_threshold=1e-3, occupancy_resolution=16)
-        table = TINY_HASH | {"table": TINY_LEVELS, "occupancy": occupancy}
-        c = Config(**table, field="hash", hidden_layers=1, hidden_width=16, rays_per_step=512)
-        c = replace(c, learning_rate=2e-2, final_learning_rate=2e-3, view_learning_rate=5e-3, visibility_resolution=16)
-        c = replace(c, huber_delta=0.1, sparsity_weight=1e-4)
-        return replace(c, deferred_share=0.6, voxel_share=0.6, resolution=32, block_size=8)
+        return changed(
+            Config(**TINY_HASH | {"table": TINY_LEVELS}), transmittance_threshold=1e-3, field="hash", hidden_layers=1,
+            hidden_width=16, rays_per_step=512, learning_rate=2e-2, final_learning_rate=2e-3, view_learning_rate=5e-3,
+            visibility_resolution=16, deferred_share=0.6, voxel_share=0.6, resolution=32, block_size=8,
+            huber_delta=0.1, sparsity_weight=1e-4,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

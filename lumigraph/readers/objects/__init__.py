@@ -1,4 +1,4 @@
-"""Masks of an object before a backdrop, found from the photographs of a capture themselves."""
+"""Masks of an object against its background, from the photographs of a capture alone."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ class Masked:
 
 
 def mask_object(folder: Path, capture: Capture) -> Masked:
-    """Find the object in the middle of a scene's photographs, and write its mask for each.
+    """Find the central object in a scene's photographs, and write its masks.
 
-    folder:  of the scene; gets object_masks/ with image.jpg.png for image.jpg, and object.png to judge them by
-    capture: what a reader found there
-    Raises LumigraphError where masks lie there already, and where no object stands out.
+    folder:  of the scene; gets object_masks/ with image.jpg.png for image.jpg, and a contact sheet object.png
+    capture: from the folder's reader
+    Raises LumigraphError where masks exist already, and if no object can be separated.
     """
     if (folder / OBJECT_MASKS).exists():
         raise LumigraphError(f"{folder / OBJECT_MASKS} is there already; delete it, and masks will be made anew")
@@ -76,7 +76,7 @@ def mask_object(folder: Path, capture: Capture) -> Masked:
 def refined(
     found: Segmentation, index: int, rgb: Float[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "height width"]:
-    """The outline at a photograph's size, drawn to its edges; in [0, 1]."""
+    """The mask at a photograph's size, refined to its edges; in [0, 1]."""
     height, width = rgb.shape[:2]
     small = Image.fromarray(found.inside[index][found.views[index].patches])
     rough = np.asarray(small.convert("L").resize((width, height), Image.Resampling.BILINEAR)) / 255
@@ -109,10 +109,10 @@ def sheet_of(scene: Scene, tiles: dict[int, Image.Image]) -> Image.Image:
 def guided(
     guide: Float[np.ndarray, "height width"], rough: Float[np.ndarray, "height width"], radius: int, noise: float = 1e-3
 ) -> Float[np.ndarray, "height width"]:
-    """A rough outline with its photograph's edges, by the guided filter (He, Sun and Tang 2010): a guide + b, whose
-    a and b fit `rough` best in the windows around each pixel (eq. 5 to 8).
+    """Guided filter (He, Sun and Tang 2010): a rough mask with the guide's edges, a guide + b, with a and b fitted to
+    `rough` in the windows around each pixel (eq. 5 to 8).
 
-    noise: variance of the guide that counts as none
+    noise: variance of the guide below which it is flat
     """
 
     def mean(x: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:

@@ -1,9 +1,9 @@
 """Segmentation of an object in all its photographs at once, by its colours and as the silhouette of one solid body.
 
-After Campbell, Vogiatzis, Hernández and Cipolla 2010 ("Automatic object segmentation from calibrated images"): cameras
-that fixate on an object determine its place; colours are learnt from there and from around; each photograph is cut;
-the cuts carve cells of space; colours are learnt from what is left of these next. Here cuts go through
-superpixels, and a table that sparse points show bounds the object from below.
+After Campbell, Vogiatzis, Hernández and Cipolla 2010 ("Automatic object segmentation from calibrated images"): the
+region that all cameras fixate is the first estimate. Then colour models are learnt, photographs are cut, and the cuts
+carve cells of space, repeatedly. Here cuts go through superpixels, and a table plane fitted to sparse points bounds the
+object from below.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Mixture:
 
     @staticmethod
     def of(colours: Float[np.ndarray, "pixel 3"]) -> Mixture:
-        """The mixture that k-means finds in some colours."""
+        """Fit a mixture to colours by k-means."""
         chance = np.random.default_rng(0)
         some = colours[chance.permutation(len(colours))[:MAX_SAMPLES]].astype(np.float64)
         count = int(np.clip(len(some) // MIN_PIXELS, 1, COMPONENTS))
@@ -78,10 +78,10 @@ class Segmentation:
     """Result of a segmentation.
 
     views:    the photographs, small
-    inside:   which superpixels of each belong to the object
+    inside:   superpixels of each that belong to the object
     body:     cells of space that the object fills
-    overlaps: intersection over union of each cut and the body as it is seen there
-    distinct: share of superpixels whose colour alone says on which side they are; 0.5 is as good as chance
+    overlaps: intersection over union of each cut and the body's silhouette
+    distinct: accuracy of classifying superpixels by colour alone; 0.5 is chance
     """
 
     views: list[ObjectView]
@@ -93,15 +93,15 @@ class Segmentation:
 
     @property
     def doubtful(self) -> list[str]:
-        """Names of photographs whose outline does not agree with the others'."""
+        """Names of photographs whose cut disagrees with the others'."""
         return [view.name for view, overlap in zip(self.views, self.overlaps, strict=True) if overlap < MIN_OVERLAP]
 
 
 def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None) -> Segmentation:
-    """Cut the object that the views look at out of all of them.
+    """Segment the object in all views.
 
     points: sparse points, in the scene's frame
-    Raises LumigraphError where no body agrees with the cuts.
+    Raises LumigraphError if no body agrees with the cuts.
     """
     region = find_region(views, points)
     if len(region.cells) < MIN_CELLS:
@@ -127,14 +127,14 @@ def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None
 
 
 def distinctness(views: Sequence[ObjectView], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
-    """The share of superpixels that colour alone puts on their side, the object's and the others counted alike."""
+    """Balanced accuracy of classifying superpixels by colour alone."""
     likely = [own.log_likelihood(view.colours) > around.log_likelihood(view.colours) for view in views]
     told, true = np.concatenate(likely), np.concatenate(list(inside))
     return 0.5 * float(told[true].mean() + (~told[~true]).mean())
 
 
 def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Float[Tensor, "cell 3"]:
-    """The cells near sparse points inside the region; those in the middle of it where there are none."""
+    """Cells near sparse points inside the region; those near its centre without points."""
     if points is not None:
         some = points[region.holds(points)]
         if len(some) >= MIN_CELLS:
@@ -147,7 +147,7 @@ def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Floa
 
 
 def learn_colours(views: Sequence[ObjectView], inside: Sequence[Patches]) -> tuple[Mixture, Mixture]:
-    """The colours of the object, and of what is around it: all that is not inside."""
+    """Colour models of the object and of the background."""
     own = np.concatenate([view.colours[i] for view, i in zip(views, inside, strict=True)])
     around = np.concatenate([view.colours[~i] for view, i in zip(views, inside, strict=True)])
     if min(len(own), len(around)) < MIN_CELLS:
@@ -156,15 +156,15 @@ def learn_colours(views: Sequence[ObjectView], inside: Sequence[Patches]) -> tup
 
 
 def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
-    """Some colours as they are in the object's own shadow, which is seen nowhere else; none of a plain backdrop, which
-    is no surface that shadows fall on. Of CIELAB all three numbers shrink together when light does."""
+    """Colours darkened as in the object's own shadow, which occurs nowhere else; none for a plain backdrop, which
+    receives no shadow. All three CIELAB numbers shrink together with light."""
     away = np.linalg.norm(colours - np.median(colours, 0), axis=-1)
     some = colours[:: round(1 / SHADOW_SHARE)] if np.quantile(away, PLAIN_SHARE) > PLAIN_DISTANCE else colours[:0]
     return some * np.random.default_rng(0).uniform(SHADOW_BRIGHTNESS, 1, (len(some), 1))
 
 
 def behind(region: Region, view: ObjectView) -> Int[np.ndarray, " cell"]:
-    """The superpixel that shows each cell; -1 for those outside the picture."""
+    """Superpixel at each cell's projection; -1 outside the picture."""
     places, pictured = view.at(region.cells)
     return np.where(pictured, view.patches[tuple(places.T)], -1).astype(np.int32)
 
@@ -172,9 +172,9 @@ def behind(region: Region, view: ObjectView) -> Int[np.ndarray, " cell"]:
 def carved(
     region: Region, shown: Sequence[np.ndarray], inside: Sequence[Patches], slack: float
 ) -> Float[Tensor, "cell 3"]:
-    """The cells that all but a share of the pictures that hold them show inside the object; the largest piece.
+    """Cells inside the object in all but a share of the pictures that contain them; the largest connected piece.
 
-    shown: by picture, the superpixel that shows each cell, see `behind`
+    shown: by picture, the superpixel of each cell, see `behind`
     """
     past, seen = np.zeros(len(region.cells)), np.zeros(len(region.cells))
     for patch, own in zip(shown, inside, strict=True):
@@ -199,12 +199,11 @@ def overlap(view: ObjectView, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray,
 
 
 def cut(view: ObjectView, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
-    """Mask of the superpixels that belong to the object: the outline of least cost, a minimum cut through a picture's
-    superpixels (Boykov and Jolly 2001).
+    """Mask of the superpixels of the object by a minimum cut (Boykov and Jolly 2001).
 
-    costs: of taking each into it, in logarithms of likelihood; negative ones speak for it. They count by the width of a
-           superpixel rather than its area, for the pixels of one are no independent witnesses
-    An outline costs less where colours change: exp(-|a - b|^2 / 2 mean) to a pixel of its length.
+    costs: of assigning each to the object, negative log likelihood ratios, weighted by the width of a superpixel rather
+           than its area, since its pixels are not independent
+    Boundary terms are exp(-|a - b|^2 / 2 mean) per pixel of length, less where colours change.
     """
     count = len(costs)
     weighed = np.clip(costs, -MAX_COST, MAX_COST) * np.sqrt(view.sizes)

@@ -1,4 +1,4 @@
-"""Input of segmentation: small photographs in superpixels, and the region of space that an object may fill."""
+"""Input of segmentation: small photographs in superpixels, and the region of space for an object."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ RANSAC_TRIALS = 500  # of three points each (RANSAC, Fischler and Bolles 1981)
 
 @dataclass
 class ObjectView:
-    """A small photograph.
+    """A small photograph in superpixels.
 
     lab:     colours in CIELAB
-    patches: the number of each pixel's superpixel
+    patches: superpixel number of each pixel
     colours: mean colour of each superpixel
-    edges:   pairs of superpixels that touch
+    edges:   pairs of adjacent superpixels
     lengths: of each pair's common border, in pixels
     """
 
@@ -81,7 +81,7 @@ class ObjectView:
     def at(
         self, points: Float[torch.Tensor, "point 3"]
     ) -> tuple[Int[np.ndarray, "point 2"], Bool[np.ndarray, " point"]]:
-        """The (row, column) at which points are seen, clamped to the picture, and whether they are in it."""
+        """(row, column) of points, clamped to the picture, and a mask of those inside."""
         places, inside = self.camera.locate(points)
         return places.numpy(), inside.numpy()
 
@@ -116,11 +116,11 @@ class TablePlane:
 
 @dataclass(frozen=True)
 class Region:
-    """Cells that the object may fill.
+    """Candidate cells of the object.
 
-    cells: their middles
+    cells: their centres
     size:  their side
-    table: what it stands on, where points tell
+    table: supporting plane, if found in the points
     """
 
     cells: Float[Tensor, "cell 3"]
@@ -140,7 +140,7 @@ class Region:
 
 
 def find_region(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None) -> Region:
-    """The cells of [-1, 1]^3 that most pictures hold and that are above the table, if sparse points show one."""
+    """Cells of [-1, 1]^3 visible in most pictures and above the table, if sparse points show one."""
     size = 2 / GRID_SIDE
     axis = torch.linspace(-1 + 0.5 * size, 1 - 0.5 * size, GRID_SIDE)
     cells = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
@@ -153,7 +153,7 @@ def find_region(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | 
 
 
 def find_table(points: Float[Tensor, "point 3"]) -> TablePlane | None:
-    """The level plane that most points nearby lie on and hardly any below; None where there is none."""
+    """Horizontal plane with most nearby points on it and hardly any below; None without one."""
     near = points[points.abs().amax(-1) < 1.5].double()
     if len(near) < 50:
         return None

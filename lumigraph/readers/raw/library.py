@@ -1,4 +1,4 @@
-"""Cameras' own raw files (DNG, NEF, CR2, ARW ...), which LibRaw reads, by way of rawpy."""
+"""Raw files of cameras (DNG, NEF, CR2, ARW ...), read by LibRaw through rawpy."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ _silenced, _stderr = 0, -1  # threads that are silent, and where the others' wor
 
 
 def open_file(path: Path) -> RawPhoto:
-    """A camera's raw file, of which only what is said of the pixels is read. Raises LumigraphError where rawpy is not
-    installed, for a camera that LibRaw does not know, a file cut short, and filters that are not Bayer's."""
+    """Open a camera's raw file and read its metadata. Raises LumigraphError if rawpy is not installed, for unsupported
+    cameras, truncated files, and filters other than Bayer's."""
     with opened(path) as raw:
         width, height = raw.sizes.width, raw.sizes.height
         try:
@@ -77,7 +77,7 @@ def colours_of(raw: Any) -> np.ndarray:
 
 
 def bayer(raw: Any, path: Path) -> Pattern:
-    """The filters over each square of four pixels. Raises LumigraphError for any others."""
+    """Bayer pattern of 2 x 2 pixels. Raises LumigraphError for any other."""
     pattern, colours = raw.raw_pattern, raw.color_desc.decode()
     if pattern is None or pattern.shape != (2, 2) or not set(colours) <= set("RGB"):
         raise LumigraphError(
@@ -88,7 +88,7 @@ def bayer(raw: Any, path: Path) -> Pattern:
 
 
 def turned_pattern(pattern: Pattern, size: tuple[int, int], turns: int) -> Pattern:
-    """The pattern of a picture of a size (width, height) after quarter turns to the left."""
+    """Pattern of a picture of a size (width, height) after rotation by `turns` times 90 degrees anticlockwise."""
     few = np.tile(np.array(pattern), (2, 2))[: 2 + size[1] % 2, : 2 + size[0] % 2]  # it ends as the picture does
     (a, b), (c, d) = np.rot90(few, turns)[:2, :2].tolist()
     return (a, b), (c, d)
@@ -96,7 +96,7 @@ def turned_pattern(pattern: Pattern, size: tuple[int, int], turns: int) -> Patte
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Within this block nothing is printed: LibRaw prints of a file cut short what it raises as well."""
+    """Block without output on stderr, where LibRaw prints errors that it also raises."""
     global _silenced, _stderr
     with _PRINTING:
         if not _silenced:
@@ -116,7 +116,7 @@ def silent() -> Iterator[None]:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """A file opened by LibRaw; whatever it raises within the block becomes one sentence."""
+    """A file opened by LibRaw; any exception within the block becomes a LumigraphError of one sentence."""
     try:
         import rawpy
     except ImportError as fault:
@@ -138,8 +138,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def exif_of(path: Path) -> Image.Exif:
-    """EXIF of a raw file, for the picture that is developed from it: empty for those of LibRaw's formats that are not
-    TIFF inside."""
+    """EXIF of a raw file, for the developed picture; empty for formats that are not TIFF inside."""
     told, found = Image.Exif(), Image.Exif()
     with open(path, "rb") as file, contextlib.suppress(Exception):  # Pillow raises anything for odd tags
         if file.read(4) in TIFF_SIGNATURES:

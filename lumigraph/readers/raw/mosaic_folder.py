@@ -1,4 +1,4 @@
-"""A folder of mosaics: 16-bit grey PNG, or bare little-endian numbers (.raw), and what mosaics.json says of them.
+"""Folder of mosaics: 16-bit grey PNG, or raw little-endian numbers (.raw), described by mosaics.json.
 
 {"all": {"pattern": "RGGB", "black": 600, "white": 15520, "gains": [1.95, 1, 1.34], "width": 768, "height": 512},
  "photographs": {"a.raw": {"exposure": 0.1}, "b.raw": {"exposure": 0.025}}}
@@ -31,11 +31,11 @@ class MosaicRecord:
     """Description of one mosaic, or of all in a folder.
 
     pattern:  colours of the filters over the first two pixels of the first row, then of the second
-    black, white: numbers that stand for no light, and for as much as the sensor can tell
-    gains:    of red, green and blue, that make white white
-    exposure: seconds, or light taken in any unit that is the same for all
+    black, white: black level and saturation level
+    gains:    white balance of red, green and blue
+    exposure: seconds, or any linear unit common to all
     colour_matrix: from CIE XYZ to the camera's colours, rows; DNG's ColorMatrix
-    width, height: of bare numbers, pixels
+    width, height: of .raw files, pixels
     """
 
     pattern: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
@@ -50,7 +50,7 @@ class MosaicRecord:
 
 @dataclass(frozen=True)
 class Listing:
-    """mosaics.json. What a photograph says itself counts for more than what is said of all."""
+    """mosaics.json. Entries of a photograph override those of all."""
 
     photographs: dict[Name, MosaicRecord]
     all: MosaicRecord = field(default_factory=MosaicRecord)
@@ -68,7 +68,7 @@ def listed(path: Path, date: int) -> Listing:
 
 
 def open_mosaic(path: Path) -> RawPhoto:
-    """A mosaic that mosaics.json beside it lists. Raises LumigraphError, naming both, for what it does not say."""
+    """Open a mosaic listed in mosaics.json. Raises LumigraphError, naming both, for missing fields."""
     listing = path.parent / LISTING_FILE
     found = listed(listing, listing.stat().st_mtime_ns)
     own, common = found.photographs[path.name], found.all
@@ -92,7 +92,7 @@ def open_mosaic(path: Path) -> RawPhoto:
 
 
 def needed(about: MosaicRecord, name: str, path: Path):
-    """Fields that a mosaic's description must have."""
+    """Required fields of a mosaic's description."""
     value = getattr(about, name)
     if value is None:
         raise LumigraphError(
@@ -102,7 +102,7 @@ def needed(about: MosaicRecord, name: str, path: Path):
 
 
 def size_of(path: Path, about: MosaicRecord) -> tuple[int, int]:
-    """Width and height, which the file must hold."""
+    """Width and height, checked against the file's size."""
     if path.suffix.lower() != MOSAIC_SUFFIX:
         with readable(path):
             kind = kind_of(path)

@@ -1,4 +1,4 @@
-"""One raw photograph, its pixels not read yet, and its development: white balance, demosaicing, sRGB."""
+"""One raw photograph, and its development: white balance, demosaicing, sRGB."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CORNERS_FILTER = np.array([[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3]
 
 
 def demosaiced(light: Float[np.ndarray, "height width"], pattern: Pattern) -> Float[np.ndarray, "height width 3"]:
-    """Red, green and blue of every pixel (Malvar, He and Cutler 2004); what was measured stays as it is.
+    """Demosaic to red, green and blue of every pixel (Malvar, He and Cutler 2004); measured values stay unchanged.
 
     light: white-balanced, so that grey has the same value behind each filter
     """
@@ -55,15 +55,15 @@ def repeated(pattern: Pattern, size: tuple[int, int]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RawPhoto:
-    """A photograph as its sensor measured it, upright.
+    """A raw photograph, upright.
 
     size:     (width, height) in pixels
-    pattern:  which colour's filter lies over each of four pixels: 0 red, 1 green, 2 blue
-    gains:    of red, green and blue, that make white white as the camera judged it
+    pattern:  colour filter of each of 2 x 2 pixels: 0 red, 1 green, 2 blue
+    gains:    white balance of red, green and blue by the camera
     srgb_from_camera: from white-balanced colours of this camera to linear sRGB
-    exposure: light taken up to one factor, seconds · ISO / 100 / f-number²; None where the file does not say
-    read:     gives the light of every pixel, float32 (height, width): 0 at black level, 1 where the sensor is full.
-              Noise around black goes below 0 and stays, for its mean is 0 only so
+    exposure: up to one factor, seconds · ISO / 100 / f-number²; None if unknown
+    read:     returns the light of every pixel, float32 (height, width): 0 at black level, 1 at saturation. Noise around
+              black is not clipped at 0, so that its mean is 0
     """
 
     path: Path
@@ -80,7 +80,7 @@ class RawPhoto:
         return repeated(self.pattern, self.size)
 
     def linear(self) -> Float[np.ndarray, "height width 3"]:
-        """Linear sRGB of every pixel, 1 where the sensor is full; it may lie beyond [0, 1]."""
+        """Linear sRGB of every pixel, 1 at saturation; it may lie beyond [0, 1]."""
         gains = np.array(self.gains, np.float32)
         balanced = np.minimum(self.read(), 1) * gains[self.filters]
         # Beyond what the least amplified colour can tell, highlights would turn that of the others: they are white.
@@ -95,16 +95,16 @@ class RawPhoto:
         return (srgb_from_linear((self.linear() * brightness).clip(0, 1)) * 255 + 0.5).astype(np.uint8)
 
     def highlight(self) -> float:
-        """The light that a developed picture shows as white: of green, which is nearest to what eyes call bright."""
+        """Green light at which the developed picture saturates to white."""
         green = self.read()[self.filters == GREEN] * self.gains[GREEN]
         return max(float(np.percentile(green, WHITE_PERCENTILE)), 1e-6)
 
 
 def srgb_from_camera(camera_from_xyz: Float[np.ndarray, "3 3"] | None) -> Float[np.ndarray, "3 3"]:
-    """From white-balanced camera colours to linear sRGB, as DNG's specification and dcraw have it: rows of the way
-    there sum to 1, so that white stays white.
+    """From white-balanced camera colours to linear sRGB, as in DNG's specification and dcraw: rows of the inverse sum
+    to 1, so that white stays white.
 
-    camera_from_xyz: the file's colour matrix; None leaves colours as they are
+    camera_from_xyz: the file's colour matrix; None leaves colours unchanged
     """
     if camera_from_xyz is None:
         return np.eye(3)

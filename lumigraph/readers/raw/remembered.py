@@ -1,7 +1,7 @@
-"""Raw files of a scene's photographs, and the layers and facts that they add to the scene.
+"""Raw files of a scene's photographs, and their layers and metadata in the scene.
 
-raw.json in a scene's folder names the files, as `lumigraph capture` writes it. Without it, a folder `raw` beside the
-photographs may hold them, each called as its photograph is (RawNeRF's published captures have it so).
+raw.json in a scene's folder names the files, as `lumigraph capture` writes it. Without it, they may be in a folder
+`raw` beside the photographs, with the photographs' names (as in RawNeRF's published captures).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def open_raw(path: Path) -> RawPhoto:
 
 @dataclass(frozen=True)
 class Developed:
-    """The raw file of a picture, and the factor on its light with which it was developed; None where it is unknown."""
+    """The raw file of a picture, and the brightness factor of its development; None if unknown."""
 
     file: Name
     brightness: Annotated[float, between(1e-9, 1e9)] | None = None
@@ -54,10 +54,10 @@ class Remembered:
 
 
 def with_raw(capture: Capture, folder: Path) -> Capture:
-    """The capture with the raw files of its photographs, if it has some.
+    """The capture with the raw files of its photographs, if any.
 
-    Each gives two layers, `mosaic` and `filter`, and says `exposure`, `white_balance`, `srgb_from_camera` and
-    `brightness`. Raises LumigraphError where a file is gone or has another shape than its picture.
+    Each gives two layers, `mosaic` and `filter`, and the values `exposure`, `white_balance`, `srgb_from_camera` and
+    `brightness`. Raises LumigraphError for a missing file, or one with another shape than its picture.
     """
     known = raw_files(capture, folder)
     if not known:
@@ -105,7 +105,7 @@ def with_its_raw(shot: Shot, developed: Developed) -> Shot:
 
 
 def planes(photo: RawPhoto, identity: str | None = None) -> dict[str, PixelPlane]:
-    """The layers of a raw photograph: what each pixel measured, and behind which filter."""
+    """Layers of a raw photograph: each pixel's measurement, and its colour filter."""
     filters = partial(repeated, photo.pattern, photo.size)
     return {
         "mosaic": PixelPlane(photo.read, "mosaic", dtype=np.dtype(np.float32), identity=identity),

@@ -1,7 +1,7 @@
-"""Bare photographs and videos, whose poses are not known yet."""
+"""Photographs and videos without poses."""
 
+from .film import is_video
 from .gather import gather, is_bare
 from .photo import Intake, Photo
-from .video import is_video
 
 __all__ = ["Intake", "Photo", "gather", "is_bare", "is_video"]

@@ -1,4 +1,4 @@
-"""Copies of photographs that every program reads: developed from raw files, turned upright, or from rare formats."""
+"""Copies of photographs in a common format: developed raw files, rotated upright, or converted from rare formats."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from PIL import Image, ImageOps
+from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry import evenly
-from ...readers.pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, eight_bits
+from ...readers.pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, HEIC_SUFFIXES, srgb_image
+from ...readers.profiles import SRGB_PROFILE
 from ...readers.raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .photo import Track
 
@@ -26,11 +27,11 @@ PNG_DEPTH_OFFSET = 24  # position of the bit depth in a PNG's header
 
 
 def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, Developed | str]:
-    """Pictures of raw files by the files' names: a JPEG NAME.jpg of each in a folder; or why there is none.
+    """Develop raw files: a JPEG NAME.jpg of each in a folder, or the reason for none, by the files' names.
 
-    Where every file says its exposure, all pictures show one light equally bright, however long they were exposed, so
-    that a scene has one colour in all of them. Otherwise each is as bright as it has to be for itself.
-    What lies in the folder of an earlier call is used again if it still fits.
+    If every file has its exposure, all pictures show one light equally bright, independent of exposure times, so that a
+    scene has one colour in all of them. Otherwise the brightness of each is chosen by itself. Files of an earlier call
+    are reused if current.
     """
     opened: dict[str, RawPhoto | str] = {name: open_or_why(path) for name, path in files.items()}
     photos = {name: one for name, one in opened.items() if isinstance(one, RawPhoto)}
@@ -71,7 +72,7 @@ def open_or_why(path: Path) -> RawPhoto | str:
 
 
 def reason(path: Path, fault: LumigraphError) -> str:
-    """Why a file cannot be used, in a few words: what is said beside its name."""
+    """Reason in a few words why a file cannot be used."""
     what, *_ = str(fault).split("; ")
     return f"it {what.removeprefix(f'{path} ')}" if what.startswith(f"{path} ") else what
 
@@ -91,7 +92,7 @@ def brightness_of_all(photos: list[RawPhoto]) -> float | None:
 
 
 def write(photo: RawPhoto, brightness: float, target: Path) -> None:
-    """A developed picture, with what the raw file says of how it was taken, and its date."""
+    """Write a developed picture, with the raw file's EXIF and date."""
     picture = Image.fromarray(photo.developed(brightness))
     exif = exif_of(photo.path)
     with replacing(target, ours=True) as partial:
@@ -115,30 +116,30 @@ def bits(png: Path) -> int:
 
 
 def name_of_copy(name: str, image: Image.Image) -> str:
-    """PNG stays PNG, alpha becomes PNG, the rest JPEG; a name that says otherwise gets the right suffix added."""
+    """Name of a copy: PNG stays PNG, alpha becomes PNG, the rest JPEG; a different suffix is added."""
     suffixes = PNG_SUFFIXES if image.format == "PNG" or image.has_transparency_data else JPEG_SUFFIXES
     return name if name.lower().endswith(suffixes) else name + suffixes[0]
 
 
 def copy_upright(image: Image.Image, source: Path, path: Path) -> None:
-    """An upright copy of an opened image in 8 bits: JPEG, or PNG without loss, by the suffix of `path`.
+    """An upright copy of an opened image in 8 bits and sRGB: JPEG, or PNG without loss, by the suffix of `path`.
 
-    A copy carries its source's date, by which `is_current` recognises it.
-    Raises LumigraphError where the disk refuses, and whatever Pillow raises for a damaged image.
+    A copy has its source's date, by which `is_current` recognises it.
+    Raises LumigraphError for a failed write, and Pillow's errors for a damaged image.
     """
-    upright = eight_bits(ImageOps.exif_transpose(image))
+    upright = srgb_image(image, turn=True)
     with replacing(path, ours=True) as partial:
-        save(upright, partial, path.suffix, image.info.get("icc_profile"))
+        save(upright, partial, path.suffix)
         stat = source.stat()
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-def save(image: Image.Image, path: Path, suffix: str, profile: bytes | None = None) -> None:
-    """Write an image as JPEG or PNG, as a suffix says. profile: of the image's colours (ICC)."""
+def save(image: Image.Image, path: Path, suffix: str) -> None:
+    """Write an image in sRGB as JPEG or PNG, as a suffix says."""
     if suffix.lower() in JPEG_SUFFIXES:
-        image.save(path, "JPEG", icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
+        image.save(path, "JPEG", icc_profile=SRGB_PROFILE, quality=JPEG_QUALITY, subsampling=0)
     else:
-        image.save(path, "PNG", icc_profile=profile)
+        image.save(path, "PNG", icc_profile=SRGB_PROFILE)
 
 
 def is_current(path: Path, source: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Pictures of a folder, of a list of files or of a video, judged before cameras are found for them."""
+"""Pictures of a folder, of a list of files or of a video, with quality checks before reconstruction."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from ...readers.pictures import HEIC_SUFFIXES, NO_HEIC, reads_heic
 from ...readers.raw import Developed, is_raw
 from ...system.memory import threads_for
 from .copies import copy_upright, develop, is_current, is_plain, name_of_copy
+from .film import is_video, tags_of
 from .judge import blurred, duplicates, judge
 from .photo import Intake, Photo, Track, untracked
-from .video import extract, is_video
+from .video import extract
 
 PHOTOGRAPHS = {".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".avif", *HEIC_SUFFIXES}
 MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
@@ -39,10 +40,10 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     """All pictures of a folder, a list of files, or a video.
 
     sources: one folder, one video, or image files
-    work:    a folder for upright copies and a video's frames; what lies there already is used again if it still fits
-    frames:  how many to take of a video; None: by its length
-    track:   shows progress, as display.track does
-    Raises LumigraphError where there is no picture to be had.
+    work:    a folder for upright copies and a video's frames; existing ones are reused if current
+    frames:  number of frames of a video; None: by its length
+    track:   progress display, as display.track
+    Raises LumigraphError without any picture.
     """
     films = [source for source in sources if is_video(source)]
     if films and len(sources) > 1:
@@ -50,7 +51,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
     if films:
         return of_video(films[0], source, work, frames, track)
-    files = named_files(list_photographs(sources, work))
+    files, pairs = without_raw_twins(named_files(list_photographs(sources, work)))
     raw: dict[str, Developed] = {}
     unreadable: dict[str, str] = {}
     if all_raw(files, source):
@@ -66,11 +67,22 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     photos = with_altitudes([one.photo for one in seen])
-    return assess(Intake(source, photos, unreadable=unreadable, raw=raw), seen)
+    return assess(Intake(source, photos, unreadable=unreadable, raw=raw, remarks=pairs), seen)
+
+
+def without_raw_twins(files: Mapping[str, Path]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Files without raw ones beside which the camera's own picture of the same name lies, and a sentence on these."""
+    pictures = {Path(name).with_suffix("") for name, path in files.items() if not is_raw(path)}
+    twins = [name for name, path in files.items() if is_raw(path) and Path(name).with_suffix("") in pictures]
+    if not twins:
+        return dict(files), ()
+    count = counted(len(twins), "photograph")
+    told = f"{count} are raw files with pictures beside them, such as {twins[0]}; the pictures are taken"
+    return {name: path for name, path in files.items() if name not in twins}, (told,)
 
 
 def all_raw(files: Mapping[str, Path], source: str) -> bool:
-    """True if photographs are raw files. Raises LumigraphError if some are and others are not."""
+    """True if photographs are raw files. Raises LumigraphError for a mixture."""
     raw = [name for name, path in files.items() if is_raw(path)]
     if raw and len(raw) < len(files):
         other = next(name for name in files if name not in raw)
@@ -91,12 +103,13 @@ def of_video(path: Path, source: str, work: Path, frames: int | None, track: Tra
         if isinstance(one, str):
             raise LumigraphError(f"{file} is damaged ({one}); delete {file.parent}, and frames will be taken anew")
         seen.append(replace(one, photo=replace(one.photo, device=path.name, time=seconds)))
-    photos = [one.photo for one in seen]
-    return assess(Intake(source, photos, in_order=True), seen)
+    photos, tags = [one.photo for one in seen], tags_of(path)
+    remarks = (tags.fault,) if tags.fault else ()
+    return assess(Intake(source, photos, in_order=True, film=tags, remarks=remarks), seen)
 
 
 def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, Candidate | str]:
-    """Every file as a candidate, or why it is none; several are read at a time."""
+    """Each file as a candidate, or the reason for none; several are read in parallel."""
     with ThreadPoolExecutor(threads_for(LOOKING_BYTES)) as pool:
         found = pool.map(lambda name: take(name, files[name], copies), files)
         try:
@@ -107,7 +120,7 @@ def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, 
 
 
 def assess(intake: Intake, seen: Sequence[Candidate]) -> Intake:
-    """An intake with the blurred and the duplicates named: of two that show the same the sharper, larger one stays."""
+    """An intake with the blurred and the duplicates named: of two equal ones the sharper, larger one is kept."""
     bad = blurred({one.photo.name: one.photo.sharpness for one in seen})
     sizes = {one.photo.name: one.photo.size for one in seen}
 
@@ -127,7 +140,7 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
 
 
 def is_bare(path: Path) -> bool:
-    """True for a video, or a folder with photographs but without poses that a reader recognises."""
+    """True for a video, or a folder of photographs that no reader of poses recognises."""
     from ...readers import READERS  # that package may import this one
 
     if not path.is_dir():
@@ -150,7 +163,7 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 def walk(
     folder: Path, work: Path | None = None, list_entries: Callable[[Path], Iterable[Path]] = Path.iterdir
 ) -> Iterator[Path]:
-    """Photographs below a folder, sorted: no hidden ones, no masks, none that a program reduced or rendered.
+    """Photographs below a folder, sorted, without hidden ones, masks, and programs' reduced or rendered copies.
 
     work: a folder to leave out; list_entries: lists the entries of a folder
     """
@@ -171,7 +184,7 @@ def walk(
 
 
 def named_files(files: list[Path]) -> dict[str, Path]:
-    """Each file by its path below the folder that all are in."""
+    """Files by path relative to their common folder."""
     if not files:
         return {}
     common = Path(os.path.commonpath([file.absolute().parent for file in files]))
@@ -188,8 +201,8 @@ class Candidate:
 
 
 def take(name: str, path: Path, copies: Path) -> Candidate | str:
-    """One photograph, copied where it has to be, and judged; or why it is none. Raises LumigraphError where the disk
-    refuses the copy."""
+    """One photograph, copied if necessary, and judged; or the reason for none. Raises LumigraphError if the copy cannot
+    be written."""
     if path.suffix.lower() not in PHOTOGRAPHS:
         return "its format is not read here; convert it to JPEG"
     heic = path.suffix.lower() in HEIC_SUFFIXES
@@ -216,7 +229,7 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
 
 
 def mask_beside(path: Path) -> Path | None:
-    """The mask of a photograph, in a folder of masks beside it or beside the folder it is in, as far as three above."""
+    """Mask of a photograph, in a folder of masks beside it or beside one of its three parent folders."""
     above = path.absolute().parents[:MASK_LEVELS]
     found = (find_mask(folder / MASKS, path.absolute().relative_to(folder).as_posix()) for folder in above)
     return next((mask for mask in found if mask is not None), None)

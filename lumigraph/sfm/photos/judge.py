@@ -1,7 +1,7 @@
 """Quality of a picture from its pixels: sharp or blurred, bright or dark, new or a duplicate.
 
-All is judged on the luminance at 640 pixels along the longer side, where a picture from a phone has no noise to speak
-of, and blur that can only be seen by enlarging does no harm.
+All is computed on the luminance at 640 pixels along the longer side, where a phone's picture has little noise, and
+slight blur is harmless.
 
 Sharpness compares slopes over a short and over a long distance, in four directions θ:
 
@@ -52,7 +52,7 @@ class Judgement:
 
     sharpness: see above, 1 to 16
     brightness: mean log2 of the linear luminance
-    signature: the detail of a small square version with length 1, or 0 where there is no detail
+    signature: normalised high-pass thumbnail, length 1, or 0 without detail
     """
 
     sharpness: float
@@ -61,10 +61,10 @@ class Judgement:
 
 
 def judge(image: Image.Image) -> Judgement:
-    """The judgement of one picture. A JPEG that is not read yet is decoded at a fraction of its size, which is quick.
+    """Judge one picture. An unread JPEG is decoded at a fraction of its size, which is fast.
 
-    EXIF's orientation is not looked at: only pictures that stand the same way have comparable signatures.
-    Raises whatever Pillow raises for damaged files.
+    EXIF's orientation is ignored: only pictures of one orientation have comparable signatures.
+    Raises Pillow's errors for damaged files.
     """
     image.draft("L", (JUDGED_SIDE, JUDGED_SIDE))
     grey = eight_bits(image).convert("L")
@@ -77,7 +77,7 @@ def judge(image: Image.Image) -> Judgement:
 
 
 def sharpness(luminance: Float[np.ndarray, "height width"]) -> float:
-    """A picture's sharpness, from 1, smooth, to 16, nothing but fine texture. luminance: 0 to 255."""
+    """Sharpness, from 1, smooth, to 16, pure fine texture. luminance: 0 to 255"""
     pairs = zip(slopes(luminance, SHORT_STEP), slopes(luminance, LONG_STEP), strict=True)
     return min((short + ROUNDING_SLOPE) / (long + ROUNDING_SLOPE) for short, long in pairs)
 
@@ -95,7 +95,7 @@ def slopes(y: Float[np.ndarray, "height width"], d: int) -> list[float]:
 
 
 def brightness(luminance: Float[np.ndarray, "height width"]) -> float:
-    """Mean log2 of the linear luminance, the brightest possible being 0; nothing is darker than 1/255 encoded."""
+    """Mean log2 of the linear luminance, 0 for white, clamped below at 1/255 encoded."""
     encoded = np.maximum(luminance, 1) / 255
     return float(np.log2(linear_from_srgb(encoded)).mean())
 
@@ -108,12 +108,11 @@ def signature(grey: Image.Image) -> Float[np.ndarray, " cell"]:
 
 
 def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
-    """Names of pictures that are too blurred to use, and why in a few words.
+    """Names of pictures that are too blurred to use, with the reason in a few words.
 
-    Muddy ones in any case. Otherwise those that are noticeably less sharp than the others, and either soft or unusual
-    as well, unless they are crisp. The others' spread is taken from the median absolute deviation of log s, so that the
-    blurred ones themselves, while they are a minority, do not widen it. Where all are equally sharp none is named;
-    where all are muddy all are.
+    Strongly blurred ones in any case. Otherwise clear outliers among the others that are also either soft or unusual,
+    but not crisp. The spread is the median absolute deviation of log s, so that a minority of blurred ones does not
+    widen it. Where all are equally sharp none is named; where all are strongly blurred all are.
     """
     if not sharpness:
         return {}
@@ -148,7 +147,7 @@ def exposure_jumps(brightness: Sequence[float], in_order: bool) -> dict[int, flo
 def duplicates(
     signatures: Mapping[str, Float[np.ndarray, " cell"]], sizes: Mapping[str, tuple[int, int]]
 ) -> dict[str, str]:
-    """Names of duplicates, exact or nearly, with the name of the earlier picture.
+    """Names of exact or near duplicates, with the name of the earlier picture.
 
     signatures: the one to keep comes first
     Two are the same if their signatures correlate by more than DUPLICATE_CORRELATION and they have one aspect ratio.

@@ -1,8 +1,8 @@
-"""Overlap of photographs before cameras are looked for: details at a small size that two of them share.
+"""Overlap of photographs before reconstruction: number of matched features at a small size.
 
-Details are SIFT features (Lowe 2004) of the photograph at SIDE pixels, the largest COUNT of them. Two photographs share
-a detail if each is the other's nearest in descriptor space, and at RATIO of the distance of the second nearest or less.
-Chance alone gives up to 11 on the bananas of a carpet; neighbours of a walk around them share 20 to 170.
+Features are SIFT (Lowe 2004) of the photograph at SIDE pixels, the largest COUNT of them. Two photographs share a
+feature if each is the other's nearest in descriptor space, and at RATIO of the distance of the second nearest or less.
+Chance alone gives up to 11 on a carpet's repeated pattern; neighbours of a walk around it share 20 to 170.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def extractor() -> Any:
 
 
 def details(image: Image.Image) -> Descriptors:
-    """Descriptors of the largest details. Raises whatever Pillow raises for damaged files."""
+    """Descriptors of the largest features. Raises Pillow's errors for damaged files."""
     image.draft("L", (SIDE, SIDE))
     grey = eight_bits(image).convert("L")
     grey.thumbnail((SIDE, SIDE))
@@ -49,7 +49,7 @@ def details(image: Image.Image) -> Descriptors:
 
 
 def shared(one: Descriptors, other: Descriptors) -> int:
-    """Number of details that two photographs share."""
+    """Number of features that two photographs share."""
     if min(len(one), len(other)) < 2:
         return 0
     similar = unit(one) @ unit(other).T
@@ -63,7 +63,7 @@ def unit(descriptors: Descriptors) -> Float[np.ndarray, "_ 128"]:
 
 
 def nearest(similar: Float[np.ndarray, "a b"]) -> tuple[Int[np.ndarray, " a"], Bool[np.ndarray, " a"]]:
-    """Nearest of b for each of a, and whether it is much nearer than the second. similar: cosines"""
+    """Nearest of b for each of a, and a mask of those that pass the ratio test. similar: cosines"""
     first = similar.argmax(1)
     best = np.take_along_axis(similar, first[:, None], 1)[:, 0]
     second = np.partition(similar, -2, 1)[:, -2]
@@ -71,10 +71,10 @@ def nearest(similar: Float[np.ndarray, "a b"]) -> tuple[Int[np.ndarray, " a"], B
 
 
 def apart(names: Sequence[str], count: Callable[[str, str], int]) -> list[str]:
-    """Names of photographs that share too little with every other one.
+    """Names of photographs with too little overlap with every other one.
 
     names: in the order of the walk: neighbours are compared first, the others only for photographs without a neighbour
-    count: number of details that two photographs share
+    count: number of features that two photographs share
     """
     found = []
     for i, name in enumerate(names):

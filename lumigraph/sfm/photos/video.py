@@ -1,25 +1,21 @@
-"""Selection of frames from a video: sharp, evenly spread over what the camera saw, no two the same.
+"""Selection of frames from a video: sharp, evenly spread over the camera's movement, without duplicates.
 
-The film is read twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
-and how far the picture has moved since the beginning. The film is then cut into as many stretches as frames are wanted,
+The film is read twice. First every frame, or every second or fourth of a fast film, is judged at small size: its
+sharpness, and the accumulated movement of the picture. The film is then cut into as many segments as frames are wanted,
 each with equal movement, so that a resting camera gives few frames and a quick turn many; a share of TIME goes by the
-clock, for movement that is not measured. The sharpest frame of each stretch, rather in its middle, is written the
-second time, unless it shows what a frame before it shows.
+clock, for movement that is not measured. The sharpest frame of each segment, with a preference for its middle, is
+written in the second pass, unless it repeats an earlier one.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import av
 import numpy as np
-from av.container import InputContainer
-from av.video.frame import VideoFrame
 from jaxtyping import Float
 from PIL import Image
 from scipy.fft import irfft2, rfft2
@@ -28,12 +24,10 @@ from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
 from ...files.ranges import Lasted
 from .copies import save
+from .film import Tags, grey, opened, tags_of
 from .judge import DUPLICATE_CORRELATION, JUDGED_SIDE, sharpness, signature
 from .photo import Track, untracked
 
-VIDEOS = {
-    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
-}  # fmt: skip
 FRAMES_PER_SECOND, MIN_FRAMES, MAX_FRAMES = 2.5, 20, 150  # default number of frames
 JUDGED_PER_SECOND = 15.0  # frames per second that are judged, or
 CANDIDATES_PER_FRAME = 4  # for each selected frame, if that is more
@@ -50,32 +44,31 @@ WINDOW_MEAN_SQUARE = (3 / 8) ** 2  # mean square of the window that fades out a 
 
 @dataclass(frozen=True)
 class Index:
-    """frames.json: which film the frames beside it are of, how many were asked for, and when each was seen."""
+    """frames.json: source film of the frames beside it, their requested number, and their times.
+
+    film: description of its pictures, by which they were converted
+    """
 
     video: str = ""
     modified: int = 0
     bytes: int = 0
     asked: int | None = None
+    film: Tags = Tags()
     frames: dict[str, Lasted] = field(default_factory=dict)
 
 
-def is_video(path: Path) -> bool:
-    """True if a file is a video, by its suffix."""
-    return path.suffix.lower() in VIDEOS and path.is_file()
-
-
 def extract(path: Path, folder: Path, frames: int | None = None, track: Track = untracked) -> list[tuple[Path, float]]:
-    """Frames of a video as upright JPEGs in `folder`, in order, and when each was seen, in seconds from the first on.
+    """Frames of a video as upright JPEGs in `folder`, in order, with times in seconds from the first on.
 
-    frames: how many; None: FRAMES_PER_SECOND, from MIN_FRAMES to MAX_FRAMES. There are fewer where the film is shorter
-            or shows the same again
-    The folder is used as it is if it was made of the same file and with the same options; else it is replaced.
-    Raises LumigraphError where the film cannot be read or has no frames.
+    frames: their number; None: FRAMES_PER_SECOND, from MIN_FRAMES to MAX_FRAMES. There are fewer where the film is
+            shorter or repeats itself
+    An existing folder of the same file and options is reused; any other is replaced.
+    Raises LumigraphError if the film cannot be read or has no frames.
     """
     if frames is not None and frames < 2:
         raise LumigraphError(f"{frames} frames of {path} are too few to find cameras for; ask for 2 at least")
     stat = path.stat()
-    wanted, index = Index(path.name, stat.st_mtime_ns, stat.st_size, frames), folder / "frames.json"
+    wanted, index = Index(path.name, stat.st_mtime_ns, stat.st_size, frames, tags_of(path)), folder / "frames.json"
     known = read_json(index, Index) if index.is_file() else Index()
     complete = all(Path(name).name == name and is_file(folder / name) for name in known.frames)
     if not complete or replace(known, frames={}) != wanted:
@@ -88,21 +81,21 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
 
 
 def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row, Row, Row]:
-    """Numbers of the judged frames, their seconds from the first on, sharpness, and how far the picture had moved."""
+    """Numbers of the judged frames, their seconds from the first on, sharpness, and accumulated movement."""
     rows: list[tuple[int, float, float, float]] = []
     odometer, end = Odometer(), 0.0
     with opened(path) as film:
-        total = film.streams.video[0].frames or max(round(duration(film) * speed(film)), 1)
+        total = film.stream.frames or max(round(film.seconds * film.rate), 1)
         most = total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf
-        step = max(int(min(speed(film) / JUDGED_PER_SECOND, most)), 1)
-        for number, (frame, end) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
+        step = max(int(min(film.rate / JUDGED_PER_SECOND, most)), 1)
+        for number, (frame, end) in enumerate(track(film.frames(), f"Watching {path.name}", total)):
             if number % step == 0:
                 luminance = grey(frame, JUDGED_SIDE)
                 rows.append((number, end, sharpness(luminance), odometer.show(grey(frame, MOVEMENT_SIDE))))
         if not rows:
             raise LumigraphError(f"{path} has no frames; record it again or take it from its source")
-        if end - rows[0][1] < MIN_DURATION_SHARE * duration(film) - 1 / speed(film):
-            text = f"{path} breaks off after {end:.1f} of {duration(film):.1f} s; what comes before is used"
+        if end - rows[0][1] < MIN_DURATION_SHARE * film.seconds - 1 / film.rate:
+            text = f"{path} breaks off after {end:.1f} of {film.seconds:.1f} s; what comes before is used"
             warnings.warn(LumigraphWarning(text), stacklevel=2)
     numbers = [number for number, *_ in rows]
     times, sharp, travelled = np.array([figures for _, *figures in rows]).T
@@ -110,7 +103,7 @@ def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row,
 
 
 def choose(numbers: Sequence[int], seconds: Row, sharp: Row, travelled: Row, frames: int | None = None) -> list[int]:
-    """The numbers of the sharpest frames of equal stretches, ascending. Other arguments are as `judge` gives them."""
+    """Numbers of the sharpest frames of segments of equal movement, ascending. Other arguments are those of `judge`."""
     length = float(seconds[-1])
     count = frames or min(max(round(FRAMES_PER_SECOND * length), MIN_FRAMES), MAX_FRAMES)
     clock = seconds / max(length, 1e-9)
@@ -122,11 +115,10 @@ def choose(numbers: Sequence[int], seconds: Row, sharp: Row, travelled: Row, fra
 
 
 def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict[str, float]:
-    """Write the chosen frames but those that repeat an earlier one; names and seconds from the first frame on."""
+    """Write the chosen frames except repetitions of earlier ones. Returns names and seconds from the first frame on."""
     written: dict[str, float] = {}
     signatures: list[np.ndarray] = []
-    for number, frame, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
-        image = upright(frame)
+    for number, image, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
         new = signature(image.convert("L"))
         if not any(new @ old > DUPLICATE_CORRELATION for old in signatures):
             name = f"{number:06d}.jpg"
@@ -136,83 +128,23 @@ def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict
     return written
 
 
-def picked(path: Path, chosen: Sequence[int]) -> Iterator[tuple[int, VideoFrame, float]]:
+def picked(path: Path, chosen: Sequence[int], tags: Tags | None = None) -> Iterator[tuple[int, Image.Image, float]]:
+    """Numbers, pictures and seconds from the first on of chosen frames. tags: as in `opened`"""
     wanted, beginning = set(chosen), 0.0
-    with opened(path) as film:
-        for number, (frame, seconds) in enumerate(decoded(path, film)):
+    with opened(path, tags) as film:
+        for number, (frame, seconds) in enumerate(film.frames()):
             beginning = seconds if number == 0 else beginning
             if number in wanted:
-                yield number, frame, seconds - beginning
+                yield number, film.picture(frame), seconds - beginning
             if number == chosen[-1]:
                 return
 
 
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[InputContainer]:
-    """A film with pictures. Raises LumigraphError where there are none."""
-    try:
-        container = av.open(str(path))
-    except (av.FFmpegError, ValueError) as fault:
-        raise LumigraphError(
-            f"{path} cannot be read as a video ({why(fault)}); take it from its source again, or convert it to MP4"
-        ) from fault
-    with container:
-        if not container.streams.video:
-            raise LumigraphError(f"{path} holds no pictures, only other tracks such as sound; name another video")
-        container.streams.video[0].thread_type = "AUTO"
-        yield container
-
-
-def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, and when each is shown, in seconds. What comes after damage is left out. Raises LumigraphError
-    where no frame can be decoded."""
-    rate, count = speed(film), 0
-    try:
-        for frame in film.decode(video=0):
-            yield frame, count / rate if frame.time is None else float(frame.time)
-            count += 1
-    except av.FFmpegError as fault:
-        if count == 0:
-            raise LumigraphError(
-                f"{path} cannot be decoded ({why(fault)}); take it from its source again, or convert it to MP4"
-            ) from fault
-
-
-def speed(film: InputContainer) -> float:
-    """Frames per second, on average."""
-    stream = film.streams.video[0]
-    return float(stream.average_rate or stream.guessed_rate or 30)
-
-
-def duration(film: InputContainer) -> float:
-    """Seconds, as the file says; 0 where it does not."""
-    stream = film.streams.video[0]
-    if stream.duration is not None and stream.time_base is not None:
-        return float(stream.duration * stream.time_base)
-    return (film.duration or 0) / av.time_base
-
-
-def grey(frame: VideoFrame, longest: int) -> Float[np.ndarray, "height width"]:
-    """Luminance from 0 to 255, reduced so that the longer side is at most `longest` pixels. Not turned upright."""
-    times = max(frame.width / longest, frame.height / longest, 1.0)
-    width, height = (max(round(side / times), 1) for side in (frame.width, frame.height))
-    return frame.reformat(width, height, format="gray", interpolation="AREA").to_ndarray().astype(np.float32)
-
-
-def upright(frame: VideoFrame) -> Image.Image:
-    """A frame as it is meant to be seen, in sRGB bytes."""
-    return frame.to_image().rotate(frame.rotation, expand=True)
-
-
-def why(fault: Exception) -> str:
-    return (getattr(fault, "strerror", None) or str(fault)).lower()
-
-
 class Odometer:
-    """Sum of the movement of a picture, in pixels of small grey pictures that are given one by one.
+    """Accumulated movement of a picture, in pixels of small grey pictures passed one by one.
 
-    Each is compared with a reference, which is exchanged only once the picture has moved by REFERENCE_STRIDE, so that
-    noise does not add up while the camera rests.
+    Each is compared with a reference, which is replaced only after movement by REFERENCE_STRIDE, so that noise does not
+    accumulate while the camera rests.
     """
 
     def __init__(self) -> None:
@@ -220,7 +152,7 @@ class Odometer:
         self._reference: np.ndarray | None = None
 
     def show(self, picture: Float[np.ndarray, "height width"]) -> float:
-        """The distance so far."""
+        """Add a picture. Returns the accumulated movement."""
         tiles = cut(picture)
         if self._reference is None:
             self._reference = tiles
@@ -231,7 +163,7 @@ class Odometer:
 
 
 def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile row column"]:
-    """Square tiles, faded out towards their borders; what does not fill a tile is left out."""
+    """Square tiles with a window function; incomplete tiles are left out."""
     rows, columns = max(picture.shape[0] // TILE_SIDE, 1), max(picture.shape[1] // TILE_SIDE, 1)
     whole = np.zeros((rows * TILE_SIDE, columns * TILE_SIDE), np.float32)
     part = picture[: rows * TILE_SIDE, : columns * TILE_SIDE]
@@ -242,8 +174,8 @@ def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile r
 
 
 def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
-    """Mean length of the tiles' displacements, each where its cross-correlation peaks; 0 where nothing has texture.
-    Tiles are followed one by one, so that walking forward or turning about the line of sight counts as well."""
+    """Mean length of the tiles' displacements by phase correlation; 0 without texture. Tiles are tracked one by one, so
+    that walking forward or rolling the camera counts as well."""
     textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > MIN_VARIANCE * WINDOW_MEAN_SQUARE
     if not textured.any():
         return 0.0

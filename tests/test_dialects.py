@@ -1,0 +1,320 @@
+"""Captures and clouds as other programs write them: what they mean is used, and what is not used is named."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import unicodedata
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from budgets import budget
+from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_colmap, write_ngp
+
+from lumigraph.camera.lens import Pinhole
+from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.exchange import is_moving, is_splat_file, read_gaussians, read_moving, write_gaussians
+from lumigraph.exchange.fourdgs import write_moving
+from lumigraph.files.ply import read_rows, write_rows
+from lumigraph.gaussians import Gaussians
+from lumigraph.large import open_any
+from lumigraph.readers import colmap, phones, transforms
+from lumigraph.readers.finding import find_named, paired
+from lumigraph.system.cache import cache_folder, temporary_cache
+
+pytestmark = budget("capture", 12)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Tiny:
+    return Tiny(count=6)
+
+
+def frames_named(tiny: Tiny, form: str) -> list[dict]:
+    return [
+        frame | {"file_path": form.format(Path(frame["file_path"]).name)} for frame in tiny.frames("images/", ".png")
+    ]
+
+
+@pytest.mark.parametrize(
+    "form",
+    [r"images\{}", r"C:\Users\me\scan\images\{}", "/home/me/scan/images/{}", "scan/images/{}", "./images/{}", "{}",
+     r"\\server\share\scan\images\{}", "IMAGES/{}", "images/images/{}"],
+)  # fmt: skip
+def test_paths_of_other_machines_lead_to_the_photographs(tiny, tmp_path, form):
+    folder = write_ngp(tmp_path, tiny, frames=frames_named(tiny, form))
+    found = transforms.read(folder)
+    assert len(found.shots) == 6 and not found.missing
+
+
+def test_names_in_other_letters(tmp_path):
+    name = "Stra\u00dfe caf\u00e9 (1).JPG"
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / unicodedata.normalize("NFD", name)).write_bytes(b"x")
+    for asked in (unicodedata.normalize("NFC", name), name.lower(), "images/Stra\u00dfe caf\u00e9 _1_.jpg"):
+        assert find_named(tmp_path, asked).is_file(), asked
+    assert not find_named(tmp_path, "images/2.jpg").is_file()
+    (tmp_path / "images" / "A.png").write_bytes(b"x")
+    (tmp_path / "images" / "a.png").write_bytes(b"x")
+    assert not find_named(tmp_path, "images/stra\u00dfe CAF\u00c9 (1).jpg").is_file(), "letters decide there"
+    assert find_named(tmp_path, "images/a.png").name == "a.png"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_json_of_windows_editors(tiny, tmp_path, encoding):
+    path = write_ngp(tmp_path, tiny) / "transforms.json"
+    path.write_text(path.read_text(), encoding=encoding)
+    assert len(transforms.read(tmp_path).shots) == 6
+
+
+def test_pairs_are_by_path_and_never_by_stem_alone():
+    names = ["left/0001.jpg", "left/0002.jpg", "right/0001.jpg"]
+    assert paired(names, [f"images/{name}" for name in names]) == {name: f"images/{name}" for name in names}
+    assert paired(["a/0001.jpg"], ["b/0001.png"]) == {"a/0001.jpg": "b/0001.png"}  # each alone in its folder
+    assert paired(["0001.jpg"], ["left/0001.jpg", "right/0001.jpg"]) == {}
+    assert paired(["left/0001.jpg", "right/0001.jpg"], ["left/0001.png", "top/0001.png"]) == {
+        "left/0001.jpg": "left/0001.png"
+    }
+
+
+# COLMAP's models
+
+
+def with_names(folder: Path, form: str) -> None:
+    """Rename a text model's photographs, and end its lines as Windows does."""
+    path = folder / "images.txt"
+    lines = path.read_text().splitlines()
+    for number in colmap.image_lines(lines):
+        *numbers, name = lines[number].split(maxsplit=9)
+        lines[number] = " ".join([*numbers, form.format(Path(name).stem)])
+    path.write_bytes("\r\n".join(["", *lines, ""]).encode("utf-8-sig"))
+
+
+@pytest.mark.parametrize("form", ["images/{}.png", "a {} (b).png", "C:\\scan\\images\\{}.png"])
+def test_text_models_name_photographs_to_the_end_of_the_line(tiny, tmp_path, form):
+    folder = write_colmap(tmp_path, tiny, text=True)
+    with_names(folder / "sparse" / "0", form)
+    if " " in form:
+        for file in (folder / "images").iterdir():
+            file.rename(file.with_name(form.format(file.stem)))
+    found = colmap.read(folder)
+    assert len(found.shots) == 6 and len(found.points) == len(tiny.points)
+
+
+def test_the_largest_of_several_models_is_used(tiny, tmp_path):
+    write_colmap(tmp_path, Tiny(count=3), place="sparse/0")
+    write_colmap(tmp_path, tiny, place="sparse/1")
+    write_colmap(tmp_path, Tiny(count=4), place="sparse/10", text=True)
+    found = colmap.read(tmp_path)
+    assert len(found.shots) == 6 and "1, is used, without 4 photographs in 10, 3 photographs in 0" in found.notes[0]
+
+
+@pytest.mark.parametrize("place", ["sparse/2", "dense/sparse", "dense/0/sparse", "undistorted/sparse", "colmap/0", "3"])
+def test_models_are_found_where_programs_leave_them(tiny, tmp_path, place):
+    write_colmap(tmp_path, tiny, place=place)
+    if place.startswith("dense"):
+        shutil.move(tmp_path / "images", (tmp_path / place).parent / "images")
+    assert len(colmap.read(tmp_path).shots) == 6
+
+
+def test_what_is_not_found_is_named_with_the_place(tiny, tmp_path):
+    write_colmap(tmp_path, tiny)
+    shutil.rmtree(tmp_path / "images")
+    with pytest.raises(LumigraphError, match=r"looked for view_00\.png"):
+        colmap.read(tmp_path)
+
+
+# Lenses and keys of transforms.json
+
+
+def test_k4_without_k5_and_k6_is_the_power_of_eight(tiny, tmp_path):
+    powers = 0.06, -0.08, 0.01, 0.09
+    named = {f"k{i + 1}": k for i, k in enumerate(powers)}
+    found = transforms.read(write_ngp(tmp_path, tiny, camera_model="OPENCV", **named))
+    assert any("r^8" in note for note in found.notes)
+    random = torch.Generator().manual_seed(0)
+    places = torch.rand(200, 2, generator=random) * torch.tensor([WIDTH, HEIGHT])
+    rays = found.shots[0].lens.unproject(places)
+    x, y = (rays[:, :2] / rays[:, 2:]).unbind(-1)
+    r2 = x**2 + y**2
+    factor = 1 + sum(k * r2 ** (i + 1) for i, k in enumerate(powers))
+    back = torch.stack([x * factor * FOCAL + WIDTH / 2, y * factor * FOCAL + HEIGHT / 2], -1)
+    assert (back - places).norm(dim=-1).max() < 0.1
+    rational = transforms.read(write_ngp(tmp_path / "b", tiny, camera_model="FULL_OPENCV", **named))
+    assert not rational.notes and rational.shots[0].lens.distortion[0, 5] == pytest.approx(0.09)
+
+
+def test_other_ways_to_say_a_lens(tiny, tmp_path):
+    degrees = 2 * math.degrees(math.atan(WIDTH / 2 / FOCAL))
+    for i, extra in enumerate(({"x_fov": degrees, "fl_x": None}, {"camera_model": "SIMPLE_PINHOLE"})):
+        lens = transforms.read(write_ngp(tmp_path / f"{i}", tiny, **extra)).shots[0].lens
+        assert isinstance(lens, Pinhole) and lens.focal[0, 0] == pytest.approx(FOCAL, rel=1e-4)
+    radial = transforms.read(write_ngp(tmp_path / "r", tiny, camera_model="SIMPLE_RADIAL", k1=0.1)).shots[0].lens
+    assert radial.distortion[0, 0] == pytest.approx(0.1)
+    circle = transforms.read(write_ngp(tmp_path / "f", tiny, camera_model="OPENCV_FISHEYE", fisheye_crop_radius=15))
+    assert circle.shots[0].mask.sum() == pytest.approx(math.pi * 15**2, rel=0.02)
+    told = transforms.read(write_ngp(tmp_path / "u", tiny, rolling_shutter=[0, 0, 0.01, 0], sharpness=3, mood="good"))
+    assert "passed over: mood" in told.notes[0] and "rolling shutter" in told.notes[1]
+
+
+def test_polycam_without_sizes(tiny, tmp_path):
+    for name in ("corrected_cameras", "cameras", "corrected_images"):
+        (tmp_path / "keyframes" / name).mkdir(parents=True)
+    pose = {f"t_{i}{j}": float(tiny.poses[0][i, j]) for i in range(3) for j in range(4)}
+    lens = {"fx": 60.0, "fy": 60.0, "cx": 24.0, "cy": 18.0}
+    for stem, sizes in (("1", {"width": 96, "height": 72}), ("2", {})):
+        tiny.write_images(tmp_path / "made")
+        shutil.copyfile(tmp_path / "made" / tiny.names[0], tmp_path / "keyframes" / "corrected_images" / f"{stem}.png")
+        (tmp_path / "keyframes" / "corrected_cameras" / f"{stem}.json").write_text(json.dumps(pose | lens))
+        (tmp_path / "keyframes" / "cameras" / f"{stem}.json").write_text(json.dumps(pose | lens | sizes))
+    assert [shot.size for shot in phones.read(tmp_path).shots] == [(96, 72), None]
+
+
+# Clouds
+
+
+def cloud(count: int = 40, far: bool = False) -> Gaussians:
+    random = torch.Generator().manual_seed(0)
+    means = torch.randn(count, 3, generator=random, dtype=torch.float64)
+    if far:
+        means = means + torch.tensor([512345.7, 4649776.2, 312.4], dtype=torch.float64)
+    return Gaussians(
+        means if far else means.float(),
+        torch.randn(count, 4, generator=random),
+        torch.randn(count, 3, generator=random) * 0.3 - 3,
+        torch.randn(count, generator=random),
+        torch.randn(count, 1, 3, generator=random),
+    )
+
+
+def with_properties(path: Path, to: Path, without: tuple[str, ...] = (), **more: np.ndarray) -> Path:
+    """A copy of a .ply without some properties and with others."""
+    rows = read_rows(path, ["vertex"])["vertex"]
+    fields = {name: rows[name] for name in rows.dtype.names if name not in without} | more
+    made = np.empty(len(rows), [(name, values.dtype) for name, values in fields.items()])
+    for name, values in fields.items():
+        made[name] = values
+    write_rows(to, "splats", {"vertex": made})
+    return to
+
+
+def test_the_filter_of_mip_splatting_is_applied(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    size = np.linspace(0.01, 0.1, 40).astype(np.float32)
+    found = read_gaussians(with_properties(tmp_path / "a.ply", tmp_path / "b.ply", filter_3D=size))
+    before = read_gaussians(tmp_path / "a.ply")
+    variances = before.log_scales.exp() ** 2
+    wider = variances + torch.from_numpy(size)[:, None] ** 2
+    torch.testing.assert_close(found.log_scales.exp() ** 2, wider)
+    share = (variances.prod(1) / wider.prod(1)).sqrt()
+    torch.testing.assert_close(found.opacities.sigmoid(), before.opacities.sigmoid() * share)
+
+
+def test_flat_gaussians_and_properties_that_are_not_used(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud())
+    path = with_properties(tmp_path / "a.ply", tmp_path / "b.ply", ("scale_2",), label=np.arange(40, dtype=np.int32))
+    with pytest.warns(LumigraphWarning) as told:
+        found = read_gaussians(path)
+    assert sorted(str(one.message).split(": ", 1)[1].split(",")[0] for one in told) == [
+        "Gaussians without scale_2 are flat",
+        "passed over: label",
+    ]
+    assert (found.log_scales[:, 2] < found.log_scales[:, :2].amin(1) - 4).all()
+
+
+def spacetime(tmp_path: Path) -> Path:
+    random = np.random.default_rng(0)
+    write_gaussians(tmp_path / "a.ply", cloud())
+    more = {"trbf_center": random.uniform(0, 1, 40), "trbf_scale": np.full(40, np.log(0.2))}
+    more |= {f"motion_{i}": random.normal(0, 1, 40) for i in range(9)} | {f"omega_{i}": np.zeros(40) for i in range(4)}
+    more = {name: values.astype(np.float32) for name, values in more.items()}
+    return with_properties(tmp_path / "a.ply", tmp_path / "b.ply", **more)
+
+
+def test_spacetime_gaussians_move(tmp_path):
+    path = spacetime(tmp_path)
+    assert is_moving(path) and not is_splat_file(path)
+    with pytest.raises(LumigraphError, match=r"move; make a file"):
+        read_gaussians(path)
+    rows = read_rows(path, ["vertex"])["vertex"]
+    moving, before = read_moving(path), read_gaussians(tmp_path / "a.ply")
+    for time in (0.05, 0.4, 0.77):
+        now = moving.at(time * moving.duration)
+        away = time - torch.from_numpy(rows["trbf_center"].copy())
+        parts = [torch.from_numpy(np.stack([rows[f"motion_{3 * k + i}"] for i in range(3)], 1)) for k in range(3)]
+        places = before.means + sum(part * away[:, None] ** (k + 1) for k, part in enumerate(parts))
+        seen = before.opacities.sigmoid() * torch.exp(-((away / 0.2) ** 2))
+        for place, opacity in zip(places[seen > 0.1], seen[seen > 0.1], strict=True):
+            nearest = (now.means - place).norm(dim=-1).argmin()
+            assert (now.means[nearest] - place).norm() < 0.03
+            assert now.opacities[nearest].sigmoid() == pytest.approx(float(opacity), rel=0.02)
+    assert open_any(path).frame.times == (0.0, 3.0)
+
+
+def test_a_folder_of_a_cloud_a_frame_moves(tmp_path):
+    for i in range(4):
+        write_gaussians(tmp_path / "clip" / f"frame_{i:04}.ply", replace(cloud(), means=cloud().means + 0.1 * i))
+    moving = read_moving(tmp_path / "clip")
+    torch.testing.assert_close(moving.at(1.5 / 30).means, cloud().means + 0.15)
+    write_moving(tmp_path / "a.4dgs", moving)
+    assert len(read_moving(tmp_path / "a.4dgs")) == 160
+    write_gaussians(tmp_path / "clip" / "other.ply", cloud())
+    assert not is_moving(tmp_path / "clip"), "a folder of clouds that are no frames"
+
+
+def test_frames_of_other_gaussians_follow_each_other(tmp_path):
+    for i in range(2):
+        write_gaussians(tmp_path / "clip" / f"{i}.ply", cloud(20 + i))
+    with pytest.warns(LumigraphWarning, match="nothing moves between frames"):
+        moving = read_moving(tmp_path / "clip")
+    assert [len(moving.at(t / 30)) for t in (0.5, 1.5)] == [20, 21]
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.glb", "a.spz", "a.sog", "a.splat", "folder/meta.json"])
+def test_far_from_the_origin_centres_are_kept(tmp_path, name):
+    far = cloud(far=True)
+    write = pytest.warns(LumigraphWarning, match=r"offset\.json has that offset")
+    if name in ("a.ply", "a.glb"):
+        write_gaussians(tmp_path / name, far)
+    else:
+        with write:
+            write_gaussians(tmp_path / name, far)
+    found = read_gaussians(tmp_path / name)
+    assert found.means.dtype == torch.float64
+    size = far.log_scales.amax(-1).exp().median()
+    assert (found.means[:, None] - far.means).norm(dim=-1).amin(1).max() < 0.01 * size
+    write_gaussians(tmp_path / name, cloud())
+    near = read_gaussians(tmp_path / name)
+    assert near.means.dtype == torch.float32 and near.means.abs().max() < 10, "the offset went with its file"
+
+
+def test_a_cloud_far_away_is_rendered_as_near_the_origin(tmp_path):
+    write_gaussians(tmp_path / "a.ply", cloud(far=True))
+    write_gaussians(tmp_path / "b.ply", cloud())
+    far, near = (open_any(tmp_path / f"{x}.ply") for x in "ab")
+    pictures = [one.method("cpu").render(one.cameras()["train"][0]).rgb for one in (far, near)]
+    torch.testing.assert_close(*pictures, atol=2e-3, rtol=0)
+
+
+# A home that cannot be written
+
+
+def test_caches_lie_in_the_temporary_folder_where_the_home_cannot_be_written(tmp_path, monkeypatch):
+    for name in ("LUMIGRAPH_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    temporary_cache.cache_clear()
+    with pytest.warns(LumigraphWarning, match="set LUMIGRAPH_CACHE"):
+        found = cache_folder()
+    assert found.parent == tmp_path and found.stat().st_mode & 0o077 == 0
+    temporary_cache.cache_clear()
+    found.chmod(0o777)  # another user may have put code there
+    with pytest.warns(LumigraphWarning):
+        assert cache_folder() != found
+    temporary_cache.cache_clear()
