@@ -167,10 +167,10 @@ def test_poses_of_a_user(kind, tmp_path):
     write_bones(bones, replace(skeleton(), times=(7.0,), poses=skeleton().poses[1:]))
     last = method.given(time=3.0).render(camera).rgb
     at_rest = method.given(pose="rest", time=3.0)
-    torch.testing.assert_close(at_rest.bones.at(at_rest, 3.0), moves(0.0), atol=1e-5, rtol=0)
+    torch.testing.assert_close(at_rest.bones.at(at_rest.settings, 3.0), moves(0.0), atol=1e-5, rtol=0)
     for path in (angles, bones):
         posed = method.given(pose=str(path))
-        torch.testing.assert_close(posed.bones.at(posed, 1.0), moves(BEND), atol=1e-5, rtol=0)
+        torch.testing.assert_close(posed.bones.at(posed.settings, 1.0), moves(BEND), atol=1e-5, rtol=0)
         if kind is ArticulatedSplatting:
             torch.testing.assert_close(posed.render(camera).rgb, last, atol=1e-4, rtol=0)
     with pytest.raises(LumigraphError, match="does not exist"):

@@ -9,7 +9,6 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph.components.clouds.addition import Step
 from lumigraph.geometry import multiply, rotated
 from lumigraph.methods.deformable_splatting import DeformableSplatting
 from lumigraph.methods.deformable_splatting.planes import PAIRS, PLANE_SCALES, PlaneMotion, SpaceTimePlanes, spread
@@ -79,12 +78,12 @@ def test_gaussians_that_hardly_move_stand_still():
     for parameter in (motion.heads.weight, motion.heads.bias):
         parameter.data.zero_()
     motion.heads.bias.data[0] = 0.001 * motion.diagonal  # below the least offset that counts
-    motion.progress, method.current = 1.0, Step.__new__(Step)
-    method.current.due = True
-    motion.after_step(method, 10)
+    step = method.step_on(tiny.scene().photograph(0), 10)
+    step.due = True
+    motion.finish(step)
     assert not motion.moves.any()
     motion.heads.bias.data[0] = 0.003 * motion.diagonal
-    motion.after_step(method, 10)
+    motion.finish(step)
     assert motion.moves.all()
 
 

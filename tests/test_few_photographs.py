@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -12,8 +11,10 @@ import torch
 from budgets import budget
 from test_gaussian_splatting import new
 
+from lumigraph.components.clouds.addition import TrainingViews
+from lumigraph.components.clouds.cloud import Cloud
 from lumigraph.components.clouds.dense_points import Points
-from lumigraph.components.clouds.initialization import round_gaussians
+from lumigraph.components.clouds.initialization import random_cloud, round_gaussians
 from lumigraph.components.training.regularizers import camera_between, places_between
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.methods.gaussian_splatting.few_views import (
@@ -155,6 +156,7 @@ def test_known_surfaces_carve_away_what_floats_in_front():
 def test_a_capture_is_sparse_if_sweeps_agree_little_on_up_to_forty_photographs_of_a_place():
     scene, points = tiny.scene(), Points(*(torch.ones(5, 3),) * 2, torch.ones(5), torch.zeros(5, 3), 0.1)
     place = replace(scene, frame=replace(scene.frame, reach=4.0, has_alpha=False))
+    cloud = Cloud(random_cloud(scene.frame, 2, 0, chance()))
     many = replace(place, splits={"train": torch.arange(41) % 4})
     agreed = replace(points, share=0.3)
     for data, found, expected in (
@@ -164,5 +166,7 @@ def test_a_capture_is_sparse_if_sweeps_agree_little_on_up_to_forty_photographs_o
         (many, points, False),
     ):
         part = FewViews(FewViewNumbers("auto"))
-        part.begin_scene(SimpleNamespace(moves_cameras=False), data, lambda found=found: found)
+        part.begin_scene(
+            cloud, TrainingViews(None, lambda cameras: cameras, 0.0, 0.0, move=False), data, lambda found=found: found
+        )
         assert bool(part.active) == expected and len(part.surface) == 5 * expected

@@ -10,7 +10,6 @@ import torch
 from balls import BLUE, RED, WHITE, Splatted, eye
 from budgets import budget
 
-from lumigraph.components.clouds.addition import Step
 from lumigraph.components.instances import edit_of
 from lumigraph.datasets.scene import Photograph
 from lumigraph.gaussians import joined
@@ -44,7 +43,7 @@ def step_at(method, camera):
     seen, red = picture.opacity > 0.5, picture.rgb[..., 0] > picture.rgb[..., 2]
     labels = torch.where(seen, torch.where(red, 0, 1), -1)
     photograph = Photograph(camera, picture.rgb, seen.float(), extra={"labels": labels})
-    step = Step(photograph, torch.Generator().manual_seed(0), cloud, cloud, camera)
+    step = method.step_on(photograph, 0)
     step.picture = picture
     return step
 
@@ -55,7 +54,7 @@ def learnt():
     optimizers = method.identities.optimizers()
     for turn in range(60):
         step = step_at(method, eye(EYES[turn % 4]))
-        method.identities.regularize(method, step)
+        method.identities.regularize(step)
         for optimizer in optimizers:
             optimizer.zero_grad()
         sum(step.terms.values()).backward()
@@ -76,7 +75,7 @@ def test_identities_change_nothing_else():
     """Gradients reach codes and classifier alone."""
     method = method_of(two_balls())
     step = step_at(method, eye(EYES[0]))
-    method.identities.regularize(method, step)
+    method.identities.regularize(step)
     sum(step.terms.values()).backward()
     assert method.identities.codes.grad.abs().sum() > 0 and method.identities.classifier.weight.grad.abs().sum() > 0
     assert all(p.grad is None or not p.grad.any() for p in method.cloud.parameters())
@@ -122,5 +121,5 @@ def test_alpha_is_a_mask_where_there_are_no_labels():
     method = method_of(two_balls())
     step = step_at(method, eye(EYES[0]))
     step.photograph.extra.clear()
-    method.identities.regularize(method, step)
+    method.identities.regularize(step)
     assert method.identities.seen.tolist() == [True, False]

@@ -268,17 +268,18 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "smooth_weight": 0.01,
         "learning_rate": 1e-4,
     },
-    "articulated-splatting": {  # Pokhariya 2024 from memory, and Kerbl 2023
+    "articulated-splatting": {  # brown-ivl/manus, config/model/gaussian/gaussian.yaml
         "sh_degree": 3,
         "ssim_weight": 0.2,
         "adaptive.densify_grad_threshold": 2e-4,
         "refine.refine_every": 100,
     },
-    "humannerf": {  # Weng 2022, section 4.1 and supplement, from memory; 400 000 steps
+    "humannerf": {  # chungyiweng/humannerf, configs/default.yaml; 400 000 steps
         "hidden_width": 256,
         "network.depth": 8,
         "network.position_frequencies": 10,
         "learning_rate": 5e-4,
+        "final_learning_rate": 5e-4 * 0.1 ** (400 / 500),  # lrate_decay 500, after 400 000 steps
         "weights.weight_cells": 32,
         "weights.weight_code": 256,
         "weights.weights_lr": 5e-5,
@@ -286,7 +287,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "bones.pose_depth": 4,
         "bones.pose_width": 256,
         "bones.pose_lr": 5e-5,
-        "bones.pose_from": 20_000 / 400_000,
+        "bones.pose_from": 0.0,
         "nonrigid.nonrigid_depth": 6,
         "nonrigid.nonrigid_width": 128,
         "nonrigid.nonrigid_frequencies": 6,
@@ -547,7 +548,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "filters.antialiased": False,
         "filters.filter_3d": False,
     },
-    "planar-splatting": {  # PGSR's section 5, from memory; 3D Gaussian Splatting's numbers where it gives none
+    "planar-splatting": {  # zju3dv/PGSR, arguments/__init__.py
         "planes.depth": "mean",
         "planes.flatness_weight": 100.0,
         "planes.normal_weight": 0.015,
@@ -605,14 +606,16 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "laplacian_weight": 0.0,
         "normal_weight": 0.0,
     },
-    "deep-appearance": {  # Lombardi 2018, sections 4.2 and 4.3, from memory
+    "deep-appearance": {  # facebookresearch/multiface, models.py and train.py
         "texture_log2": 10,
         "code": 128,
+        "channels": 16,
+        "max_channels": 128,
         "view_features": 8,
         "mesh_width": 256,
         "divergence_weight": 0.01,
         "textures_per_step": 16,
-        "learning_rate": 1e-3,
+        "learning_rate": 3e-4,
     },
     "lumigraph": {  # Buehler 2001 gives no numbers; Gortler 1996, sec. 3.4: the four cameras around a ray
         "blended_views": 4,

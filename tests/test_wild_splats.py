@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -340,8 +339,10 @@ def test_each_rule_is_an_option(rule):
         cloud.log_scales[:3] = torch.tensor([[0.01] * 3, [9.0, 9.0, 0.1], [0.5, 0.01, 0.01]]).log()
         cloud.harmonics[:, 1:] = 1.0
         before = cloud.gaussians().log_scales.clone()
-        method.current, method.bands = SimpleNamespace(due=True), 2
-        method.tidying.after_step(method, 1)
+        method.bands = 2
+        step = method.step_on(tiny.scene().photograph(1), 1)
+        step.due = True
+        method.tidying.finish(step)
     scales = cloud.log_scales.detach()
     found = {"prune_near": len(cloud) < len(before), "observed_harmonics": not cloud.harmonics[:, 1:].any()}
     if len(cloud) == len(before):
@@ -359,8 +360,9 @@ def test_a_sheet_before_a_training_camera_goes():
     with torch.no_grad():
         method.cloud.means[0] = camera.position[0] + 0.5 * scene.frame.near * camera.forward[0]
         before = len(method.cloud)
-        method.current = SimpleNamespace(due=True)
-        method.tidying.after_step(method, 1)
+        step = method.step_on(scene.photograph(1), 1)
+        step.due = True
+        method.tidying.finish(step)
     assert len(method.cloud) == before - 1 == len(method.cloud.view_bits)
     assert len(method.cloud) == len(method.density_control.positional_gradient_sum)
     assert float(camera_distance(method.cloud.means, scene.cameras.position).min()) > scene.frame.near

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,7 +12,7 @@ from torch import Tensor
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..geometry import Similarity
-from ..method.controls import Control
+from ..method.controls import Configured, Control
 
 LABELS = "labels"
 MOVE, COPY, REMOVE, ALONE = EDITS = "move", "copy", "remove", "alone"
@@ -72,7 +71,7 @@ def edit_controls(learnt: Bool[Tensor, " label"], reach: float) -> tuple[Control
     )
 
 
-def edit_of(method: Any) -> Edit | None:
+def edit_of(method: Configured) -> Edit | None:
     """The edit of a method's settings; None for the scene as it is."""
     if not method.settings.keys() & CONTROLS:
         return None

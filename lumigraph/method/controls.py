@@ -5,12 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 from ..errors import LumigraphError
 
 Value = float | str
 
 NAMED = 8  # choices in a sentence at most
+
+
+@runtime_checkable
+class Configured(Protocol):
+    """Something with settings by the names of its controls, as a Method has."""
+
+    settings: dict[str, Value]
+
+    def control(self, name: str) -> Value: ...
 
 
 @dataclass(frozen=True)

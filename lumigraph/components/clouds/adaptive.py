@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +12,7 @@ from torch import Tensor
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, Steps
 from ...geometry import to_matrix
+from .addition import Step, TrainingViews
 from .cloud import Cloud
 from .density_control import PRUNE_OPACITY, DensityControl, RefineNumbers
 
@@ -47,9 +48,9 @@ class AdaptiveDensity(DensityControl):
         for name in self.grows:
             self.register_buffer(name, torch.zeros(count))
 
-    def begin_cloud(self, method: Any) -> None:
-        super().begin_cloud(method)
-        self.forget(len(method.cloud))
+    def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
+        super().begin_cloud(cloud, views, chance)
+        self.forget(len(cloud))
 
     def forget(self, count: int) -> None:
         """Reset the sums, for a cloud of `count` Gaussians."""
@@ -64,20 +65,21 @@ class AdaptiveDensity(DensityControl):
         return dict.fromkeys(self.grows, Stored("nothing"))
 
     @torch.no_grad()
-    def after_step(self, method: Any, step: int) -> None:
-        progress, cloud, picture = method.progress, method.cloud, method.current.picture
+    def finish(self, step: Step) -> None:
+        progress, cloud, picture, number = step.progress, step.learnt, step.picture, step.number
         if progress >= self.refining.refine_until:
             return
         height, width = picture.opacity.shape
+        assert picture.centres.grad is not None
         self.record(picture.centres.grad, picture.opacities > 0, (width, height))
-        steps = step / max(progress, 1e-6)  # of the whole budget
-        if method.current.due:
+        steps = number / max(progress, 1e-6)  # of the whole budget
+        if step.due:
             cap = self.current_cap(cloud, progress, steps)
-            full = self.refine(cloud, float(cloud.extent), cap, method.random(step))
+            full = self.refine(cloud, float(cloud.extent), cap, step.refining)
             if full and len(cloud) >= NEARLY_FULL * self.max_count(cloud, steps):
                 self.warn_full(cloud, steps)
-        every, full_size = self.numbers.opacity_reset_interval, progress >= method.config.half_resolution_until
-        if step and step % every == 0 and full_size and steps - step >= RECOVERY_INTERVALS * every:
+        every = self.numbers.opacity_reset_interval
+        if number and number % every == 0 and step.full_size and steps - number >= RECOVERY_INTERVALS * every:
             self.reset_opacity(cloud)
 
     def current_cap(self, cloud: Cloud, progress: float, steps: float = 0.0) -> int:

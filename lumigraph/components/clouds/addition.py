@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,22 +15,48 @@ from ...datasets.scene import Photograph, Scene
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted
 from ...method import Part
+from ...method.controls import Configured
+from .cloud import Cloud
 from .dense_points import Points
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """TrainingViews that a cloud is learnt from.
+
+    cameras:    of all photographs, as they were given; None before training
+    refined:    gives cameras their learnt poses
+    near_plane: of rasterization
+    near:       distance within which nothing is, `Frame.near`
+    move:       whether poses are learnt
+    """
+
+    cameras: Camera | None
+    refined: Callable[[Camera], Camera]
+    near_plane: float
+    near: float
+    move: bool
 
 
 @dataclass
 class Step:
     """State of one training step between the cloud and the loss.
 
-    chance:     random generator of this step
-    whole:      the trained cloud, with filters
-    cloud:      the rasterised cloud
-    camera:     of the photograph, with its pose correction
-    picture:    rasterised, over black
-    rgb:        the picture in the photograph's appearance; composited over the background after `after_raster`
-    background: one colour or one for each pixel
-    target:     target colours of the loss
-    residual:   rgb - target before masking
+    chance:     random numbers of this step; refining: those of density control
+    whole:      the cloud that is learnt, with filters
+    cloud:      the cloud that is rasterized
+    camera:     of the photograph, with its learnt pose
+    picture:    rasterized, over black
+    rgb:        the picture in the photograph's appearance; in front of the background once `after_raster` is over
+    background: behind everything, one colour or one for each pixel
+    target:     colours that the loss compares with
+    residual:   rgb - target before pixels are left out
+    learnt:     the parameters;  prune: leaves the Gaussians of a mask of them
+    progress:   share of the budget spent;  drawn: number of photographs that were learnt from
+    bands:      of the harmonics in use
+    moment:     of the photograph, in a scene that moves
+    differ:     whether photographs have appearances of their own
+    full_size:  whether photographs have their final size
     due:        whether density control is due after this step
     """
 
@@ -40,6 +65,17 @@ class Step:
     whole: Gaussians
     cloud: Gaussians
     camera: Camera
+    learnt: Cloud
+    prune: Callable[[Bool[Tensor, " gaussian"]], None]
+    views: TrainingViews
+    number: int
+    refining: torch.Generator
+    progress: float
+    drawn: int
+    bands: int
+    moment: float
+    differ: bool
+    full_size: bool
     picture: Splatted = field(init=False)
     rgb: Float[Tensor, "height width 3"] = field(init=False)
     background: Float[Tensor, "... 3"] = field(init=False)
@@ -50,8 +86,8 @@ class Step:
 
 
 class Addition(Part):
-    """A part that changes training or rendering of a cloud. All hooks do nothing by default, and are called in order of
-    assignment. `method` is the CloudMethod of the part.
+    """A part that changes how a cloud is learnt or shown. All hooks do nothing by default, and are visited in the order
+    in which parts were assigned.
 
     base_colours: whether it keeps harmonics beyond degree 0 at zero
     """
@@ -64,11 +100,11 @@ class Addition(Part):
 
     # The cloud
 
-    def begin_cloud(self, method: Any) -> None:
-        """Initialise for a new cloud."""
+    def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
+        """Follow a new cloud."""
 
-    def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
-        """Initialise from the photographs. sweep: returns points of plane sweeps"""
+    def begin_scene(self, cloud: Cloud, views: TrainingViews, data: Scene, sweep: Callable[[], Points]) -> None:
+        """Initialise from the photographs. sweep: gives points that plane sweeps find"""
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
         """Update after pruning to the Gaussians of a mask, or of indices."""
@@ -79,26 +115,29 @@ class Addition(Part):
 
     # A training step
 
-    def before_raster(self, method: Any, step: Step) -> None:
-        """Change the cloud before rasterisation in a step."""
+    def before_raster(self, step: Step) -> None:
+        """Change the cloud that a step rasterizes."""
 
-    def after_raster(self, method: Any, step: Step) -> None:
-        """Change the colours and the background in a step."""
+    def after_raster(self, step: Step) -> None:
+        """Change the colours and the background of a step."""
 
-    def mask(self, method: Any, step: Step) -> None:
-        """Mask pixels: their target becomes their own colour."""
+    def mask(self, step: Step) -> None:
+        """Leave pixels out: their target becomes their own colour."""
 
-    def regularize(self, method: Any, step: Step) -> None:
+    def regularize(self, step: Step) -> None:
         """Add terms to the loss."""
+
+    def finish(self, step: Step) -> None:
+        """Change the cloud, or what follows it, after a step."""
 
     # Rendering
 
     def shown(
-        self, method: Any, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
+        self, method: Configured, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
     ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "... 3"]]:
         """Colours over black and the background, under the method's settings."""
         return seen.rgb, background
 
-    def recoloured_cloud(self, method: Any, cloud: Gaussians) -> Gaussians:
+    def recoloured_cloud(self, method: Configured, cloud: Gaussians) -> Gaussians:
         """A cloud whose colours are those of the method's settings."""
         return cloud

@@ -18,7 +18,7 @@ from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
-from ...method.controls import Control
+from ...method.controls import Configured, Control
 from ..fields.appearance import APPEARANCE, PhotographCodes
 from ..training.photometric import spread_of_light
 from ..training.schedules import falling
@@ -81,7 +81,7 @@ class SplatAppearance(Addition):
         if self.is_active and self.has_sky:
             self.codes.codes[:, COLOUR_NUMBERS:] = mean_skies(data).to(self.differ.device)
 
-    def after_raster(self, method: Any, step: Step) -> None:
+    def after_raster(self, step: Step) -> None:
         if not self.is_active or step.camera.image_index is None:
             return
         code, opacity = self.codes(step.camera.image_index)[0], step.picture.opacity
@@ -103,7 +103,7 @@ class SplatAppearance(Addition):
     # Rendering
 
     def shown(
-        self, method: Any, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
+        self, method: Configured, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
     ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "... 3"]]:
         code = self.code(method)
         if code is None:
@@ -111,12 +111,12 @@ class SplatAppearance(Addition):
         rgb = recoloured(seen.rgb, seen.opacity, code).clamp(0, 1)
         return rgb, sky(code[COLOUR_NUMBERS:], camera).clamp(0, 1) if self.has_sky else background
 
-    def recoloured_cloud(self, method: Any, cloud: Gaussians) -> Gaussians:
+    def recoloured_cloud(self, method: Configured, cloud: Gaussians) -> Gaussians:
         code = self.code(method)
         return cloud if code is None else replace(cloud, harmonics=recoloured_harmonics(cloud.harmonics, code))
 
-    def code(self, method: Any) -> Float[Tensor, " number"] | None:
-        """Code of the control, else of a given photograph, else the average; None if photographs do not differ."""
+    def code(self, method: Configured) -> Float[Tensor, " number"] | None:
+        """Code of the control, else of a given photograph, else the average; None where photographs do not differ."""
         if not self.is_active:
             return None
         if self.found is not None and "appearance" not in method.settings:

@@ -25,7 +25,7 @@ from ...method.capabilities import ColourPairs
 from ...method.depth import depth_layers, depth_terms
 from ..fields.teacher import teacher_of
 from ..training.pose_refinement import PoseRefinement
-from .addition import Addition, Step
+from .addition import Addition, Step, TrainingViews
 from .appearance import SplatAppearance
 from .cloud import Cloud, picture_share, thinned
 from .dense_points import Points, compile_sweep, seen_points
@@ -97,7 +97,7 @@ class CloudMethod(Method, ABC):
         sweep = cache(partial(seen_points, data, SWEEP_SHARE * seconds))
         self.begin_with(self.first_cloud(data, sweep), data.cameras[data.splits["train"]])
         for part in self.additions:
-            part.begin_scene(self, data, sweep)
+            part.begin_scene(self.cloud, self.views, data, sweep)
         super().begin(data, seconds)
 
     def first_cloud(self, data: Scene, sweep: Callable[[], Points]) -> Gaussians:
@@ -122,7 +122,7 @@ class CloudMethod(Method, ABC):
         self.cloud.set_extent(cameras)
         self.cameras = cameras
         for part in self.additions:
-            part.begin_cloud(self)
+            part.begin_cloud(self.cloud, self.views, self.random(5))
 
     # Optimisation (section 5)
 
@@ -165,12 +165,29 @@ class CloudMethod(Method, ABC):
             times //= 2
         return times
 
+    @property
+    def views(self) -> TrainingViews:
+        return TrainingViews(self.cameras, self.refined, self.near_plane, self.frame.near, self.moves_cameras)
+
+    def moment_of(self, camera: Camera | None = None) -> float:
+        """Moment of a camera, in a scene that moves."""
+        return 0.0
+
+    def step_on(self, photograph: Photograph, number: int) -> Step:
+        """A step that begins, on a photograph."""
+        cloud, moment = self.filtered(), self.moment_of(photograph.camera)
+        return Step(
+            photograph, self.random(~number), cloud, cloud, photograph.camera, self.cloud, self.prune, self.views,
+            number, self.random(number), self.progress, int(self.drawn), self.bands, moment,
+            differ=self.appearance is not None and self.appearance.is_active,
+            full_size=self.progress >= self.config.half_resolution_until)  # fmt: skip
+
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         """The absolute error and D-SSIM of a picture (eq. 7), and the terms of additions."""
-        c, cloud = self.config, self.filtered()
-        now = self.current = Step(batch, self.random(~step), cloud, cloud, batch.camera)
+        c, now = self.config, self.step_on(batch, step)
+        self.current = now
         for part in self.additions:
-            part.before_raster(self, now)
+            part.before_raster(now)
         if self.poses:
             now.cloud, now.camera = seen_from(self.poses, now.cloud, now.camera)
         now.picture = splat(now.cloud, view_of(now.camera, self.near_plane), self.bands, TRANSMITTANCE_THRESHOLD)
@@ -181,20 +198,20 @@ class CloudMethod(Method, ABC):
             now.background = torch.rand(3, generator=now.chance).to(self.device)
         now.target = batch.before(now.background)
         for part in self.additions:
-            part.after_raster(self, now)
+            part.after_raster(now)
         if now.background.any():
             now.rgb = over(now.rgb, now.picture.opacity, now.background)
         if batch.mask is not None:
             now.target = torch.where(batch.mask[..., None], now.target, now.rgb.detach())
         now.residual = (now.rgb - now.target).detach()
         for part in self.additions:
-            part.mask(self, now)
+            part.mask(now)
         ssim, l1 = kernels.photometric(now.rgb, now.target)
         now.terms |= {"l1": (1 - c.ssim_weight) * l1, "ssim": c.ssim_weight * (1 - ssim)}
         if batch.extra:
             now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:
-            part.regularize(self, now)
+            part.regularize(now)
         return now.terms
 
     @torch.no_grad()
@@ -204,6 +221,8 @@ class CloudMethod(Method, ABC):
         now.due = self.density_control.due(step, self.progress)
         if now.camera.image_index is not None:
             self.cloud.record_view(now.camera.image_index, now.picture.centres.grad.ne(0).any(-1))
+        for part in self.additions:
+            part.finish(now)
         super().after_step(step)
         self.figures |= {"mse": float(now.residual.square().mean()), "gaussians": len(self.cloud)}
         self.current = None

@@ -6,7 +6,7 @@ import math
 import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 from ...errors import LumigraphWarning
 from ...files.ranges import NonNegative, Share, between
 from ...system.memory import room_for
-from .addition import Addition
+from .addition import Addition, Step, TrainingViews
 from .cloud import Cloud
 from .interval_schedule import IntervalSchedule, intervals
 
@@ -53,11 +53,11 @@ class DensityControl(Addition, ABC):
         self.warned = False
 
     @abstractmethod
-    def after_step(self, method: Any, step: int) -> None:
-        """Change the cloud if due."""
+    def finish(self, step: Step) -> None:
+        """Change the cloud where that is due."""
 
-    def begin_cloud(self, method: Any) -> None:
-        self.initial_count.fill_(len(method.cloud))
+    def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
+        self.initial_count.fill_(len(cloud))
 
     def due(self, step: int, progress: float) -> bool:
         """True if the cloud may change after this step; called once a step."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ...gaussians import Gaussians
-from .addition import Addition
+from .addition import Addition, Step
 from .cloud import zero_unobserved_sh
 
 NEAR_ZONE = 2.5  # times the frame's near distance: up to there a Gaussian needs MIN_NEAR_VIEWS
@@ -43,18 +42,18 @@ class Tidying(Addition):
         self.rules = rules
 
     @torch.no_grad()
-    def after_step(self, method: Any, step: int) -> None:
-        cloud, cameras, rules = method.cloud, method.cameras, self.rules
+    def finish(self, step: Step) -> None:
+        cloud, views, cameras, rules = step.learnt, step.views, step.views.cameras, self.rules
         limits = rules.limit_scale, rules.limit_anisotropy
-        if method.current.due and (rules.prune_near or any(limits)):
-            distance = camera_distance(cloud.means, method.refined(cameras).position.to(cloud.means.device))
-            near = near_camera(distance, cloud.view_count, method.frame.near)
-            known = rules.prune_near and int(method.drawn) >= PASSES_BEFORE_PRUNING * len(cameras)
+        if step.due and cameras is not None and (rules.prune_near or any(limits)):
+            distance = camera_distance(cloud.means, views.refined(cameras).position.to(cloud.means.device))
+            near = near_camera(distance, cloud.view_count, views.near)
+            known = rules.prune_near and step.drawn >= PASSES_BEFORE_PRUNING * len(cameras)
             if known and near.any() and not near.all():
-                method.prune(~near)
+                step.prune(~near)
                 distance = distance[~near]
             cloud.log_scales.copy_(clamped_scales(cloud.gaussians(), distance, float(cloud.extent), *limits))
-        if method.bands > 1 and rules.observed_harmonics:
+        if step.bands > 1 and rules.observed_harmonics:
             zero_unobserved_sh(cloud.harmonics, cloud.view_bits)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +22,7 @@ from ...exchange.bones import SUFFIXES, read_motion
 from ...files.ranges import Layers, LearningRate, Share, Width
 from ...geometry import multiply, to_matrix, to_quaternion
 from ...method import Part
-from ...method.controls import Control, moment
+from ...method.controls import Control, Value, moment
 from ..training.pose_refinement import PoseAdam
 from ..training.schedules import falling
 
@@ -156,10 +157,10 @@ class BoneMotion(Part):
         return torch.lerp(first, second, share), torch.lerp(self.positions[before], self.positions[after], share)
 
     def shown(
-        self, method: Any, times: Float[Tensor, " time"]
+        self, settings: Mapping[str, Value], times: Float[Tensor, " time"]
     ) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
-        """Rotations and positions of joints under the method's settings: of the capture, or of a user's poses."""
-        if (path := str(method.settings.get("pose", CAPTURED))) == CAPTURED:
+        """The same under settings: of the capture, or of a user's poses."""
+        if (path := str(settings.get("pose", CAPTURED))) == CAPTURED:
             return self.local(times)
         if path == AT_REST:
             home = rigid_inverse(self.home)
@@ -180,9 +181,9 @@ class BoneMotion(Part):
         joints = posed(self.skeleton.parents, torch.cat([matrices, places[..., None]], -1))
         return rigid_product(joints, self.home.expand_as(joints))
 
-    def at(self, method: Any, time: float) -> Float[Tensor, "bone 3 4"]:
-        """Transforms of the bones at a time under the method's settings."""
-        return self.transforms(*self.shown(method, torch.tensor([time], device=self.times.device)))[0]
+    def at(self, settings: Mapping[str, Value], time: float) -> Float[Tensor, "bone 3 4"]:
+        """Transforms of the bones at a moment under settings."""
+        return self.transforms(*self.shown(settings, torch.tensor([time], device=self.times.device)))[0]
 
     # Learning
 

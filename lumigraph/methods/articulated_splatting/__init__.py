@@ -43,7 +43,7 @@ INITIALIZATION: Initialization = "random"  # an option of older runs; first Gaus
 
 @dataclass(frozen=True)
 class Config:
-    """Numbers of MANUS from memory, and Kerbl's (2023) of the cloud; `cpu_preset` has those of a plain CPU."""
+    """Kerbl's (2023) numbers of the cloud, as in MANUS; those of bones and weights are ours, not the paper's."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
     ssim_weight: ClassVar[float] = SSIM_WEIGHT
@@ -113,7 +113,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
 
     def at(self, canonical: Gaussians, time: float) -> Gaussians:
         """A canonical cloud at a moment under the settings, as a picture or a map of contact."""
-        cloud = self.skin.at(self, canonical, time)
+        cloud = self.skin.at(self.settings, canonical, time)
         if self.settings.get("show", PICTURE) == PICTURE:
             return cloud
         return contact_map(cloud, self.body_of(canonical), self.config.contact_distance)

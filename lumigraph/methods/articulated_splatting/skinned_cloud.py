@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from ...components.skinning.weight_volume import WeightNumbers, WeightVolume, se
 from ...datasets.scene import Frame
 from ...gaussians import Gaussians
 from ...geometry import multiply, to_quaternion
+from ...method.controls import Value
 
 LONE_REACH = 0.25  # deviation of places about a lone bone, in distances to the nearest other
 
@@ -49,12 +50,12 @@ class SkinnedCloud(Addition):
         spread = radius[chosen] * torch.randn(count, 3, generator=generator)
         return torch.lerp(starts[chosen], ends[chosen], share) + spread
 
-    def before_raster(self, method: Any, step: Step) -> None:
-        step.cloud = self.at(method, step.cloud, method.moment_of(step.camera))
+    def before_raster(self, step: Step) -> None:
+        step.cloud = self.at({}, step.cloud, step.moment)
 
-    def at(self, method: Any, cloud: Gaussians, time: float) -> Gaussians:
-        """The cloud at a moment under the method's settings."""
-        return skinned(cloud, self.weights(cloud.means), self.bones.at(method, time))
+    def at(self, settings: Mapping[str, Value], cloud: Gaussians, time: float) -> Gaussians:
+        """The cloud at a moment under settings."""
+        return skinned(cloud, self.weights(cloud.means), self.bones.at(settings, time))
 
 
 def skinned(

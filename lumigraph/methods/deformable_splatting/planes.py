@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.functional import normalize
 
-from ...components.clouds.addition import Addition, Step
+from ...components.clouds.addition import Addition, Step, TrainingViews
+from ...components.clouds.cloud import Cloud
 from ...components.training.schedules import falling
 from ...datasets.scene import Frame
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Share, between
@@ -212,9 +213,9 @@ class PlaneMotion(Addition):
 
     # Learning
 
-    def begin_cloud(self, method: Any) -> None:
-        self.extent.copy_(method.cloud.extent)
-        self.follow_cloud(method.cloud.means.detach())
+    def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
+        self.extent.copy_(cloud.extent)
+        self.follow_cloud(cloud.means.detach())
 
     @torch.no_grad()
     def follow_cloud(self, means: Float[Tensor, "gaussian 3"], apart: bool = False) -> None:
@@ -266,10 +267,10 @@ class PlaneMotion(Addition):
     def before_step(self, method: Any, step: int, progress: float) -> None:
         self.active.fill_(progress >= self.numbers.still_until)
 
-    def before_raster(self, method: Any, step: Step) -> None:
-        step.cloud = self.at(step.cloud, method.moment_of(step.camera))
+    def before_raster(self, step: Step) -> None:
+        step.cloud = self.at(step.cloud, step.moment)
 
-    def regularize(self, method: Any, step: Step) -> None:
+    def regularize(self, step: Step) -> None:
         """Smooth planes, and neighbours at fixed places in each other's frame (Luiten 2024, eq. 9)."""
         if not self.active:
             return
@@ -277,7 +278,7 @@ class PlaneMotion(Addition):
         space, calm, moving = self.planes.terms()
         step.terms["planes"] = PLANE_SMOOTHNESS * space + n.time_smoothness * calm + TIME_SPARSITY * moving
         if n.rigidity:
-            step.terms["rigidity"] = n.rigidity * self.bending(step.whole, method.moment_of(step.camera), step.chance)
+            step.terms["rigidity"] = n.rigidity * self.bending(step.whole, step.moment, step.chance)
 
     def bending(self, cloud: Gaussians, time: float, chance: torch.Generator) -> Float[Tensor, ""]:
         """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
@@ -301,10 +302,10 @@ class PlaneMotion(Addition):
         near = apart.square().sum(-1).clamp_min(MIN_DISTANCE**2)
         return (change.square().sum(-1) / near).mean()
 
-    def after_step(self, method: Any, step: int) -> None:
-        if method.current.due or len(self.moves) != len(method.cloud):
-            apart = bool(self.active) and method.progress >= TOLD_APART
-            self.follow_cloud(method.cloud.means.detach(), apart)
+    def finish(self, step: Step) -> None:
+        if step.due or len(self.moves) != len(step.learnt):
+            apart = bool(self.active) and step.progress >= TOLD_APART
+            self.follow_cloud(step.learnt.means.detach(), apart)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         n = self.numbers

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +17,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...camera import Camera
-from ...components.clouds.addition import Addition, Step
+from ...components.clouds.addition import Addition, Step, TrainingViews
+from ...components.clouds.cloud import Cloud
 from ...components.clouds.dense_points import Points, compile_sweep
 from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
@@ -83,9 +84,9 @@ class FewViews(Addition):
     def compile_begin(self) -> None:
         compile_sweep()
 
-    def begin_scene(self, method: Any, data: Scene, sweep: Callable[[], Points]) -> None:
+    def begin_scene(self, cloud: Cloud, views: TrainingViews, data: Scene, sweep: Callable[[], Points]) -> None:
         """Decide whether the capture is sparse, and keep what plane sweeps have found."""
-        if method.moves_cameras:
+        if views.move:
             return
         count = len(data.splits["train"])
         if self.numbers.few_views == "auto":
@@ -96,16 +97,16 @@ class FewViews(Addition):
             found = sweep()
             self.surface, self.surface_colours = (x.to(self.surface) for x in (found.positions, found.colours))
 
-    def before_raster(self, method: Any, step: Step) -> None:
+    def before_raster(self, step: Step) -> None:
         if self.active:
-            step.cloud = drop_gaussians(step.cloud, MAX_DROP_RATE * method.progress, step.chance)
+            step.cloud = drop_gaussians(step.cloud, MAX_DROP_RATE * step.progress, step.chance)
 
-    def regularize(self, method: Any, step: Step) -> None:
-        if not self.active or method.cameras is None:
+    def regularize(self, step: Step) -> None:
+        if not self.active or step.views.cameras is None:
             return
-        camera = camera_between(method.cameras, step.chance).to(method.device)
+        camera = camera_between(step.views.cameras, step.chance).to(step.whole.means.device)
         camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
-        seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
+        seen = splat(step.whole, view_of(camera, step.views.near_plane), bands=1)
         step.terms["depth"] = ROUGHNESS_WEIGHT * depth_roughness(seen)
         if len(self.surface):
             place, depth, index = visible_points(self.surface, camera)

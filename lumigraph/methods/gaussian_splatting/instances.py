@@ -14,13 +14,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy, log_softmax
 
-from ...components.clouds.addition import Addition, Step
+from ...components.clouds.addition import Addition, Step, TrainingViews
+from ...components.clouds.cloud import Cloud
 from ...components.instances import ALONE, check_labels, edit_controls, edit_of, labels_of, layers_of
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored
 from ...files.ranges import LearningRate, Share, Steps, between
 from ...gaussians import Gaussians, joined
-from ...method.controls import Control
+from ...method.controls import Configured, Control
 
 CHANNELS = 4  # numbers that one pass of the rasteriser composites: three colours and a depth
 FIRST_DEVIATION = 0.1  # of the numbers of codes at first
@@ -71,15 +72,13 @@ class Identities(Addition):
 
     # Following the cloud
 
-    def begin_scene(self, method: Any, data: Scene, sweep: Any) -> None:
+    def begin_scene(self, cloud: Cloud, views: TrainingViews, data: Scene, sweep: Any) -> None:
         check_labels(data)
 
-    def begin_cloud(self, method: Any) -> None:
+    def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
         """Random codes for a new cloud."""
-        count = len(method.cloud)
-        chance = method.random(5)
-        drawn = FIRST_DEVIATION * torch.randn(count, self.numbers.identity_code, generator=chance)
-        self._set(drawn.to(self.places.device), method.cloud.means.detach().clone())
+        drawn = FIRST_DEVIATION * torch.randn(len(cloud), self.numbers.identity_code, generator=chance)
+        self._set(drawn.to(self.places.device), cloud.means.detach().clone())
 
     def follow(self, means: Float[Tensor, "gaussian 3"]) -> None:
         """Codes for a cloud whose Gaussians were cloned, split or pruned: of the nearest old one."""
@@ -114,12 +113,12 @@ class Identities(Addition):
 
     # Learning
 
-    def regularize(self, method: Any, step: Step) -> None:
+    def regularize(self, step: Step) -> None:
         """Cross entropy of rendered identities, and the neighbours' agreement (eqs. 3 and 4)."""
         n = self.numbers
-        if method.progress < n.identity_start or int(method.drawn) % n.identity_interval:
+        if step.progress < n.identity_start or step.drawn % n.identity_interval:
             return
-        self.follow(method.cloud.means)
+        self.follow(step.learnt.means)
         labels, known = labels_of(step.photograph.extra, step.photograph.alpha, n.instances)
         self.seen[labels[labels >= 0].unique()] = True
         logits = self.classifier(self.rendered(step))
@@ -165,7 +164,7 @@ class Identities(Addition):
     def controls(self) -> tuple[Control, ...]:
         return edit_controls(self.seen, 1.0)
 
-    def recoloured_cloud(self, method: Any, cloud: Gaussians) -> Gaussians:
+    def recoloured_cloud(self, method: Configured, cloud: Gaussians) -> Gaussians:
         """The cloud under the edit of the settings."""
         edit = edit_of(method)
         if edit is None:

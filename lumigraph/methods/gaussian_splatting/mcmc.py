@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -39,23 +38,24 @@ class MarkovChain(DensityControl):
         super().__init__(refine)
         self.numbers = numbers
 
-    def regularize(self, method: Any, step: Step) -> None:
+    def regularize(self, step: Step) -> None:
         """Regularisers of opacity and scale (eq. 11)."""
         whole = step.whole
         step.terms["opacity"] = OPACITY_REGULARIZATION * whole.opacities.sigmoid().mean()
-        step.terms["scale"] = SCALE_REGULARIZATION / float(method.cloud.extent) * whole.log_scales.exp().mean()
+        step.terms["scale"] = SCALE_REGULARIZATION / float(step.learnt.extent) * whole.log_scales.exp().mean()
 
     @torch.no_grad()
-    def after_step(self, method: Any, step: int) -> None:
-        cloud, generator = method.cloud, method.random(step)
-        if method.current.due and method.progress < LAST_RELOCATION:
+    def finish(self, step: Step) -> None:
+        cloud, generator = step.learnt, step.refining
+        if step.due and step.progress < LAST_RELOCATION:
             count = wanted = len(cloud)
-            if method.progress < self.refining.refine_until:
-                joined = int(self.initial_count) + step * self.numbers.joining_per_step
+            if step.progress < self.refining.refine_until:
+                joined = int(self.initial_count) + step.number * self.numbers.joining_per_step
                 wanted = int(max(GROWTH_FACTOR * count, joined))
             if wanted > max(cap := self.max_count(cloud), count) and cap < self.allowed():
                 self.warn_full(cloud)
             self.refine(cloud, min(wanted, max(cap, count)), generator)
+        assert cloud.optimizer is not None
         self.explore(cloud, cloud.optimizer.param_groups[0]["lr"], generator)
 
     @torch.no_grad()

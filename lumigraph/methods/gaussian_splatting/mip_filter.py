@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ...camera import Camera
-from ...components.clouds.addition import Addition
+from ...components.clouds.addition import Addition, Step, TrainingViews
+from ...components.clouds.cloud import Cloud
 from ...gaussians import Gaussians
 from ...gaussians.splatting import view_of
 
@@ -38,12 +39,13 @@ class MipFilter(Addition):
         super().__init__()
         self.register_buffer("interval", torch.zeros(count))
 
-    def begin_cloud(self, method: Any) -> None:
-        self.interval = sampling_interval(method.cloud.means, method.cameras, method.near_plane)
+    def begin_cloud(self, cloud: Cloud, views: TrainingViews, chance: torch.Generator) -> None:
+        assert views.cameras is not None
+        self.interval = sampling_interval(cloud.means, views.cameras, views.near_plane)
 
-    def after_step(self, method: Any, step: int) -> None:
-        if method.current.due or len(method.cloud) != len(self.interval):
-            self.begin_cloud(method)
+    def finish(self, step: Step) -> None:
+        if step.due or len(step.learnt) != len(self.interval):
+            self.begin_cloud(step.learnt, step.views, step.chance)
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
         self.interval = self.interval[keep]

@@ -8,7 +8,7 @@ pixels, which go on counting.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -46,18 +46,18 @@ class RobustMask(Addition):
         self.numbers = numbers
         self.register_buffer("histogram", torch.zeros(BINS))
 
-    def is_active(self, method: Any) -> bool:
+    def is_active(self, step: Step) -> bool:
         """True if pixels are left out: always, or with the setting auto where photographs differ."""
-        return self.numbers.robust == "yes" or (method.appearance is not None and method.appearance.is_active)
+        return self.numbers.robust == "yes" or step.differ
 
-    def mask(self, method: Any, step: Step) -> None:
-        if self.is_active(method) and method.progress >= ROBUST_START:
+    def mask(self, step: Step) -> None:
+        if self.is_active(step) and step.progress >= ROBUST_START:
             counted = inliers(step.residual.abs().mean(-1), self.threshold)
             step.target = torch.where(counted[..., None], step.target, step.rgb.detach())
 
-    def after_step(self, method: Any, step: int) -> None:
-        if self.is_active(method):
-            self.record(method.current.residual.abs().mean(-1))
+    def finish(self, step: Step) -> None:
+        if self.is_active(step):
+            self.record(step.residual.abs().mean(-1))
 
     @property
     def threshold(self) -> float:

@@ -14,9 +14,9 @@ import torch
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
-from ...components.clouds.addition import Addition, Step
+from ...components.clouds.addition import Addition, Step, TrainingViews
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import HasteNumbers
+from ...components.clouds.cloud import Cloud, HasteNumbers
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
 from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
 from ...components.clouds.cloud_method import SSIM_WEIGHT, TRANSMITTANCE_THRESHOLD, CloudMethod
@@ -102,25 +102,25 @@ class Planes(Addition):
         super().__init__()
         self.numbers = numbers
 
-    def begin_scene(self, method: Any, data: Scene, sweep: Any) -> None:
+    def begin_scene(self, cloud: Cloud, views: TrainingViews, data: Scene, sweep: Any) -> None:
         if self.numbers.discs:
-            method.cloud.replace(discs(method.cloud.gaussians()))
+            cloud.replace(discs(cloud.gaussians()))
 
-    def regularize(self, method: Any, step: Step) -> None:
+    def regularize(self, step: Step) -> None:
         """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms."""
         c, cloud = self.numbers, step.cloud
         visible = step.picture.opacities > 0
         step.terms["flatness"] = FLATNESS_WEIGHT * cloud.log_scales[visible].amin(-1).exp().mean()
-        if method.progress < c.consistency_from:
+        if step.progress < c.consistency_from:
             return
         here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera, c.stop))
         step.terms["normals"] = c.normal_weight * single_view_error(here)
         other = step.photograph.other if isinstance(step.photograph, Pair) else None
         if other is None or not (c.photometric_weight or c.geometric_weight):
             return
-        camera = method.refined(other.camera)
+        camera = step.views.refined(other.camera)
         with torch.set_grad_enabled(c.both_views):
-            picture = splat(step.whole, view_of(camera, method.near_plane), 1, TRANSMITTANCE_THRESHOLD)
+            picture = splat(step.whole, view_of(camera, step.views.near_plane), 1, TRANSMITTANCE_THRESHOLD)
             there = PlaneView(camera, grey_of(other), plane_maps(step.whole, picture, camera, c.stop))
         middle = patch_centres(step.photograph, here.maps, c.patch_side, c.patches, step.chance)
         photometric, geometric = multi_view_errors(here, there, *middle, c.patch_side)
