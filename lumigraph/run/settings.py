@@ -117,44 +117,30 @@ def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[s
     """JSON of a Config, each option at its place in this version; no two options of a Config have one name. Options
     that are constants now, by their names in capitals beside the Config or a part of it, are left out, with a warning
     of another value."""
-    parts, made = [*parts_of(kind)], dict[str, Any]()
-    places = {name: (*path, name) for path, part in parts for name in hints(part)}
-    modules = [vars(sys.modules[part.__module__]) for _, part in parts]
-    for path, value in leaves(said):
-        name = path[-1]
+    found, owners = dict(leaves(said)), list[type]()
+
+    def placed(part: Any) -> dict[str, Any]:
+        owners.append(part)
+        inner = {name: held for name, held in hints(part).items() if is_dataclass(held)}
+        own = {name: found.pop(name) for name in hints(part).keys() - inner if name in found}
+        return own | {name: placed(held) for name, held in inner.items()}
+
+    made = placed(kind)
+    modules = [vars(sys.modules[owner.__module__]) for owner in owners]
+    for name, value in found.items():
         constants = [module[name.upper()] for module in modules if name.upper() in module]
-        if name in places or not constants:
-            put(made, places.get(name, path), value)
+        if not constants:
+            made[name] = value
         elif value not in map(msgspec.to_builtins, constants):
             text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constants[0])} now"
             warnings.warn(text, LumigraphWarning, stacklevel=2)
     return made
 
 
-def parts_of(kind: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """A dataclass and those that it holds, each after its path."""
-    yield path, kind
-    for name, part in hints(kind).items():
-        if is_dataclass(part):
-            yield from parts_of(part, (*path, name))
-
-
-def leaves(said: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Values of nested JSON that are no dictionaries, each after its path."""
+def leaves(said: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Values of nested JSON that are no dictionaries, by their names."""
     for name, value in said.items():
-        if isinstance(value, dict):
-            yield from leaves(value, (*path, name))
-        else:
-            yield (*path, name), value
-
-
-def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
-    """Set a value at a path of nested JSON, unless something else than a dictionary is on the way."""
-    for name in path[:-1]:
-        made = made.setdefault(name, {})
-        if not isinstance(made, dict):
-            return
-    made[path[-1]] = value
+        yield from leaves(value) if isinstance(value, dict) else [(name, value)]
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:

@@ -23,7 +23,18 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
+from ...files.ranges import (
+    BatchSize,
+    LearningRate,
+    NonNegative,
+    Positive,
+    PositiveShare,
+    Seed,
+    Share,
+    Steps,
+    between,
+    changed,
+)
 from ...kernels import total_variation
 from ...kernels.harmonic_grid import BANDS
 from ...method import Field, FieldMethod
@@ -170,30 +181,25 @@ class Plenoxels(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        occupancy = OccupancyNumbers(1 << 16, 1e-3, occupancy_threshold=0.02)
-        c = Config(
-            occupancy,
+        return changed(
+            Config(), samples_per_step=1 << 16, transmittance_threshold=1e-3, occupancy_threshold=0.02,
+            base_resolution=128, max_resolution=192, open_base_resolution=64, open_max_resolution=192,
+            refine_until=0.4, step_size=1.0, rays_per_step=4096, tv_share=0.1, tv_interval=8, sparsity=0.0,
+            density_learning_rate=40.0, final_density_learning_rate=4.0, density_delay=0.2,
+            harmonics_learning_rate=0.15, final_harmonics_learning_rate=0.02, occupancy_resolution=128,
             occupancy_interval=16,
-            base_resolution=128,
-            max_resolution=192,
-            open_base_resolution=64,
-            open_max_resolution=192,
-        )
-        c = replace(c, refine_until=0.4, step_size=1.0, rays_per_step=4096, tv_share=0.1, tv_interval=8, sparsity=0.0)
-        c = replace(c, density_learning_rate=40.0, final_density_learning_rate=4.0, density_delay=0.2)
-        return replace(c, harmonics_learning_rate=0.15, final_harmonics_learning_rate=0.02)
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A grid of three sizes with every loss, within some twenty quick steps."""
-        occupancy = replace(Config().occupancy, occupancy_resolution=16)
-        c = Config(occupancy, base_resolution=8, max_resolution=32, open_base_resolution=8, open_max_resolution=32)
-        c = replace(
-            c, occupancy_interval=4, refine_until=0.5, step_size=1.0, rays_per_step=128, tv_share=0.5, tv_interval=2
-        )
-        c = replace(c, density_learning_rate=60.0, final_density_learning_rate=10.0, density_delay=0.1)
-        c = replace(c, harmonics_learning_rate=0.2, final_harmonics_learning_rate=0.05)
-        return replace(c, sparsity=1e-5, beta=1e-4, exposure_correction="yes")
+        return changed(
+            Config(), occupancy_resolution=16, occupancy_interval=4, base_resolution=8, max_resolution=32,
+            open_base_resolution=8, open_max_resolution=32, refine_until=0.5, step_size=1.0, rays_per_step=128,
+            tv_share=0.5, tv_interval=2, density_learning_rate=60.0, final_density_learning_rate=10.0,
+            density_delay=0.1, harmonics_learning_rate=0.2, final_harmonics_learning_rate=0.05, sparsity=1e-5,
+            beta=1e-4, exposure_correction="yes",
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
