@@ -23,17 +23,7 @@ from ...components.training.row_optimizers import LazyAdam
 from ...components.training.schedules import BandSchedule, exponential_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import (
-    BatchSize,
-    Cells,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Seed,
-    Share,
-    Width,
-    between,
-)
+from ...files.ranges import BatchSize, Cells, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...method import seeded
 from .fields import LOGIT_SCALE, OccupancyField, TableField
 

@@ -22,17 +22,7 @@ from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import (
-    Layers,
-    NonNegative,
-    Octaves,
-    PositiveShare,
-    Seed,
-    Share,
-    Width,
-    between,
-    changed,
-)
+from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between, changed
 from ...method import FieldMethod, Pass, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density

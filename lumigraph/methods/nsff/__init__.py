@@ -17,13 +17,7 @@ from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import (
-    NonNegative,
-    PositiveShare,
-    Seed,
-    between,
-    changed,
-)
+from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
 from ...method import FieldMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Densities, Directions, Points

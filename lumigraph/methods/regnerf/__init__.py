@@ -52,6 +52,7 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     table: HashNumbers = HashNumbers()
     steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
     field: Literal["network", "hash", "auto"] = "network"  # mip-NeRF's network; a faster hash table; auto: see field_of
     unseen_patches: Annotated[int, between(0, 4096)] = 64  # patches of 8 x 8 unobserved rays in a step; 0: none
     depth_weight: NonNegative = 0.1  # weight of depth's roughness in these patches, eq. 6; higher smooths depth
@@ -84,7 +85,6 @@ class Config:
     table_occupancy_threshold: NonNegative = 0.05  # of the table: optical thickness of an empty cell; higher: faster
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # of the hash table: residual at which the loss turns from squared to linear
-    sweep_weight: NonNegative = 0.03  # of the hash table: weight of plane-sweep depth in the open at first; 0: off
 
     @property
     def occupancy(self) -> OccupancyNumbers:
@@ -93,11 +93,6 @@ class Config:
         return OccupancyNumbers(
             self.samples_per_step, self.transmittance_threshold, cells, self.table_occupancy_threshold
         )
-
-    @property
-    def proposals(self) -> ProposalNumbers:
-        """Numbers of the hash table's samples in scenes without bounds."""
-        return ProposalNumbers(sweep_weight=self.sweep_weight)
 
 
 ANNEALING_START = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
