@@ -185,6 +185,7 @@ def learner(method: str, scene: str) -> None:
     from lumigraph import methods  # ahead of PyTorch, as the command line does; isort: skip
     import torch
 
+    from lumigraph.files.ranges import changed
     from lumigraph.opening import open_scene
     from lumigraph.run import build
     from lumigraph.training import Descent, set_learning_rate
@@ -192,7 +193,7 @@ def learner(method: str, scene: str) -> None:
     data, kind, device = open_scene(scene), methods.find(method), torch.device("cpu")
     config = kind.preset(device)
     if method == "gaussian-splatting":
-        config = dataclasses.replace(config, refine_every=1_000_000_000)
+        config = changed(config, refine_until=0.0)
     model = build(kind, data.frame, config, device, 0).train()
     optimizers, generator, step = model.optimizers(), torch.Generator().manual_seed(0), 0
     model.begin(data)

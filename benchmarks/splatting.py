@@ -20,6 +20,7 @@ import tyro
 from rich.table import Table
 
 from lumigraph import kernels, methods
+from lumigraph.components.clouds import cloud_method
 from lumigraph.files import write_json
 from lumigraph.files.ranges import changed
 from lumigraph.gaussians import Gaussians, splatting
@@ -59,13 +60,8 @@ def main(options: Options) -> None:
 def steps(options: Options, device: torch.device) -> list[dict]:
     """Milliseconds of each part of a training step, at several sizes of the cloud."""
     scene, kind = open_scene(str(options.scene), downscale=options.downscale), methods.find("gaussian-splatting")
-    numbers = {
-        "refine_from": 100,
-        "sh_degree_interval": 1,
-        "half_resolution_until": 0.0,
-        "max_gaussians": 2 * max(options.sizes),
-    }
-    config = changed(kind.preset(device), **numbers)
+    cloud_method.SH_DEGREE_INTERVAL = 1  # all bands are in use
+    config = changed(kind.preset(device), half_resolution_until=0.0, max_gaussians=2 * max(options.sizes))
     method = build(kind, scene.frame, config, device, 0)
     optimizers, generator = method.optimizers(), torch.Generator().manual_seed(0)
     method.begin(scene)

@@ -27,6 +27,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 from lumigraph import methods
 from lumigraph.components.guidance import open_guide
 from lumigraph.components.guidance.guides import ClipGuide
+from lumigraph.components.guidance.part import CAMERA_DISTANCE
 from lumigraph.components.guidance.views import camera_around
 from lumigraph.datasets.words import Words
 from lumigraph.figures import Row, contact_sheet, save_picture
@@ -121,7 +122,7 @@ def views(method: Any, size: int) -> Tensor:
     azimuth = torch.arange(VIEWS) * (360 / VIEWS) + 11.0
     n = method.config.guidance
     around = torch.full((VIEWS,), ELEVATION)
-    cameras = camera_around(azimuth, around, n.camera_distance, n.focal, size, method.guidance.origin)
+    cameras = camera_around(azimuth, around, CAMERA_DISTANCE, n.focal, size, method.guidance.origin)
     return torch.stack([method.render(cameras[i]).rgb.clamp(0, 1).movedim(-1, 0) for i in range(VIEWS)])
 
 

@@ -28,6 +28,7 @@ from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, Omnidirectiona
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
 from lumigraph.commands.eval import compared
+from lumigraph.commands.main_options import MAX_SHOWN, option_names
 from lumigraph.components.fields import appearance
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Scene
@@ -187,22 +188,18 @@ def test_a_page_describes_it(name):
     assert f"lumigraph train {name}" in page.read_text("utf-8")
 
 
-def numbers(config: Any) -> list[str]:
-    """The names of a config's fields, and of those of configs within it."""
-    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return [
-        x for name, value in values.items() for x in (numbers(value) if dataclasses.is_dataclass(value) else [name])
-    ]
-
-
 @pytest.mark.parametrize("name", NAMES)
-def test_help_names_its_numbers(name, capsys):
-    with pytest.raises(SystemExit) as done:
-        main(["train", name, "--help"])
-    told = capsys.readouterr().out
-    assert done.value.code == 0
-    for number in numbers(methods.find(name).Config()):
-        assert f"--{number.replace('_', '-')}" in told, number
+def test_help_shows_what_people_set_and_all_on_request(name, capsys):
+    told = {}
+    for asked in ("--help", "--help-all"):
+        with pytest.raises(SystemExit) as done:
+            main(["train", name, asked])
+        assert done.value.code == 0
+        told[asked] = capsys.readouterr().out.partition(f"{name} options")[2]
+    flags = [f"--{number.replace('_', '-')}" for number in option_names(methods.find(name).Config())]
+    assert all(re.search(rf"{flag}\b", told["--help-all"]) for flag in flags)
+    shown = [flag for flag in flags if re.search(rf"{flag}(?![\w-])", told["--help"])]
+    assert min(len(flags), 4) <= len(shown) <= MAX_SHOWN and "Config" not in told["--help-all"], shown
 
 
 # Learning

@@ -12,7 +12,7 @@ from budgets import budget
 from lumigraph.components.clouds.addition import Step
 from lumigraph.geometry import multiply, rotated
 from lumigraph.methods.deformable_splatting import DeformableSplatting
-from lumigraph.methods.deformable_splatting.planes import PAIRS, PlaneMotion, SpaceTimePlanes, spread
+from lumigraph.methods.deformable_splatting.planes import PAIRS, PLANE_SCALES, PlaneMotion, SpaceTimePlanes, spread
 
 pytestmark = budget("methods", 5)
 FRAME = replace(tiny.scene().frame, times=(1.0, 3.0))
@@ -30,14 +30,16 @@ def moving(seed: int = 0) -> DeformableSplatting:
 
 def test_features_are_products_of_interpolated_planes():
     planes = SpaceTimePlanes(DeformableSplatting.smallest().motion)
-    for plane, (a, b) in zip(planes.planes, PAIRS, strict=True):  # each holds a linear function of its two axes
+    for plane, (a, b) in zip(
+        planes.planes, PAIRS * PLANE_SCALES, strict=True
+    ):  # each holds a linear function of its two axes
         rows, columns = (torch.linspace(-1, 1, n) for n in plane.shape[2:])
         plane.data[:] = (2 + a + columns)[None, :] + (0.5 * b * rows)[:, None]
     places = torch.rand(20, 4, generator=torch.Generator().manual_seed(0)) * 2 - 1
     expected = torch.ones(20)
     for a, b in PAIRS:
         expected = expected * (2 + a + places[:, a] + 0.5 * b * places[:, b])
-    torch.testing.assert_close(planes(places), expected[:, None].expand(20, 4))
+    torch.testing.assert_close(planes(places), expected[:, None].expand(20, 4 * PLANE_SCALES))
 
 
 def test_nothing_moves_at_first_and_nothing_leaves_the_scene():

@@ -17,7 +17,7 @@ from lumigraph.components.training.row_optimizers import LazyAdam
 from lumigraph.datasets.scene import Frame
 from lumigraph.evaluation import evaluate
 from lumigraph.lab.explain.activation import fits
-from lumigraph.methods.dvgo import DVGO, point_error, shift_of
+from lumigraph.methods.dvgo import DVGO, FINE_ALPHA, point_error, shift_of
 from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.volume import composite, weights_of
@@ -85,7 +85,7 @@ def test_what_was_dense_stays_as_dense_and_the_rest_begins_anew():
     made._advance(1)
     torch.testing.assert_close(made.density(middle), before, rtol=1e-4, atol=0.0)
     assert float(grid.box.abs().max()) < 0.7
-    free = -math.log1p(-made.config.fine_alpha) / float(made.network.edge)
+    free = -math.log1p(-FINE_ALPHA) / float(made.network.edge)
     assert made.density(outside).item() >= 0.99 * free
     assert made._stage_at(0.0) == 0 and made._stage_at(1.0) == 1 + made.config.doublings
 

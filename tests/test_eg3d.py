@@ -20,6 +20,7 @@ from lumigraph.components.training.adversarial import Discriminator, doubled, ha
 from lumigraph.errors import LumigraphError
 from lumigraph.method import frozen
 from lumigraph.method.controls import Value
+from lumigraph.methods import eg3d as module
 from lumigraph.methods.eg3d import EG3D, labels
 from lumigraph.methods.eg3d.fields import PlaneField
 from lumigraph.methods.eg3d.networks import ModulatedConvolution, SuperResolution, blurred
@@ -212,8 +213,10 @@ def taught(method: EG3D, steps: int) -> list[tuple[list[str], list[int]]]:
     return done
 
 
-def test_a_step_has_two_descents_and_lazy_terms():
-    done = taught(eg3d(r1_interval=2, density_interval=3), 3)
+def test_a_step_has_two_descents_and_lazy_terms(monkeypatch):
+    monkeypatch.setattr(module, "R1_INTERVAL", 2)
+    monkeypatch.setattr(module, "DENSITY_INTERVAL", 3)
+    done = taught(eg3d(), 3)
     assert [chosen for _, chosen in done] == [[1], [0]] * 3
     assert [("r1" in terms) for terms, _ in done[::2]] == [True, False, True]
     assert [("density" in terms) for terms, _ in done[1::2]] == [True, False, False]
@@ -238,8 +241,9 @@ def test_the_generators_step_leaves_the_discriminator_alone():
 
 @pytest.mark.parametrize("probability", [0.0, 1.0])
 def test_the_generator_is_conditioned_on_its_own_pose_or_on_another(probability, monkeypatch):
-    """From a probability of one at first to the Config's."""
-    method, seen = eg3d(swap_probability=probability, swap_pictures=100), []
+    """From a probability of one at first to the paper's."""
+    monkeypatch.setattr(module, "SWAP_PROBABILITY", probability)
+    method, seen = eg3d(swap_pictures=100), []
     views, mapping = some_cameras(4), method.generator.mapping.forward
     monkeypatch.setattr(
         method.generator.mapping, "forward", lambda z, label: (seen.append(label), mapping(z, label))[1]
@@ -260,8 +264,9 @@ def test_the_discriminator_sees_both_resolutions():
     assert eg3d(field="film")._discriminated(pictures, raw, 0.0).shape == (2, 3, 16, 16)
 
 
-def test_the_rendering_grows():
-    method = eg3d(rendering_size=8, final_rendering_size=16, growth_start=0.5)
+def test_the_rendering_grows(monkeypatch):
+    monkeypatch.setattr(module, "GROWTH_START", 0.5)
+    method = eg3d(rendering_size=8, final_rendering_size=16)
     sizes = []
     for progress in (0.0, 0.5, 0.5 + 0.5 / 27.5, 0.6, 1.0):
         method.before_step(0, progress)
@@ -331,9 +336,10 @@ def test_pictures_of_many_are_those_of_each():
     torch.testing.assert_close(found[1], alone[0].permute(1, 2, 0))
 
 
-def test_an_inversion_comes_closer_to_its_photograph():
+def test_an_inversion_comes_closer_to_its_photograph(monkeypatch):
     """By the best of some styles, by descent from it, and further by the tuned generator; the prior itself is left as
     it was."""
+    monkeypatch.setattr(module, "MAPPING_LAYERS", 1)
     method = eg3d(code_steps=0, tune_steps=0).eval()
     scene = tiny_collection.tinted("green")
     one = replace(scene, splits={"train": scene.splits["train"][:1]})
@@ -344,7 +350,8 @@ def test_an_inversion_comes_closer_to_its_photograph():
     best = method.given(one)
     method.config = replace(method.config, code_steps=10)
     found = method.given(one)
-    method.config = replace(method.config, tune_steps=40, tune_learning_rate=1e-2)
+    monkeypatch.setattr(module, "TUNE_LEARNING_RATE", 1e-2)
+    method.config = replace(method.config, tune_steps=40)
     tuned = method.given(one)
     scores = [psnr(x.render(camera).rgb.clamp(0, 1), truth) for x in (method, best, found, tuned)]
     assert scores[0] + 1 < scores[1] and scores[1] + 0.5 < scores[2] and scores[2] + 1 < scores[3], scores

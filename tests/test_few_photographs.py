@@ -94,7 +94,7 @@ def test_a_wall_is_smoother_than_a_heap():
 
 
 def test_few_views_have_plain_colours_and_a_term_of_depth():
-    method, _ = new(few_views="yes", roughness_weight=2.0)
+    method, _ = new(few_views="yes")
     scene = replace(tiny.scene(), splits={"train": torch.arange(5)})
     fit(method, scene, steps=12, show=False, rehearsal=False)
     assert method.bands == 1 and not method.cloud.harmonics[:, 1:].any()

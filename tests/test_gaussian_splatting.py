@@ -27,8 +27,6 @@ from lumigraph.training import fit
 
 pytestmark = [budget("methods", 10), pytest.mark.filterwarnings("ignore:The cloud stops growing")]
 GROWING = {
-    "refine_from": 10,
-    "refine_every": 10,
     "densify_grad_threshold": 1e-5,
     "max_gaussians": 600,
     "cap_ramp": True,

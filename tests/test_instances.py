@@ -22,9 +22,7 @@ from lumigraph.selection.distilled import CloudWeigher
 
 pytestmark = budget("methods", 5)
 
-NUMBERS = InstanceNumbers(
-    "yes", instances=2, identity_code=4, identity_lr=0.1, classifier_lr=0.1, neighbour_samples=512
-)
+NUMBERS = InstanceNumbers("yes", instances=2, identity_code=4, identity_lr=0.1, classifier_lr=0.1)
 EYES = (-3.0, 0.3, 0.8), (0.2, -3.0, 0.5), (3.0, 0.2, 0.3), (-0.3, 3.0, 0.9)
 
 

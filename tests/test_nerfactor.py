@@ -184,11 +184,10 @@ def test_lights_that_cannot_be(tmp_path):
         ).begin(tiny.scene())
 
 
-def test_networks_of_the_paper_learn():
+def test_networks_of_the_paper_learn(monkeypatch):
     """Every term of the paper's variant, and gradients of all that learns."""
-    method = relightable(
-        properties="network", visibility="network", reflectance="learnt", property_width=16, prior_steps=2
-    )
+    monkeypatch.setattr("lumigraph.methods.nerfactor.PRIOR_STEPS", 2)
+    method = relightable(properties="network", visibility="network", reflectance="learnt", property_width=16)
     method._choose_learning()
     method.train().before_step(0, 1.0)
     method.began.fill_(0.0)

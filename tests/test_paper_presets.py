@@ -1,4 +1,5 @@
-"""The numbers of `--preset paper`, held as literals, and the page's section on where a method differs from its paper.
+"""The numbers of `--preset paper`, held as literals, the page's section on where a method differs from its paper, and
+its table of options. `python tests/test_paper_presets.py` writes these tables.
 
 A source is the authors' release, by repository and file, or the paper. "From memory" marks numbers of a paper whose
 text was not at hand, and which no release confirms.
@@ -6,8 +7,12 @@ text was not at hand, and which no release confirms.
 
 from __future__ import annotations
 
+import inspect
 import re
 import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +22,13 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.files.ranges import holds, value_of
+from lumigraph.files.ranges import groups_of, holds, value_of
 
 pytestmark = budget("house", 3)
 PAGES = Path(__file__).parent.parent / "docs" / "methods"
 FILES = {path.stem for path in Path(methods.__file__).parent.iterdir()}
+SHARED_PAGE = PAGES.parent / "training.md"  # options of parts that several methods have
+TABLE = re.compile(r"(?<=<!-- options -->\n).*?(?=<!-- end of options -->)", re.DOTALL)
 NAMES = [name for name in methods.available() if name.replace("-", "_") in FILES]  # tiny adds some of the tests' own
 
 WORDS: dict[str, Any] = {
@@ -261,17 +268,18 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "smooth_weight": 0.01,
         "learning_rate": 1e-4,
     },
-    "articulated-splatting": {  # Pokhariya 2024 from memory, and Kerbl 2023
+    "articulated-splatting": {  # brown-ivl/manus, config/model/gaussian/gaussian.yaml
         "sh_degree": 3,
         "ssim_weight": 0.2,
         "adaptive.densify_grad_threshold": 2e-4,
         "refine.refine_every": 100,
     },
-    "humannerf": {  # Weng 2022, section 4.1 and supplement, from memory; 400 000 steps
+    "humannerf": {  # chungyiweng/humannerf, configs/default.yaml; 400 000 steps
         "hidden_width": 256,
         "network.depth": 8,
         "network.position_frequencies": 10,
         "learning_rate": 5e-4,
+        "final_learning_rate": 5e-4 * 0.1 ** (400 / 500),  # lrate_decay 500, after 400 000 steps
         "weights.weight_cells": 32,
         "weights.weight_code": 256,
         "weights.weights_lr": 5e-5,
@@ -279,7 +287,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "bones.pose_depth": 4,
         "bones.pose_width": 256,
         "bones.pose_lr": 5e-5,
-        "bones.pose_from": 20_000 / 400_000,
+        "bones.pose_from": 0.0,
         "nonrigid.nonrigid_depth": 6,
         "nonrigid.nonrigid_width": 128,
         "nonrigid.nonrigid_frequencies": 6,
@@ -540,7 +548,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "filters.antialiased": False,
         "filters.filter_3d": False,
     },
-    "planar-splatting": {  # PGSR's section 5, from memory; 3D Gaussian Splatting's numbers where it gives none
+    "planar-splatting": {  # zju3dv/PGSR, arguments/__init__.py
         "planes.depth": "mean",
         "planes.flatness_weight": 100.0,
         "planes.normal_weight": 0.015,
@@ -598,14 +606,16 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "laplacian_weight": 0.0,
         "normal_weight": 0.0,
     },
-    "deep-appearance": {  # Lombardi 2018, sections 4.2 and 4.3, from memory
+    "deep-appearance": {  # facebookresearch/multiface, models.py and train.py
         "texture_log2": 10,
         "code": 128,
+        "channels": 16,
+        "max_channels": 128,
         "view_features": 8,
         "mesh_width": 256,
         "divergence_weight": 0.01,
         "textures_per_step": 16,
-        "learning_rate": 1e-3,
+        "learning_rate": 3e-4,
     },
     "lumigraph": {  # Buehler 2001 gives no numbers; Gortler 1996, sec. 3.4: the four cameras around a ray
         "blended_views": 4,
@@ -816,6 +826,69 @@ def test_the_preset_paper_says_its_memory(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_its_page_says_where_it_differs(name):
-    page = (PAGES / f"{name.replace('-', '_')}.md").read_text("utf-8")
+    page = page_of(name).read_text("utf-8")
     sections = re.findall(r"^## Where we differ\n\n(.+?)(?=^## |\Z)", page, re.DOTALL | re.MULTILINE)
     assert len(sections) == 1 and len(sections[0]) > 200
+
+
+# Every option has a sentence in a page: where the page itself says nothing, in a table of the options' comments.
+
+
+def explained(group: Any) -> Iterator[tuple[str, str]]:
+    """Options of a dataclass, and their comments."""
+    source = "".join(inspect.getsource(x) for x in type(group).__mro__ if is_dataclass(x))
+    for field in fields(group):
+        if not is_dataclass(getattr(group, field.name)) and field.name != "seed":
+            comment = re.search(rf"(?m)^    {field.name}:.*?  # (.+)$", source)
+            assert comment, f"{type(group).__name__}.{field.name} has no comment, which --help and its page show"
+            yield field.name, comment[1]
+
+
+def is_shared(group: Any) -> bool:
+    return not type(group).__module__.startswith(methods.__name__)
+
+
+def row(name: str, *cells: Any) -> str:
+    return f"| `--{name.replace('_', '-')}` | {' | '.join(str(x) for x in cells)} |"
+
+
+def options_of(name: str) -> str:
+    """Table of a method's own options that the rest of its page does not name, in the values of both presets."""
+    kind, page = methods.find(name), TABLE.sub("", page_of(name).read_text("utf-8"))
+    rows = ["| option | paper | CPU | what it does |", "|---|---|---|---|"]
+    for paper, cpu in zip(groups_of(kind.Config()), groups_of(kind.cpu_preset()), strict=True):
+        for option, comment in () if is_shared(paper) else explained(paper):
+            if not re.search(rf"--(no-)?{option.replace('_', '-')}\b(?!-)", page):
+                rows.append(row(option, *(value_shown(getattr(x, option)) for x in (paper, cpu)), comment))
+    return "\n".join(rows) + "\n"
+
+
+def value_shown(value: Any) -> str:
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value).strip("()") or "none"
+
+
+def shared_options() -> str:
+    """Table of the options of parts that several methods have."""
+    found = {
+        type(group): group for name in NAMES for group in groups_of(methods.find(name).Config()) if is_shared(group)
+    }
+    rows = {row(*pair) for group in found.values() for pair in explained(group)}
+    return "\n".join(["| option | what it does |", "|---|---|", *sorted(rows)]) + "\n"
+
+
+def page_of(name: str) -> Path:
+    return PAGES / f"{name.replace('-', '_')}.md"
+
+
+TABLES = {SHARED_PAGE: shared_options} | {page_of(name): partial(options_of, name) for name in NAMES}
+
+
+@pytest.mark.parametrize("page", TABLES, ids=lambda page: page.stem)
+def test_every_option_has_a_sentence_in_a_page(page):
+    written = TABLE.search(page.read_text("utf-8"))
+    assert (written and written[0]) == TABLES[page](), f"{page} is stale; run `python tests/test_paper_presets.py`"
+
+
+if __name__ == "__main__":
+    for page, table in TABLES.items():
+        page.write_text(TABLE.sub(lambda _, table=table: table(), page.read_text("utf-8")), "utf-8")

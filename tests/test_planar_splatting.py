@@ -201,5 +201,5 @@ def test_surface_is_a_word_for_the_default_method():
     in_the_open = replace(bounded, frame=replace(bounded.frame, reach=4.0))
     plain = parse(["train", "surface", "SCENE"])
     assert (plain.chosen(bounded), plain.chosen(in_the_open)) == ("neus", "planar-splatting")
-    assert parse(["train", "surface", "SCENE", "--flatness-weight", "3"]).chosen(bounded) == "planar-splatting"
+    assert parse(["train", "surface", "SCENE", "--normal-weight", "3"]).chosen(bounded) == "planar-splatting"
     assert parse(["train", "planar-splatting", "SCENE"]).chosen(bounded) == "planar-splatting"

@@ -198,7 +198,7 @@ def test_numbers_that_disagree_are_told(words, ball_folder, tmp_path, capsys):
 
 
 def test_help_shows_ranges_that_surprise(capsys):
-    for words in (["train", "instant-ngp", "--help"], ["export", "mesh", "--help"]):
+    for words in (["train", "instant-ngp", "--help-all"], ["export", "mesh", "--help"]):
         with pytest.raises(SystemExit):
             main(words)
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())

@@ -10,6 +10,7 @@ import tiny_words
 import torch
 from budgets import budget
 
+from lumigraph.components.guidance import diffusion
 from lumigraph.components.guidance.diffusion import DiffusionGuide
 from lumigraph.components.guidance.guides import DistillationNumbers
 from lumigraph.components.guidance.opening import open_guide
@@ -45,22 +46,26 @@ def test_the_loss_has_the_gradient_of_the_paper(guide):
     assert score.abs().mean() > 1e-3
 
 
-def test_guidance_extrapolates_from_no_words(guide):
+def test_guidance_extrapolates_from_no_words(guide, monkeypatch):
     """e = (1 + w) e(y) - w e(), eq. 4, at one time for all pictures."""
+    monkeypatch.setattr(diffusion, "MIN_TIME", 0.5)
+    monkeypatch.setattr(diffusion, "MAX_TIME", 0.5)
     latents = torch.randn(2, 4, 8, 8, generator=chance(3))
 
     def at(scale: float) -> torch.Tensor:
-        return guide.gradient(latents, PROMPTS, chance(5), DistillationNumbers(scale, 0.5, 0.5))
+        return guide.gradient(latents, PROMPTS, chance(5), DistillationNumbers(scale))
 
     torch.testing.assert_close(at(4.0) - at(0.0), 4 * (at(1.0) - at(0.0)), rtol=1e-3, atol=1e-4)
     assert (at(1.0) - at(0.0)).abs().max() > 1e-6
 
 
-def test_the_noise_is_weighted_by_what_is_lost(guide):
+def test_the_noise_is_weighted_by_what_is_lost(guide, monkeypatch):
     """With a denoiser that finds nothing the gradient is -w(t) noise, w(t) = 1 - kept(t)."""
+    monkeypatch.setattr(diffusion, "MIN_TIME", 0.3)
+    monkeypatch.setattr(diffusion, "MAX_TIME", 0.3)
     plain = object.__new__(DiffusionGuide)
     plain.__dict__ = guide.__dict__ | {"predicted": lambda noisy, time, states: torch.zeros_like(noisy)}
-    latents, n = torch.zeros(1, 4, 8, 8), DistillationNumbers(0.0, 0.3, 0.3)
+    latents, n = torch.zeros(1, 4, 8, 8), DistillationNumbers(0.0)
     generator = chance(1)
     torch.rand(1, generator=generator)
     noise = torch.randn(latents.shape, generator=generator)

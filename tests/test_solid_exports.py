@@ -30,7 +30,7 @@ pytestmark = [budget("methods", 15), pytest.mark.filterwarnings("ignore:The clou
 
 RADIUS, SIZE, CELL = 0.6, 48, 1 / 12
 HASH = {"samples_per_step": 1 << 14, "occupancy_resolution": 32, "levels": 6, "max_resolution": 48}
-CLOUD = {"max_gaussians": 3000, "initial_gaussians": 1000, "refine_every": 20, "refine_from": 20}
+CLOUD = {"max_gaussians": 3000, "initial_gaussians": 1000}
 FAMILIES = {  # a method, its steps, numbers beside those of its smallest configuration
     "hash table": ("instant-ngp", 200, HASH | {"refine_cameras": False, "exposure_correction": "no"}),
     "voxel grid": ("dvgo", 250, {}),

@@ -13,6 +13,7 @@ from torch.nn.functional import layer_norm
 
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
+from lumigraph.methods import srn as module
 from lumigraph.methods.srn import SRN
 from lumigraph.methods.srn.networks import RayMarcher, SceneHyperNetwork, scene_features
 from lumigraph.run import build
@@ -71,9 +72,11 @@ def test_gradients_of_the_marchers_state_are_bounded():
     assert 0.01 < gradient.abs().max() <= 2 * 10  # of two rays; a gate passes at most all of it on
 
 
-def test_places_behind_the_camera_are_penalised():
+def test_places_behind_the_camera_are_penalised(monkeypatch):
     """By the square of their distance (eq. 6); others are not."""
-    method = srn(start="camera", start_deviation=0.0, start_distance=0.1, depth_weight=10.0, march_steps=4)
+    monkeypatch.setattr(module, "START_DEVIATION", 0.0)
+    monkeypatch.setattr(module, "START_DISTANCE", 0.1)
+    method = srn(start="camera", march_steps=4)
     lesson = method.batch(tiny_collection.collection(), torch.Generator().manual_seed(0))
     for bias, expected in ((0.5, 0.0), (-0.5, 10.0 * 1.9**2)):
         with torch.no_grad():
@@ -83,13 +86,13 @@ def test_places_behind_the_camera_are_penalised():
 
 
 def test_colours_are_compared_between_minus_one_and_one_and_codes_stay_small():
-    method = srn(colour_weight=200.0, code_weight=3.0)
+    method = srn()
     lesson = method.batch(tiny_collection.collection(), torch.Generator().manual_seed(0))
     with torch.no_grad():
         method.codes.rows.fill_(0.5)
     terms = method.loss(lesson, 0)
     assert float(terms["colour"]) == pytest.approx(800 * method.figures["mse"], rel=1e-5)
-    assert float(terms["code"]) == pytest.approx(3.0 * 0.25)
+    assert float(terms["code"]) == pytest.approx(0.25)
 
 
 def test_photographs_without_alpha_have_no_opacity():
@@ -102,7 +105,7 @@ def test_photographs_without_alpha_have_no_opacity():
 @pytest.fixture(scope="module")
 def taught() -> SRN:
     """Sixty steps on three balls."""
-    method, data = srn(code_steps=40, code_learning_rate=0.02), tiny_collection.collection()
+    method, data = srn(code_steps=40), tiny_collection.collection()
     method.begin(data)
     (optimizer,) = method.optimizers()
     generator = torch.Generator().manual_seed(0)

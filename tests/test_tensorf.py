@@ -13,7 +13,7 @@ from budgets import budget
 from lumigraph import kernels
 from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.kernels.factor_grid import Factors
-from lumigraph.methods.tensorf import UPSAMPLINGS, TensoRF
+from lumigraph.methods.tensorf import DENSITY_SCALE, UPSAMPLINGS, TensoRF
 from lumigraph.methods.tensorf.factorised import FactorGrid, nodes_in
 
 pytestmark = budget("methods")
@@ -137,7 +137,7 @@ def test_nothing_is_outside_the_box():
 def density_in_cube(field, places):
     """Eq. 5 at places of the grid's cube, per unit of the coordinates."""
     config, total = field.config, field.density_grid(places, summed=True)[:, 0]
-    return config.density_scale * torch.nn.functional.softplus(total + config.density_shift)
+    return DENSITY_SCALE * torch.nn.functional.softplus(total + config.density_shift)
 
 
 AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0)), (1.0, 1.0), 0.5)

@@ -191,7 +191,7 @@ def test_without_it_nothing_is_told():
 
 
 def test_resuming_is_exact(tmp_path):
-    config = {"appearance": "yes", "robust": "yes", "robust_start": 0.2}
+    config = {"appearance": "yes", "robust": "yes"}
     (a, straight), (b, broken) = new(tmp_path / "a", **config), new(tmp_path / "b", **config)
     fit(a, tiny.scene(), straight, steps=40, show=False, rehearsal=False)
     fit(b, tiny.scene(), broken, steps=40, pause_at=25, show=False, rehearsal=False)
@@ -273,7 +273,7 @@ def test_what_passed_before_photographs_is_left_out():
     spoilt = replace(scene, images=ImageStore.from_arrays(pictures))
     scores = {}
     for robust in ("no", "yes"):
-        method, _ = new(robust=robust, robust_start=0.3, opacity_reset_interval=1000)
+        method, _ = new(robust=robust, opacity_reset_interval=1000)
         fit(method, spoilt, steps=150, show=False, rehearsal=False)
         scores[robust] = evaluate(method, scene).psnr
     assert scores["yes"] > scores["no"] + 0.3, scores

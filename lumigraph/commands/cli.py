@@ -18,19 +18,19 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import tyro
-from tyro.conf import arg
+from tyro.conf import Suppress, arg
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
 from ..files.options import option_name
-from ..files.ranges import coherent, domain, is_surprising, outside, shown
+from ..files.ranges import coherent, domain, groups_of, is_surprising, members, outside, shown
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
 from .app import AppCommand
@@ -52,6 +52,7 @@ from .gallery import Gallery
 from .infer import Infer
 from .info import Info
 from .jump import Jump
+from .main_options import HELP_ALL, hidden_options
 from .methods import Methods
 from .photo3d import Photo3DCommand
 from .render import Render
@@ -64,18 +65,29 @@ from .view import ViewCommand
 
 RULES = ConstructorRegistry()
 beneath = False  # True while tyro applies its own rules only
+groups: tuple[type, ...] = ()  # of a method's options: its Config and what it holds
+hidden: frozenset[str] = frozenset()  # options of the method that --help leaves out
 
 
 @RULES.struct_rule
 def with_ranges(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """A dataclass for tyro, each number with its range behind its default: (default: 16; 1 to 32)."""
+    """A dataclass for tyro, each number with its range behind its default: (default: 16; 1 to 32). A method's options
+    are one list, without headings of their groups."""
     if beneath or not is_dataclass(info.type):
         return None
     with without_ranges():
         spec = ConstructorRegistry.get_struct_spec(info)
     if not isinstance(spec, StructConstructorSpec):
         return None
-    return replace(spec, fields=tuple(replace(x, type=with_range(x.type)) for x in spec.fields))
+    shown = listed if info.type in groups else with_range
+    return replace(spec, fields=tuple(replace(x, type=shown(x.type, x.name)) for x in spec.fields))
+
+
+def listed(kind: Any, name: str) -> Any:
+    """A method's option for --help, in the list of all of them."""
+    if name in hidden:
+        return Annotated[kind, Suppress]
+    return Annotated[kind, arg(name="")] if next(members(kind)) in groups else with_range(kind)
 
 
 @contextmanager
@@ -89,7 +101,7 @@ def without_ranges() -> Iterator[None]:
         beneath = False
 
 
-def with_range(kind: Any) -> Any:
+def with_range(kind: Any, name: str = "") -> Any:
     """An option's annotation with its range beside the default in --help; itself if the range is no surprise."""
     if not is_surprising(kind):
         return kind
@@ -223,6 +235,7 @@ def without_method_files(arguments: list[str]) -> list[str]:
 
 def parse(arguments: list[str]) -> Any:
     """The command with its options. Leaves with code 2 if they cannot be understood."""
+    global groups, hidden
     arguments = without_method_files(arguments)
     commands, first, rest = dict(COMMANDS), "".join(arguments[:1]), arguments[1:]
     there = {*methods.available(), *(methods.ALIASES if first == "train" else ())}
@@ -230,6 +243,9 @@ def parse(arguments: list[str]) -> Any:
     if named:  # the options of the method too
         given = {name: value_of(f"--{name}", rest, default) for name, default in DECISIVE.items()}
         commands[first] = with_options_of(named[0], commands[first], **given)
+        config = fields(commands[first])[-1].default
+        groups = tuple(type(group) for group in groups_of(config))
+        hidden = hidden_options(config) if {"--help", "-h"} & {*rest} and HELP_ALL not in rest else frozenset()
     if first == "train" and rest[:1] == ["captions"]:  # a model and no method
         commands[first] = importlib.import_module(".train_captions", __package__).TrainCaptions
     kinds = []
@@ -238,5 +254,5 @@ def parse(arguments: list[str]) -> Any:
         about = tyro.conf.subcommand(name, description=None if name == first else first_sentence)
         kinds.append(Annotated[kind, about])
     union: Any = functools.reduce(operator.or_, kinds)
-    arguments = arguments or ["--help"]
+    arguments = ["--help" if x == HELP_ALL else x for x in arguments or ["--help"]]
     return held(tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments, registry=RULES))

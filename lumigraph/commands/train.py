@@ -32,6 +32,7 @@ from .common import (
     show,
     typed,
 )
+from .main_options import hidden_options, option_names
 from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, ViewerToken, needed, option
 
 MEMORY_BYTES = 2 << 30  # bytes reserved for a block
@@ -202,9 +203,9 @@ class Train:
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
     take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. Those
-    that learn from words take words:PROMPT and --guidance. If
-    photographs have no poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's
-    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` continues.
+    that learn from words take words:PROMPT and --guidance. If photographs have no poses, `lumigraph capture` finds them
+    first. `lumigraph train METHOD --help` adds the method's options that people set, `--help-all` all of them;
+    `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` continues.
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
@@ -329,7 +330,12 @@ def with_options_of(
         blocks = derived(BlockOptions, kind.Config, {})
         extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
     default = default_config(command, kind, preset_device(device, preset))
-    extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], default
+    about = (
+        f"What people set. `--help-all` lists all {len(option_names(default))} options."
+        if hidden_options(default)
+        else None
+    )
+    extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes, arg(help=about)], default
     return derived(command, kind.Config, extra)
 
 

@@ -117,17 +117,20 @@ def changed(value: Any, **numbers: Any) -> Any:
 
 def value_of(value: Any, name: str) -> Any:
     """The number of a name, of a dataclass or one that it holds."""
-    if name in {field.name for field in fields(value)}:
-        return getattr(value, name)
-    inner = (getattr(value, field.name) for field in fields(value))
-    return value_of(next(x for x in inner if is_dataclass(x) and holds(x, name)), name)
+    return next(getattr(group, name) for group in groups_of(value) if name in hints(group.__class__))
 
 
 def holds(value: Any, name: str) -> bool:
     """True if a dataclass, or a nested one, has a field of this name."""
-    found = fields(value)
-    inner = (getattr(value, field.name) for field in found)
-    return name in {field.name for field in found} or any(is_dataclass(x) and holds(x, name) for x in inner)
+    return any(name in hints(group.__class__) for group in groups_of(value))
+
+
+def groups_of(value: Any) -> Iterator[Any]:
+    """A dataclass, and those within it."""
+    yield value
+    for field in fields(value):
+        if is_dataclass(inner := getattr(value, field.name)):
+            yield from groups_of(inner)
 
 
 def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:

@@ -43,20 +43,20 @@ MESH_WEIGHT = 1.0  # lambda_M of the loss
 
 @dataclass(frozen=True)
 class Config:
-    """Numbers of Lombardi 2018, section 4, and of its supplement, from memory."""
+    """Numbers of the release, facebookresearch/multiface, models.py and train.py; its codes of 128 are the paper's."""
 
     texture_log2: Annotated[int, between(4, 10)] = 10  # side of the texture, log2; higher: finer, slower
     code: Count = 128  # numbers of an expression's code
-    channels: Width = 32  # of the decoder's finest layer but one; coarser layers have up to 16 times as many
-    max_channels: Width = 512  # of any layer
+    channels: Width = 16  # of the decoder's finest layer but one; coarser layers have up to 16 times as many
+    max_channels: Width = 128  # of any layer
     view_features: Count = 8  # of the view's direction (section 4.2)
     mesh_width: Width = 256  # of the layer before the mesh
     divergence_weight: NonNegative = 0.01  # lambda_Z
     mesh_rows: Annotated[int, between(5, 512)] = 73  # of the mesh's grid; 7306 vertices are the paper's
-    mesh_columns: Annotated[int, between(5, 512)] = 101
-    textures_per_step: Count = 16
-    learning_rate: LearningRate = 1e-3
-    seed: Seed = 0
+    mesh_columns: Annotated[int, between(5, 512)] = 101  # of the mesh's grid
+    textures_per_step: Count = 16  # textures of a step; more are steadier, and cost time
+    learning_rate: LearningRate = 3e-4  # Adam's learning rate
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)
@@ -175,19 +175,14 @@ class DeepAppearance(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Textures of 128 texels, and a hundredth of the paper's weights."""
-        return Config(
-            texture_log2=7, code=16, channels=16, max_channels=64, mesh_rows=49, mesh_columns=65, mesh_width=64,
-            textures_per_step=8,
-            learning_rate=2e-3,
-        )  # fmt: skip
+        return Config(texture_log2=7, code=16, channels=16, max_channels=64, mesh_rows=49, mesh_columns=65,
+            mesh_width=64, textures_per_step=8, learning_rate=2e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Textures of 32 texels."""
-        return Config(
-            texture_log2=5, code=4, channels=8, max_channels=16, mesh_rows=13, mesh_columns=17, mesh_width=8,
-            textures_per_step=9, learning_rate=1e-2, divergence_weight=1e-3,
-        )  # fmt: skip
+        return Config(texture_log2=5, code=4, channels=8, max_channels=16, mesh_rows=13, mesh_columns=17, mesh_width=8,
+            textures_per_step=9, learning_rate=1e-2, divergence_weight=1e-3)  # fmt: skip
 
     # Learning
 

@@ -22,7 +22,7 @@ from ..components.training.shape_points import PointNumbers, PointPools, sampled
 from ..datasets.scene import Frame
 from ..datasets.shapes import CUBE, HALF_SIDE, PointBatch, Shape, Shapes
 from ..errors import LumigraphError
-from ..files.ranges import Count, Depth, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ..files.ranges import Count, Depth, Layers, LearningRate, Seed, Share, Width, between, changed
 from ..geometry import Similarity
 from ..method import seeded
 
@@ -32,6 +32,10 @@ Tally = Annotated[int, between(0, 100_000)]
 FINAL_SHARE = 1 / 16  # share of both learning rates at the end of the budget
 FIT_LEARNING_RATE = 5e-3  # Adam's learning rate of a new code
 FIT_WEIGHT = 1e-4  # weight of the new code's squared length, eq. 10
+CODE_DEVIATION = 0.01  # standard deviation of codes at first, section 4.2
+CODE_WEIGHT = 1e-4  # weight of the codes' squared lengths, eq. 9; higher keeps codes near zero
+CLAMP_DISTANCE = 0.1  # delta of eq. 4, scene units; smaller concentrates on the surface
+OFFSET = 0.01  # scene units from a scanned point along its normal, at which the distance is known
 
 
 @dataclass(frozen=True)
@@ -46,17 +50,13 @@ class Config:
     weight_norm: bool = True  # normalise the weights of hidden layers, section 4.1
     dropout: Share = 0.2  # share of hidden channels that a training step drops; higher: smoother
     code: Width = 256  # numbers of a shape's code, section 6; more hold more shapes
-    code_deviation: Positive = 0.01  # standard deviation of codes at first, section 4.2
-    code_weight: NonNegative = 1e-4  # weight of the codes' squared lengths, eq. 9; higher keeps codes near zero
     members: Count = 4096  # shapes of a collection at most; each has a code, so more cost memory
-    clamp_distance: Positive = 0.1  # delta of eq. 4, scene units; smaller concentrates on the surface
     shapes_per_step: Annotated[int, between(1, 1024)] = 8  # shapes in a step; more reduce noise, and cost time
     points_per_shape: Annotated[int, between(1, 1 << 20)] = 16_384  # points of each shape in a step
     learning_rate: LearningRate = 5e-4  # Adam's learning rate of the network at first
     code_learning_rate: LearningRate = 1e-3  # Adam's learning rate of the codes at first
     # Finding the code of a new shape.
     code_steps: Tally = 800  # steps that fit the code of a new shape, section 6.2; more take longer
-    offset: Positive = 0.01  # scene units from a scanned point along its normal, at which the distance is known
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -125,15 +125,14 @@ class DeepSDF(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller network that takes waves, without dropout and weight normalisation."""
-        c = Config(PointNumbers(80_000), depth=6, hidden_width=128, skip_layer=3, octaves=4, weight_norm=False)
-        c = replace(c, dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024)
-        return replace(c, learning_rate=2e-3, code_learning_rate=4e-3, code_steps=300)
+        return changed(Config(), pool_points=80_000, depth=6, hidden_width=128, skip_layer=3, octaves=4,
+            weight_norm=False, dropout=0.0, code=64, members=256, shapes_per_step=4, points_per_shape=1024,
+            learning_rate=2e-3, code_learning_rate=4e-3, code_steps=300)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(PointNumbers(4096), depth=2, hidden_width=16, skip_layer=1, octaves=1, code=4, members=4)
-        c = replace(c, shapes_per_step=1, points_per_shape=256, learning_rate=1e-2, code_steps=20)
-        return replace(c, dropout=0.05)
+        return changed(Config(), pool_points=4096, depth=2, hidden_width=16, skip_layer=1, octaves=1, code=4, members=4,
+            shapes_per_step=1, points_per_shape=256, learning_rate=1e-2, code_steps=20, dropout=0.05)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -145,7 +144,7 @@ class DeepSDF(CodedSurface):
 
     def begin(self, data: Shapes, seconds: float = math.inf) -> None:
         self.codes.check_room(len(data), data.source)
-        self.codes.begin(data.splits["train"], self.config.code_deviation, self.random(1))
+        self.codes.begin(data.splits["train"], CODE_DEVIATION, self.random(1))
 
     def steps_per_pass(self, data: Shapes) -> float:
         return len(data.splits["train"]) / self.config.shapes_per_step
@@ -161,17 +160,17 @@ class DeepSDF(CodedSurface):
         error = self._error(codes, batch.points, batch.signed)
         self.decoder.drop_by(None)
         self.figures = {"distance error": float(error.detach())}
-        return {"distance": error, "code": self.config.code_weight * codes.square().sum(-1).mean()}
+        return {"distance": error, "code": CODE_WEIGHT * codes.square().sum(-1).mean()}
 
     def _error(
         self, codes: Float[Tensor, "point code"], points: Float[Tensor, "point 3"], distance: Float[Tensor, " point"]
     ) -> Float[Tensor, ""]:
         """Mean |clamp(f(z, x), delta) - clamp(s, delta)| (eq. 4)."""
-        delta = self.config.clamp_distance
+        delta = CLAMP_DISTANCE
         return (self._clamped(codes, points) - distance.clamp(-delta, delta)).abs().mean()
 
     def _clamped(self, codes: Float[Tensor, "point code"], points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        delta = self.config.clamp_distance
+        delta = CLAMP_DISTANCE
         return in_chunks(lambda z, x: (self.decoder(z, x),), codes, points)[0].clamp(-delta, delta)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -206,8 +205,8 @@ class DeepSDF(CodedSurface):
                 f"{shape.name} has points without normals, so nothing says on which side of them it is solid; "
                 "write the normals into its .ply as nx, ny, nz"
             )
-        off = self.config.offset * scan.normals
-        points, ahead = torch.cat([scan.points + off, scan.points - off]), torch.full((len(off),), self.config.offset)
+        off = OFFSET * scan.normals
+        points, ahead = torch.cat([scan.points + off, scan.points - off]), torch.full((len(off),), OFFSET)
         return points.to(self.device), torch.cat([ahead, -ahead]).to(self.device)
 
     def find(self, evidence: Any) -> Float[Tensor, " code"]:

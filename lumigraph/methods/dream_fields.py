@@ -26,7 +26,7 @@ from ..components.sampling.spaces import space_of
 from ..components.training.schedules import held
 from ..datasets.scene import Frame
 from ..datasets.words import Words
-from ..files.ranges import LearningRate, Seed, Width, between
+from ..files.ranges import LearningRate, Seed, Width, between, changed
 from ..method import FieldMethod, seeded
 from ..volume import composite
 
@@ -37,7 +37,7 @@ class Config:
 
     table: HashNumbers = HashNumbers(sh_bands=1)
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20)
-    steps: StepNumbers = StepNumbers(192)
+    steps: StepNumbers = StepNumbers(steps_per_diagonal=192)
     proposals: ProposalNumbers = ProposalNumbers()
     guidance: GuidanceNumbers = GuidanceNumbers()
     distillation: DistillationNumbers = DistillationNumbers()
@@ -68,11 +68,9 @@ class DreamFields(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Coarse tables and small views, larger in the picture, in which a small model recognises shapes."""
-        table = HashNumbers(
-            levels=4, features_per_level=4, log2_hashmap_size=15, base_resolution=8, max_resolution=48, sh_bands=1
-        )
-        occupancy = OccupancyNumbers(samples_per_step=1 << 17, occupancy_resolution=32)
-        return Config(table, occupancy, StepNumbers(72), guidance=CPU_GUIDANCE, hidden_width=32)
+        return changed(Config(guidance=CPU_GUIDANCE), levels=4, features_per_level=4, log2_hashmap_size=15,
+            base_resolution=8, max_resolution=48, samples_per_step=1 << 17, occupancy_resolution=32,
+            steps_per_diagonal=72, hidden_width=32)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -24,7 +24,7 @@ from ..components.guidance import (
 )
 from ..datasets.scene import Frame
 from ..datasets.words import Words
-from ..files.ranges import CloudSize, PositiveShare, Seed
+from ..files.ranges import CloudSize, PositiveShare, Seed, changed
 from ..gaussians import Gaussians
 from ..gaussians.splatting import render, splat, view_of
 from ..method import Method
@@ -37,7 +37,7 @@ class Config:
     """Tang 2024, section 3.1 and the released code (configs/text.yaml)."""
 
     rates: RateNumbers = RateNumbers(
-        means_lr=1e-3, final_means_lr=2e-5, sh_lr=1e-2, opacities_lr=0.05, scales_lr=5e-3, quaternions_lr=5e-3
+        means_lr=1e-3, final_means_lr=2e-5, sh_lr=1e-2, scales_lr=5e-3, quaternions_lr=5e-3
     )
     guidance: GuidanceNumbers = GuidanceNumbers()
     distillation: DistillationNumbers = DistillationNumbers()
@@ -65,10 +65,8 @@ class DreamSplats(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Fewer Gaussians that move faster, and the small views of `dream-fields`."""
-        rates = RateNumbers(
-            means_lr=5e-3, final_means_lr=5e-4, sh_lr=2e-2, opacities_lr=0.05, scales_lr=1e-2, quaternions_lr=5e-3
-        )
-        return Config(rates, CPU_GUIDANCE, initial_gaussians=1000)
+        return changed(Config(guidance=CPU_GUIDANCE), means_lr=5e-3, final_means_lr=5e-4, sh_lr=2e-2, scales_lr=1e-2,
+            initial_gaussians=1000)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -26,7 +26,7 @@ from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
-from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
+from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between, changed
 from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod, seeded
@@ -39,6 +39,13 @@ Voxels = Annotated[int, between(64, 1 << 30)]
 
 TV_DENSITY_WEIGHT = 1e-3  # weight of density's total variation, in the open
 TV_FEATURE_WEIGHT = 1e-4  # weight of features' total variation, in the open
+COARSE_ALPHA = 1e-6  # initial alpha of the coarse stage, eq. 9; higher begins denser
+FINE_ALPHA = 1e-2  # initial alpha of the fine stage, eq. 9; higher begins denser
+OPEN_ALPHA = 1e-4  # initial alpha of both stages in the open; higher begins as haze
+BOX_ALPHA = 1e-3  # alpha of a voxel above which the tight box holds it; higher gives a smaller box
+WEIGHT_THRESHOLD = 1e-4  # weight of a sample below which it gets no colour in the fine stage; higher: faster
+FINAL_LEARNING_RATE = 0.1  # share of these rates at the end of the budget, section 6.1
+TV_INTERVAL = 8  # steps between these two terms, whose weight is multiplied by it; more are faster
 
 
 @dataclass(frozen=True)
@@ -54,25 +61,18 @@ class Config:
     hidden_width: Width = 128  # channels of the colour network, section 6.1; wider costs time
     hidden_layers: Layers = 2  # hidden layers of the colour network, section 6.1; more cost time
     sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands of the direction; 1: no view dependence
-    coarse_alpha: PositiveShare = 1e-6  # initial alpha of the coarse stage, eq. 9; higher begins denser
-    fine_alpha: PositiveShare = 1e-2  # initial alpha of the fine stage, eq. 9; higher begins denser
-    open_alpha: PositiveShare = 1e-4  # initial alpha of both stages in the open; higher begins as haze
     coarse_share: Share = 0.2  # share of the budget of the coarse stage: 5 of the paper's 25 thousand steps
     doublings: Annotated[int, between(0, 12)] = 4  # doublings of the voxels in the fine stage, section 5.2; 0: none
     growing_share: Share = 0.2  # share of the fine stage with these doublings: 4 of 20 thousand steps
-    box_alpha: PositiveShare = 1e-3  # alpha of a voxel above which the tight box holds it; higher gives a smaller box
     step_size: PositiveShare = 0.5  # distance of samples in voxels, section 6.1; larger is faster, less exact
-    weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour in the fine stage; higher: faster
     open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # the same where there is no bound
     density_learning_rate: LearningRate = 0.1  # rate of the density grid at first, section 6.1
     feature_learning_rate: LearningRate = 0.1  # rate of the feature grid at first, section 6.1
     network_learning_rate: LearningRate = 1e-3  # rate of the colour network at first, section 6.1
-    final_learning_rate: PositiveShare = 0.1  # share of these rates at the end of the budget, section 6.1
     coarse_point_weight: NonNegative = 0.1  # weight of each sample's own colour in the coarse stage, eq. 12; 0: off
     point_weight: NonNegative = 0.01  # the same in the fine stage; 0: off
     coarse_entropy_weight: NonNegative = 0.01  # weight of the entropy of opacity in the coarse stage, eq. 13; 0: off
     entropy_weight: NonNegative = 0.001  # the same in the fine stage; higher gives harder edges
-    tv_interval: Steps = 8  # steps between these two terms, whose weight is multiplied by it; more are faster
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -140,8 +140,7 @@ class VoxelField(Field):
 
     def shift(self, stage: int) -> float:
         """The b of softplus(grid + b), eq. 9."""
-        c = self.config
-        return shift_of(c.open_alpha if self.space.is_open else c.fine_alpha if stage > 0 else c.coarse_alpha)
+        return shift_of(OPEN_ALPHA if self.space.is_open else FINE_ALPHA if stage > 0 else COARSE_ALPHA)
 
     @property
     def step_length(self) -> float:
@@ -149,7 +148,7 @@ class VoxelField(Field):
 
     @property
     def min_weight(self) -> float:
-        return self.config.weight_threshold if self.stage > 0 else 0.0  # in the coarse stage all is thin at first
+        return WEIGHT_THRESHOLD if self.stage > 0 else 0.0  # in the coarse stage all is thin at first
 
     def storage(self) -> dict[str, Stored]:
         """Features by a codebook, density as whole numbers, the network as halves."""
@@ -178,19 +177,19 @@ class DVGO(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1)
-        c = Config(occupancy, coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8)
-        c = replace(c, coarse_share=0.1, doublings=3, growing_share=0.4, open_samples_per_step=1 << 16)
-        c = replace(c, density_learning_rate=0.6, feature_learning_rate=0.2, network_learning_rate=5e-3)
-        return replace(c, coarse_point_weight=0.0, point_weight=0.0, coarse_entropy_weight=0.0, entropy_weight=0.0)
+        return changed(Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1,
+            coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8, coarse_share=0.1, doublings=3,
+            growing_share=0.4, open_samples_per_step=1 << 16, density_learning_rate=0.6, feature_learning_rate=0.2,
+            network_learning_rate=5e-3, coarse_point_weight=0.0, point_weight=0.0, coarse_entropy_weight=0.0,
+            entropy_weight=0.0)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Grids of a few thousand voxels that reach the fine stage and double twice within some twenty quick steps."""
-        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), coarse_voxels=16**3, voxels=24**3)
-        c = replace(c, feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096)
-        c = replace(c, density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2)
-        return replace(c, coarse_share=0.2, doublings=2, growing_share=0.5)
+        return changed(Config(), samples_per_step=4096, occupancy_resolution=16, coarse_voxels=16**3, voxels=24**3,
+            feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096,
+            density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2, doublings=2,
+            growing_share=0.5)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -214,12 +213,12 @@ class DVGO(FieldMethod):
             terms["points"] = weight * point_error(look, batch.before(self.background))
         if weight := c.entropy_weight if fine else c.coarse_entropy_weight:
             terms["entropy"] = weight * opacity_entropy(rendering.opacity)
-        if self.sampler.is_open and step % c.tv_interval == 0 and len(look.samples):
+        if self.sampler.is_open and step % TV_INTERVAL == 0 and len(look.samples):
             assert isinstance(samples.features, Tensor)
             weights = {"tv_density": TV_DENSITY_WEIGHT, "tv_feature": TV_FEATURE_WEIGHT}
             for grid, (name, weight) in zip(self.network.grids, weights.items(), strict=True):
                 if weight:
-                    terms[name] = c.tv_interval * weight * grid.variation(samples.features, MAX_SMOOTHED, generator)
+                    terms[name] = TV_INTERVAL * weight * grid.variation(samples.features, MAX_SMOOTHED, generator)
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -231,7 +230,7 @@ class DVGO(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c = self.config
-        share = falling(1.0, c.final_learning_rate, progress) * min(1.0, (step + 1) / 20)
+        share = falling(1.0, FINAL_LEARNING_RATE, progress) * min(1.0, (step + 1) / 20)
         rates = {"density": c.density_learning_rate, "features": c.feature_learning_rate}
         return {name: share * rate for name, rate in {**rates, "network": c.network_learning_rate}.items()}
 
@@ -275,7 +274,7 @@ class DVGO(FieldMethod):
         what is thinner than free space at the beginning of the fine stage begins as that does."""
         c, network, grid = self.config, self.network, self.network.density_grid
         thickness = nn.functional.softplus(grid.values[:, 0] + network.shift(0))
-        dense = 1 - torch.exp(-thickness) > c.box_alpha
+        dense = 1 - torch.exp(-thickness) > BOX_ALPHA
         inside = dense.view(grid.shape)
         box = grid.box.clone() if self.sampler.is_open else tight_box(grid.box, inside)
         volume = float((box[1] - box[0]).prod())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from ..components.image_based.kept_views import focal_length
 from ..components.image_based.method import ImageBasedMethod
 from ..components.image_based.surface import surface_seen
 from ..datasets.scene import Frame, Scene
-from ..files.ranges import Count, Pixels, PositiveShare, Seed, between
+from ..files.ranges import Count, Pixels, Seed
 from ..method.controls import Control
 from ..system.work import at_work
 
@@ -28,6 +28,8 @@ FOCUS_RANGE = 8.0  # times the distance of the optimum plane, to which the contr
 DEFAULT_APERTURE = 0.04  # of that distance: the lens's radius where only the focus is set
 RESOLUTION_WEIGHT = 0.05  # penalty of photographs coarser than the new picture, beside the angle in radians
 HIDDEN_WEIGHT = 10.0  # penalty of photographs that see another surface there, times the angle
+DEPTH_TOLERANCE = 0.015  # of distance, within which they see the same
+BORDER = 0.08  # of a photograph's side, over which its weight falls to its edge
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,7 @@ class Config:
     blended_views: Count = 4  # k: photographs blended at each pixel; more: smoother, more ghosts
     candidate_views: Count = 16  # photographs near a camera among which each pixel chooses
     surface_views: Count = 6  # photographs whose depth maps make the surface before a camera
-    depth_tolerance: Annotated[float, between(0, 1)] = 0.015  # of distance, within which they see the same
-    border: PositiveShare = 0.08  # of a photograph's side, over which its weight falls to its edge
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class Lumigraph(ImageBasedMethod):
@@ -124,7 +124,7 @@ class Lumigraph(ImageBasedMethod):
         named = (tables.pictures, tables.depths, tables.sizes, tables.poses, tables.lenses)
         pictures, depths, sizes, poses, lenses = (x[chosen] for x in named)
         hidden = 0.0 if c.geometry == "plane" else HIDDEN_WEIGHT
-        weights = RESOLUTION_WEIGHT, hidden, c.depth_tolerance, c.border
+        weights = RESOLUTION_WEIGHT, hidden, DEPTH_TOLERANCE, BORDER
         eyes = rays.origins[solid.flatten()].contiguous()
         found, share = kernels.blend_views(
             points, eyes, focal_length(camera), pictures, depths, sizes, poses, lenses, c.blended_views, *weights

@@ -35,6 +35,7 @@ from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
 VARIANCE_WEIGHT = 1e-3  # weight of the variance of weights, supplement
+EXPOSURE_SCALES = True  # an option of older runs: a factor per colour of each exposure is learnt, section 4.2
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,6 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     epsilon: Positive = 1e-3  # epsilon of eq. 4; 1 is white in the longest exposure; higher: less weight in the dark
     huber_delta: NonNegative = 0.0  # relative error at which the loss turns from squared to linear; 0: always squared
-    exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2; off: as stated
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
@@ -105,7 +105,7 @@ class RawNeRF(FieldMethod):
             self.network = LightField(c.table, c.hidden_width, space, frame.reach, joining=joining)
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         photographs = frame.image_count
-        self.log_scale = nn.Parameter(torch.zeros(photographs, 3), requires_grad=c.exposure_scales)
+        self.log_scale = nn.Parameter(torch.zeros(photographs, 3))
         self.register_buffer("exposure", torch.ones(photographs))  # of each photograph, of the longest
         self.register_buffer("group", torch.arange(photographs))  # photographs of one exposure share a number
         self.register_buffer("free", torch.ones(photographs))  # 0 for those whose scale is 1, by which others go
@@ -232,9 +232,8 @@ class RawNeRF(FieldMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
         optimizers = self.network.optimizers_at(c.learning_rate, c.hash_weight_decay)
-        if c.exposure_scales:
-            group: dict[str, Any] = {"params": [self.log_scale], "scale": 0.05}
-            optimizers.append(torch.optim.Adam([group], lr=c.learning_rate, betas=(0.9, 0.99), eps=1e-15))
+        group: dict[str, Any] = {"params": [self.log_scale], "scale": 0.05}
+        optimizers.append(torch.optim.Adam([group], lr=c.learning_rate, betas=(0.9, 0.99), eps=1e-15))
         return [*optimizers, *super().optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> float:

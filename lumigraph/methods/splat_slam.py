@@ -21,11 +21,11 @@ from ..color.blending import before, over
 from ..components.clouds.cloud import Cloud, RateNumbers
 from ..components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
 from ..components.tracking.frames import DepthFrame, Moment
-from ..components.tracking.tracker import Iterations, Tracker, TrackingNumbers
+from ..components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
 from ..components.tracking.trajectory import Pose, moved
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import CloudSize, Count, LearningRate, NonNegative, Seed, Share, between
+from ..files.ranges import CloudSize, Count, Seed, between, changed
 from ..gaussians import Gaussians
 from ..gaussians.cloud import joined
 from ..gaussians.splatting import Splatted, render, splat, view_of
@@ -43,6 +43,12 @@ OVERLAP_BORDER = 20 / 640  # of a keyframe's width, within which points do not c
 DEPTH_TOLERANCE = 0.1  # relative error of depth up to which a pixel is explained
 TRUNCATION = 0.1  # metres from the rendered surface within which points are aligned with it
 NORMAL_STEP = 2  # pixels between the points that a rendered normal is made of
+ROTATION_RATE = 8e-4  # Adam's rate of a pose's rotation, radians: 4e-4 of a quaternion
+SHIFT_RATE = 2e-3  # Adam's rate of a pose's shift, metres
+TRACKING_SILHOUETTE = 0.99  # silhouette from which on a pixel counts in tracking
+DEPTH_WEIGHT = 1.0  # weight of depth, metres
+COLOUR_WEIGHT = 0.5  # weight of colours
+SSIM_WEIGHT = 0.2  # share of D-SSIM in the loss of colours, in mapping alone
 
 
 @dataclass(frozen=True)
@@ -50,9 +56,6 @@ class SplatPoseNumbers:
     """A Config's numbers of a frame's pose (section 3.2)."""
 
     tracking_iterations: Iterations = 40  # descents on a frame's pose; more follow faster motion, slower
-    rotation_rate: LearningRate = 8e-4  # Adam's rate of a pose's rotation, radians: 4e-4 of a quaternion
-    shift_rate: LearningRate = 2e-3  # Adam's rate of a pose's shift, metres
-    tracking_silhouette: Share = 0.99  # silhouette from which on a pixel counts in tracking
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,6 @@ class SplatMappingNumbers:
     first_iterations: Iterations = 60  # descents on the map for the first frame
     window: Annotated[int, between(2, 1000)] = 24  # frames k of a frame's mapping: itself, the latest keyframe, others
     keyframe_every: Count = 5  # frames from one keyframe to the next
-    depth_weight: NonNegative = 1.0  # weight of depth, metres
-    colour_weight: NonNegative = 0.5  # weight of colours
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss of colours, in mapping alone
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,7 @@ class Config:
     tracking: TrackingNumbers = TrackingNumbers()
     descent: SplatPoseNumbers = SplatPoseNumbers()
     mapping: SplatMappingNumbers = SplatMappingNumbers()
-    rates: RateNumbers = RateNumbers(
-        means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, opacities_lr=0.05, scales_lr=1e-3
-    )
+    rates: RateNumbers = RateNumbers(means_lr=1e-4, final_means_lr=1e-4, sh_lr=2.5e-3 / K00, scales_lr=1e-3)
     frame_side: Annotated[int, between(0, 10_000)] = 0  # pixels of the longer side of frames, about; 0 as photographs
     max_gaussians: CloudSize = 4_000_000  # Gaussians at most; what is seen after that is not mapped
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
@@ -113,16 +111,16 @@ class SplatSlam(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Small frames, aligned with the rendered surface first; few descents."""
-        tracking = TrackingNumbers(first_estimate="surface")
-        mapping = SplatMappingNumbers(mapping_iterations=8, first_iterations=40, window=10)
-        rates = replace(Config().rates, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3)
-        return Config(tracking, SplatPoseNumbers(tracking_iterations=5), mapping, rates, frame_side=160)
+        return changed(
+            Config(), first_estimate="surface", tracking_iterations=5, mapping_iterations=8, first_iterations=40,
+            window=10, means_lr=1e-3, final_means_lr=1e-3, sh_lr=2e-2, scales_lr=5e-3, frame_side=160)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Few descents a frame."""
-        mapping = SplatMappingNumbers(2, 2, window=4, keyframe_every=2)
-        return Config(descent=SplatPoseNumbers(tracking_iterations=4), mapping=mapping)
+        return changed(
+            Config(), tracking_iterations=4, mapping_iterations=2, first_iterations=2, window=4, keyframe_every=2,
+        )  # fmt: skip
 
     # The sequence
 
@@ -207,21 +205,21 @@ class SplatSlam(Method):
 
         L = sum over S > 0.99 of |D - D^| + 0.5 |C - C^|                                            (eq. 8)
         """
-        c, t = self.config.mapping, self.config.descent
+        t = self.config.descent
         with torch.no_grad():
             cloud, (depth, known) = self.gaussians(), axial(frame)
         if self.config.tracking.first_estimate == "surface":
             pose = self.surface_aligned(cloud, frame, pose, chance)
         rgb, best, found = self.target(frame), math.inf, pose
         turn, shift = (torch.zeros(1, 3, device=self.device, requires_grad=True) for _ in range(2))
-        groups = [{"params": [turn], "lr": t.rotation_rate}, {"params": [shift], "lr": t.shift_rate}]
+        groups = [{"params": [turn], "lr": ROTATION_RATE}, {"params": [shift], "lr": SHIFT_RATE}]
         optimizer = torch.optim.Adam(groups)
         for _ in range(1 if self.rehearses else t.tracking_iterations):
             at = moved(pose[None], torch.cat([turn, shift * self.unit], -1))[0]
             seen = self.seen(cloud, frame, at)
-            sure = known & (seen.opacity.detach() > t.tracking_silhouette)
-            away = c.depth_weight * (surface_depth(seen) - depth).abs() / self.unit
-            error = away + c.colour_weight * (self.shown(seen) - rgb).abs().sum(-1)
+            sure = known & (seen.opacity.detach() > TRACKING_SILHOUETTE)
+            away = DEPTH_WEIGHT * (surface_depth(seen) - depth).abs() / self.unit
+            error = away + COLOUR_WEIGHT * (self.shown(seen) - rgb).abs().sum(-1)
             loss = torch.where(sure, error, 0.0).sum() / sure.sum().clamp_min(1)
             if (value := loss.item()) < best:
                 best, found = value, at.detach()
@@ -231,7 +229,7 @@ class SplatSlam(Method):
 
     def surface_aligned(self, cloud: Gaussians, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
         """The pose at which measured points lie on the surface that is rendered from the first estimate."""
-        t, sure = self.config.tracking, self.config.descent.tracking_silhouette
+        sure = TRACKING_SILHOUETTE
         with torch.no_grad():
             seen = self.seen(cloud, frame, pose)
             surface, normals, there = surface_of(frame, seen, sure)
@@ -247,10 +245,10 @@ class SplatSlam(Method):
             inside = valid & (values[:, 9] > 0.99)
             return torch.where(inside, distance / (TRUNCATION * self.unit), 2.0), values[:, 6:9]
 
-        pixels = frame.drawn(t.alignment_points, chance, measured=True)
+        pixels = frame.drawn(ALIGNMENT_POINTS, chance, measured=True)
         points = frame.rays[pixels].at(frame.depth[pixels])
         deviation = sensor_deviation(frame.depth[pixels] / self.unit) / TRUNCATION
-        rgb, steps = frame.rgb[pixels], t.alignment_iterations
+        rgb, steps = frame.rgb[pixels], ALIGNMENT_ITERATIONS
         return aligned(field, pose, points, rgb, deviation, COLOUR_DEVIATION, self.unit, steps).pose
 
     # Densification (section 3.3)
@@ -332,7 +330,7 @@ class SplatSlam(Method):
         self, window: Sequence[DepthFrame], iterations: int, chance: torch.Generator, descend: Descend
     ) -> dict[str, Tensor]:
         """Descend on the Gaussians through frames of the window at random, without a silhouette mask."""
-        c, terms = self.config.mapping, dict[str, Tensor]()
+        terms = dict[str, Tensor]()
         if self.cloud.optimizer is not None:
             self.cloud.optimizer.state.clear()  # as the release, which makes a new optimizer for each frame
         for i in range(iterations):
@@ -344,8 +342,8 @@ class SplatSlam(Method):
             shown = self.shown(seen)
             away = torch.where(known, (seen.depth - depth).abs(), 0.0).sum() / known.sum().clamp_min(1) / self.unit
             ssim, l1 = kernels.photometric(shown, rgb)
-            colour = (1 - c.ssim_weight) * l1 + c.ssim_weight * (1 - ssim)
-            terms = {"depth": c.depth_weight * away, "colour": c.colour_weight * colour}
+            colour = (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim)
+            terms = {"depth": DEPTH_WEIGHT * away, "colour": COLOUR_WEIGHT * colour}
             self.figures["mse"] = float((shown - rgb).detach().square().mean())
             descend(terms)
         return terms

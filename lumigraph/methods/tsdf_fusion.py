@@ -42,7 +42,7 @@ class Config:
     max_depth: Length = 4.0  # in units of the capture, beyond which depth is left out; 0: none
     trusted_depth: Length = 0.0  # in units of the capture, up to which depth counts in full; 0: everywhere
     min_weight: NonNegative = 0.0  # of voxels that the mesh is made of; above 1, what was seen once is lost
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class TSDFFusion(RayMethod):

@@ -20,12 +20,15 @@ from ..components.image_based.surface import consensus
 from ..components.image_based.warping import behind, pushed, soft_splat
 from ..datasets.scene import Frame, Scene
 from ..depth_maps.optical_flow import optical_flow, round_trip_error, sampled
-from ..files.ranges import NonNegative, Pixels, Positive, PositiveShare, Seed, between
+from ..files.ranges import Pixels, Seed, between
 from ..geometry import to_matrix, to_quaternion
 from ..system.work import at_work
 
 MIN_COVER = 0.2  # sum of splatting weights from which on a pixel is covered
 FLOW_DISAGREEMENT = 1.5  # pixels between a flow and the one back, at which a pixel's weight has fallen to 1 / e
+OCCLUSION = 80.0  # alpha: sharpness of the choice of the nearer of two surfaces, per relative depth
+AGREEMENT = 0.04  # of distance, within which photographs show one surface
+NEARNESS = 2.0  # power of the inverse distance of a photograph in its weight
 
 
 @dataclass(frozen=True)
@@ -36,10 +39,7 @@ class Config:
     geometry: Literal["stereo", "measured"] = "stereo"  # source of depth: multi-view stereo, or a layer `depth`
     depth_size: Pixels = 400  # longer side of the depth maps; larger: finer edges, slower
     warped_views: Annotated[int, between(1, 16)] = 2  # photographs warped into a picture; more: fewer holes, slower
-    occlusion: Positive = 80.0  # alpha: sharpness of the choice of the nearer of two surfaces, per relative depth
-    agreement: PositiveShare = 0.04  # of distance, within which photographs show one surface
-    nearness: NonNegative = 2.0  # power of the inverse distance of a photograph in its weight
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class ViewInterpolation(ImageBasedMethod):
@@ -85,11 +85,11 @@ class ViewInterpolation(ImageBasedMethod):
         chosen = tables.nearest(camera, c.warped_views)
         layers = [self._splatted(i, camera) for i in chosen]
         apart = (tables.cameras.position[chosen] - camera.position).norm(dim=-1) / tables.middle
-        near = ((1e-3 + apart.min()) / (1e-3 + apart)) ** c.nearness
+        near = ((1e-3 + apart.min()) / (1e-3 + apart)) ** NEARNESS
         rgb, depth, cover = (torch.stack(x) for x in zip(*layers, strict=True))
         weight = near[:, None, None] * cover.clamp_max(1) * (cover > MIN_COVER)
         agreed = consensus(depth, weight)
-        weight = weight * ((depth - agreed).abs() < c.agreement * agreed)
+        weight = weight * ((depth - agreed).abs() < AGREEMENT * agreed)
         total = weight.sum(0)
         seen = total > 0
         found = (weight[..., None] * rgb).sum(0) / total.clamp_min(1e-12)[..., None]
@@ -112,7 +112,7 @@ class ViewInterpolation(ImageBasedMethod):
         distance = (points - camera.position).norm(dim=-1)
         footprint = away[usable] * focal_length(camera) / (distance * focal_length(own))
         values = torch.cat([distance[:, None], colours], -1)[valid]
-        importance = -self.config.occlusion * distance[valid].log()
+        importance = -OCCLUSION * distance[valid].log()
         found, cover = soft_splat(places[valid], values, importance, shape(camera), float(footprint.median()))
         return found[..., 1:], found[..., 0], cover
 

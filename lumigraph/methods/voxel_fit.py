@@ -22,30 +22,32 @@ from ..components.training.schedules import falling
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
-from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, between
+from ..files.ranges import LearningRate, Seed, between, changed
 from ..method import Field, FieldMethod
 from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
 Voxels = Annotated[int, between(8, 1 << 28)]
+GROWING_SHARE = 0.5  # share of the budget in which they happen
+INITIAL_OPACITY = 0.01  # share of light that a voxel stops at first; higher is harder to clear
+MASK_WEIGHT = 0.1  # of the silhouettes' squared error
+ENTROPY_WEIGHT = 1e-3  # of rays' entropy of opacity; larger makes voxels full or empty
+VARIATION_WEIGHT = 1e-5  # of total variation; larger is smoother
 
 
 @dataclass(frozen=True)
 class Config:
     """Numbers of a small grid: no paper's. Voxels and opacity at first are those of Sun 2022."""
 
-    occupancy: OccupancyNumbers = OccupancyNumbers(1 << 18, transmittance_threshold=1e-3, occupancy_threshold=0.05)
+    occupancy: OccupancyNumbers = OccupancyNumbers(
+        samples_per_step=1 << 18, transmittance_threshold=1e-3, occupancy_threshold=0.05
+    )
     first_voxels: Voxels = 64**3  # voxels at first; fewer are faster, and find the shape sooner
     voxels: Voxels = 160**3  # voxels in the end; more show more detail, and cost memory and time
     doublings: Annotated[int, between(0, 20)] = 4  # times that voxels grow in number, at even shares of the budget
-    growing_share: PositiveShare = 0.5  # share of the budget in which they happen
-    initial_opacity: PositiveShare = 0.01  # share of light that a voxel stops at first; higher is harder to clear
     step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples, in voxels; larger is faster, and coarser
     learning_rate: LearningRate = 0.3  # of the grid; larger is faster, and noisier
     final_learning_rate: LearningRate = 0.03  # at the end of the budget
-    mask_weight: NonNegative = 0.1  # of the silhouettes' squared error
-    entropy_weight: NonNegative = 1e-3  # of rays' entropy of opacity; larger makes voxels full or empty
-    variation_weight: NonNegative = 1e-5  # of total variation; larger is smoother
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -68,7 +70,7 @@ class SoftVoxels(Field):
         super().__init__()
         self.config = config
         self.grid = VoxelGrid([list(corner) for corner in frame.bounds], config.first_voxels, 4)
-        self.shift = math.log(config.initial_opacity / (1 - config.initial_opacity))
+        self.shift = math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))
         volume = math.prod(high - low for low, high in zip(*frame.bounds, strict=True))
         self.edge = (volume / config.voxels) ** (1 / 3)
 
@@ -102,14 +104,14 @@ class VoxelFit(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        c = Config(OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1))
-        return replace(c, first_voxels=48**3, voxels=112**3, doublings=3, step_size=0.8)
+        return changed(Config(), samples_per_step=1 << 17, occupancy_threshold=0.1, first_voxels=48**3, voxels=112**3,
+            doublings=3, step_size=0.8)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some thousand voxels that double once."""
-        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), first_voxels=12**3, voxels=20**3, doublings=1)
-        return replace(c, learning_rate=0.5, final_learning_rate=0.2)
+        return changed(Config(), samples_per_step=4096, occupancy_resolution=16, first_voxels=12**3, voxels=20**3,
+            doublings=1, learning_rate=0.5, final_learning_rate=0.2, transmittance_threshold=0.0001)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -128,7 +130,7 @@ class VoxelFit(FieldMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Squared errors of colours and silhouettes, entropy of opacity, total variation."""
-        c, generator = self.config, self.random(step)
+        generator = self.random(step)
         (samples,), terms = self.learn(batch.rays, generator)
         look = samples.look(self.network)
         background = backdrop(batch, self.background, generator)
@@ -136,14 +138,13 @@ class VoxelFit(FieldMethod):
         error = (seen.rgb - batch.before(background)).square().mean()
         self.figures["mse"] = float(error.detach())
         terms |= {"colour": error}
-        if batch.alpha is not None and c.mask_weight:
-            terms["mask"] = c.mask_weight * (seen.opacity - batch.alpha).square().mean()
-        if c.entropy_weight:
-            a = seen.opacity.clamp(1e-6, 1 - 1e-6)
-            terms["entropy"] = c.entropy_weight * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
-        if c.variation_weight and len(look.samples):
+        if batch.alpha is not None:
+            terms["mask"] = MASK_WEIGHT * (seen.opacity - batch.alpha).square().mean()
+        a = seen.opacity.clamp(1e-6, 1 - 1e-6)
+        terms["entropy"] = ENTROPY_WEIGHT * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
+        if len(look.samples):
             points, _ = look.samples.along(batch.rays)
-            terms["variation"] = c.variation_weight * self.network.grid.variation(points, MAX_SMOOTHED, generator)
+            terms["variation"] = VARIATION_WEIGHT * self.network.grid.variation(points, MAX_SMOOTHED, generator)
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -156,7 +157,7 @@ class VoxelFit(FieldMethod):
     def before_step(self, step: int, progress: float) -> None:
         """Double the number of voxels at even shares of the budget."""
         c, grid = self.config, self.network.grid
-        due = min(c.doublings, int(progress / c.growing_share * (c.doublings + 1)))
+        due = min(c.doublings, int(progress / GROWING_SHARE * (c.doublings + 1)))
         if due > int(self.doubled):
             grid.rebuild(
                 grid.box, round(c.first_voxels * (c.voxels / c.first_voxels) ** (due / c.doublings)), self._adam

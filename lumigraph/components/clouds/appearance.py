@@ -16,7 +16,6 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning
-from ...files.ranges import LearningRate
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
 from ...method.controls import Control
@@ -32,6 +31,7 @@ FULL_SCHEDULE_PASSES = 400  # steps for each photograph, from which on the learn
 MAX_LR_SCALE = 6.0  # of the learning rate, in short runs
 FINAL_APPEARANCE_LR = 5e-4  # learning rate of appearance codes at the end of the budget
 APPEARANCE_REGULARIZATION = 1e-3  # weight of squares of appearance codes in the loss
+APPEARANCE_LR = 5e-3  # learning rate of these colours and skies at first
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,6 @@ class AppearanceNumbers:
 
     appearance: Literal["auto", "yes", "no"] = "auto"  # colours for each photograph; auto: where photographs differ
     own_skies: bool = True  # with appearance, learn a sky for each photograph of an open capture
-    appearance_lr: LearningRate = 5e-3  # learning rate of these colours and skies at first
 
 
 class SplatAppearance(Addition):
@@ -94,11 +93,11 @@ class SplatAppearance(Addition):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         """One row a step has a gradient, as with Gaussians."""
-        return [CloudAdam([{"name": "appearance", "params": [self.codes.codes], "lr": self.numbers.appearance_lr}])]
+        return [CloudAdam([{"name": "appearance", "params": [self.codes.codes], "lr": APPEARANCE_LR}])]
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         full_schedule = FULL_SCHEDULE_PASSES * len(self.codes.codes)
-        rate = falling(self.numbers.appearance_lr, FINAL_APPEARANCE_LR, progress)
+        rate = falling(APPEARANCE_LR, FINAL_APPEARANCE_LR, progress)
         return {"appearance": short_schedule_lr_scale(step, progress, full_schedule, MAX_LR_SCALE) * rate}
 
     # Rendering

@@ -30,17 +30,27 @@ FULL_SCHEDULE = 2400  # steps from which on the rates of scales and harmonics ar
 REST_BANDS_SCALE = 1 / 20  # of the harmonics' learning rate, beyond the first band
 
 
+# Learning rates of 3D Gaussian Splatting, graphdeco-inria/gaussian-splatting, arguments/__init__.py; see `RateNumbers`.
+MEANS_LR, FINAL_MEANS_LR, SH_LR, OPACITIES_LR, SCALES_LR, QUATERNIONS_LR = 1.6e-4, 1.6e-6, 2.5e-3, 0.05, 5e-3, 1e-3
+MOST_HASTE = 1.0  # factor on rates in short runs, where it is no option
+
+
+@dataclass(frozen=True)
+class HasteNumbers:
+    """Options of learning rates; these are those of 3D Gaussian Splatting."""
+
+    most_haste: Annotated[float, between(1, 1000)] = 1.0  # largest factor on scales' and colours' rates in short runs
+
+
 @dataclass(frozen=True)
 class RateNumbers:
-    """A Config's learning rates, those of the authors' release."""
+    """Options of learning rates."""
 
-    means_lr: LearningRate = 1.6e-4  # learning rate of the means at first, times the extent of the cameras
-    final_means_lr: LearningRate = 1.6e-6  # learning rate of the means at the end of the budget, likewise
-    sh_lr: LearningRate = 2.5e-3  # learning rate of colours; a twentieth of it beyond the first band
-    opacities_lr: LearningRate = 0.05  # learning rate of opacity logits
-    scales_lr: LearningRate = 5e-3  # learning rate of log scales
-    quaternions_lr: LearningRate = 1e-3  # learning rate of rotations
-    most_haste: Annotated[float, between(1, 1000)] = 1.0  # largest factor on scales' and colours' rates in short runs
+    means_lr: LearningRate = MEANS_LR  # learning rate of the means at first, times the extent of the cameras
+    final_means_lr: LearningRate = FINAL_MEANS_LR  # learning rate of the means at the end of the budget, likewise
+    sh_lr: LearningRate = SH_LR  # learning rate of colours; a twentieth of it beyond the first band
+    scales_lr: LearningRate = SCALES_LR  # learning rate of log scales
+    quaternions_lr: LearningRate = QUATERNIONS_LR  # learning rate of rotations
 
 
 class Cloud(Part):
@@ -62,9 +72,9 @@ class Cloud(Part):
     extent: Tensor
     optimizer: CloudAdam | None = None
 
-    def __init__(self, gaussians: Gaussians, rates: RateNumbers = RateNumbers()):
+    def __init__(self, gaussians: Gaussians, rates: RateNumbers = RateNumbers(), most_haste: float = MOST_HASTE):
         super().__init__()
-        self.rates = rates
+        self.rates, self.most_haste = rates, most_haste
         self.antialiased = gaussians.antialiased
         for name in NAMES:
             setattr(self, name, nn.Parameter(getattr(gaussians, name).clone()))
@@ -90,7 +100,7 @@ class Cloud(Part):
             {"name": "means", "params": [self.means], "lr": c.means_lr},
             {"params": [self.quaternions], "lr": c.quaternions_lr},
             {"name": "scales", "params": [self.log_scales], "lr": c.scales_lr},
-            {"params": [self.opacities], "lr": c.opacities_lr},
+            {"params": [self.opacities], "lr": OPACITIES_LR},
             {"name": "harmonics", "params": [self.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
         self.optimizer = CloudAdam(groups)
@@ -100,7 +110,7 @@ class Cloud(Part):
         """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others are constant, but
         higher for scales and harmonics in short runs."""
         c = self.rates
-        scale = short_schedule_lr_scale(step, progress, FULL_SCHEDULE, c.most_haste)
+        scale = short_schedule_lr_scale(step, progress, FULL_SCHEDULE, self.most_haste)
         means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
         return {"means": means, "scales": scale * c.scales_lr, "harmonics": scale * c.sh_lr}
 

@@ -35,6 +35,10 @@ from .interval_schedule import intervals
 from .moved_cloud import seen_from
 
 BLACK = 0.0, 0.0, 0.0
+SH_DEGREE_INTERVAL = 1000  # steps for each further degree of harmonics, section 7.1; or the share below, if sooner
+SH_DEGREE_INTERVAL_SHARE = 1 / 8  # of the budget
+SSIM_WEIGHT = 0.2  # share of D-SSIM in the loss, eq. 7
+TRANSMITTANCE_THRESHOLD = 1e-4  # transmittance at which a pixel is finished, appendix C
 SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
 LEAST_PIXELS = 4096  # of a photograph that is reduced
@@ -47,9 +51,8 @@ class CloudMethod(Method, ABC):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
 
     Assign a DensityControl as `density_control`, a PoseRefinement or None as `poses`, and further `Addition`s. The
-    Config has the numbers `sh_degree`, `sh_degree_interval`, `sh_degree_interval_share`, `ssim_weight`,
-    `initialization`, `initial_gaussians`, `half_resolution_until`, `transmittance_threshold` and `seed`, and the parts'
-    `rates`, `refine` and `photographs`.
+    Config has `sh_degree`, `ssim_weight`, `initialization`, `initial_gaussians`, `half_resolution_until` and `seed`,
+    and the parts' `rates`, `refine` and `photographs`.
     cameras:  of the photographs that are learnt from; None before training
     bands:    of the harmonics in use
     current:  the step between `loss` and `after_step`
@@ -64,7 +67,7 @@ class CloudMethod(Method, ABC):
         c = config
         super().__init__(frame, c)
         count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians or PLACEHOLDER_COUNT)
-        self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), c.rates)
+        self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), most_haste=c.rates.most_haste)
         self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
         self.register_buffer("drawn", torch.tensor(0))
         self.cameras: Camera | None = None
@@ -127,7 +130,7 @@ class CloudMethod(Method, ABC):
         """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
         super().before_step(step, progress)
         c = self.config
-        joined = intervals(step, progress, c.sh_degree_interval, c.sh_degree_interval_share)
+        joined = intervals(step, progress, SH_DEGREE_INTERVAL, SH_DEGREE_INTERVAL_SHARE)
         coarse = self.moves_cameras and progress < COARSE_UNTIL
         plain = coarse or any(part.base_colours for part in self.additions)
         self.bands = 1 if plain else 1 + min(int(joined), c.sh_degree)
@@ -170,7 +173,7 @@ class CloudMethod(Method, ABC):
             part.before_raster(self, now)
         if self.poses:
             now.cloud, now.camera = seen_from(self.poses, now.cloud, now.camera)
-        now.picture = splat(now.cloud, view_of(now.camera, self.near_plane), self.bands, c.transmittance_threshold)
+        now.picture = splat(now.cloud, view_of(now.camera, self.near_plane), self.bands, TRANSMITTANCE_THRESHOLD)
         now.rgb, now.background = now.picture.rgb, self.background[0]
         if now.picture.centres.requires_grad:
             now.picture.centres.retain_grad()  # density control follows it

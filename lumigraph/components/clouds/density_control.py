@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ...errors import LumigraphWarning
-from ...files.ranges import NonNegative, Share, Steps, between
+from ...files.ranges import NonNegative, Share, between
 from ...system.memory import room_for
 from .addition import Addition
 from .cloud import Cloud
@@ -21,19 +21,19 @@ from .interval_schedule import IntervalSchedule, intervals
 PRUNE_OPACITY = 0.005  # below which a Gaussian is pruned or relocated (Kerbl 2023 and Kheradmand 2024)
 MIN_CAP = 120_000  # Gaussians that a budget of few steps may have, where the cap follows the budget
 BYTES_PER_GAUSSIAN = 4096  # lower bound while it learns: itself, its gradient and moments, its share of a picture
+REFINE_EVERY = 100  # steps between density control, section 5.2; or the share below, if sooner
 REFINE_EVERY_SHARE = 0.1  # share of the budget between density control, if that is sooner
+REFINE_FROM = 500  # step at which density control starts, section 5.2; or the share below, if sooner
 REFINE_FROM_SHARE = 0.15  # share of the budget at which density control starts, if sooner
 
 
 @dataclass(frozen=True)
 class RefineNumbers:
-    """A Config's numbers of when a strategy changes the cloud."""
+    """Options of density control."""
 
     max_gaussians: Annotated[int, between(0, 100_000_000)] = 0  # Gaussians at most; more cost time; 0: as memory allows
     gaussians_per_step: NonNegative = 0.0  # of the budget, at most, beyond 120,000; 0: the cap follows no budget
     cap_ramp: bool = False  # raise the cap evenly until refine_until, with adaptive, so that early steps are quick
-    refine_every: Steps = 100  # steps between density control, section 5.2; or the share below, if sooner
-    refine_from: Steps = 500  # step at which density control starts, section 5.2; or the share below, if sooner
     refine_until: Share = 0.5  # share of the budget at which it ends, section 7.1: 15 000 of 30 000 steps
 
 
@@ -48,7 +48,7 @@ class DensityControl(Addition, ABC):
     def __init__(self, refine: RefineNumbers):
         super().__init__()
         self.refining = refine
-        self.schedule = IntervalSchedule(refine.refine_every, REFINE_EVERY_SHARE)
+        self.schedule = IntervalSchedule(REFINE_EVERY, REFINE_EVERY_SHARE)
         self.register_buffer("initial_count", torch.tensor(0))
         self.warned = False
 
@@ -62,7 +62,7 @@ class DensityControl(Addition, ABC):
     def due(self, step: int, progress: float) -> bool:
         """True if the cloud may change after this step; called once a step."""
         ended = self.schedule.due(step, progress)
-        return ended and intervals(step, progress, self.refining.refine_from, REFINE_FROM_SHARE) >= 1
+        return ended and intervals(step, progress, REFINE_FROM, REFINE_FROM_SHARE) >= 1
 
     def allowed(self, steps: float = 0.0) -> float:
         """Gaussians that the numbers allow in a budget of so many steps; infinitely many without `max_gaussians`."""

@@ -32,7 +32,7 @@ class TidyingNumbers:
     observed_harmonics: bool = False  # zero harmonics that too few photographs determine; off: any are learnt
 
 
-ALL_RULES = TidyingNumbers(True, True, True, True)
+ALL_RULES = TidyingNumbers(prune_near=True, limit_scale=True, limit_anisotropy=True, observed_harmonics=True)
 
 
 class Tidying(Addition):

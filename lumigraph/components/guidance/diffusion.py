@@ -23,7 +23,7 @@ from ...files.reading import reading
 from ...metrics import Score
 from .clip import TextTransformer
 from .clip_files import ConfigRecord, TowerRecord, load, named_as_here, read_tensors, read_tokenizer, tower_of
-from .guides import DistillationNumbers, Pictures
+from .guides import MAX_TIME, MIN_TIME, DistillationNumbers, Pictures
 
 DIFFUSION_INDEX = "model_index.json"
 CLASSES = {"unet": "UNet2DConditionModel", "text_encoder": "CLIPTextModel"}  # that are understood
@@ -95,7 +95,7 @@ class DiffusionGuide:
     ) -> Float[Tensor, "picture channel h w"]:
         """w(t) (e(z_t; y, t) - noise) with classifier-free guidance (Poole 2022, eq. 3 and 4); w(t) = 1 - kept(t)."""
         last = len(self.kept) - 1
-        share = n.min_time + (n.max_time - n.min_time) * torch.rand(len(latents), generator=generator)
+        share = MIN_TIME + (MAX_TIME - MIN_TIME) * torch.rand(len(latents), generator=generator)
         time = (share * last).round().long().to(latents.device)
         noise = torch.randn(latents.shape, generator=generator).to(latents)
         kept = self.kept[time][:, None, None, None]

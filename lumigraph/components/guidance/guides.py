@@ -10,13 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...errors import LumigraphError
-from ...files.ranges import NonNegative, Share
+from ...files.ranges import NonNegative
 from ...metrics import Score
 from .clip import Clip
 from .tokenizer import Tokenizer
 
 Pictures = Float[Tensor, "picture 3 side side"]
+MIN_TIME = 0.02  # share of the noise schedule at which the least noise is drawn; higher: coarser advice
+MAX_TIME = 0.98  # share of the noise schedule at which the most noise is drawn
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,6 @@ class DistillationNumbers:
     """A Config's numbers of score distillation (Poole 2022, section 3); CLIP uses none of them."""
 
     guidance_scale: NonNegative = 100.0  # omega of eq. 4; higher: closer to the prompt, less varied, gaudier
-    min_time: Share = 0.02  # share of the noise schedule at which the least noise is drawn; higher: coarser advice
-    max_time: Share = 0.98  # share of the noise schedule at which the most noise is drawn
-
-    def check(self) -> None:
-        """Raises LumigraphError for an empty range of noise."""
-        if self.min_time > self.max_time:
-            raise LumigraphError(f"--min-time {self.min_time:g} is above --max-time {self.max_time:g}; swap them")
 
 
 @runtime_checkable

@@ -27,6 +27,9 @@ from .views import (
 )
 
 Degrees = Annotated[float, between(-90, 90)]
+MIN_ELEVATION = 30.0  # degrees above the horizon, of the lowest cameras
+MAX_ELEVATION = 30.0  # degrees above the horizon, of the highest cameras
+CAMERA_DISTANCE = 4.0  # distance of cameras from the origin, in scene units
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,6 @@ class GuidanceNumbers:
     crop_share: PositiveShare = 154 / 168  # width of a random crop as a share of the view; less: stronger augmentation
     views_per_step: Annotated[int, between(1, 64)] = 8  # views of a step, each of its own camera; more are steadier
     crops_per_view: Annotated[int, between(1, 64)] = 8  # crops of a view, each before a random background
-    min_elevation: Degrees = 30.0  # elevation of the lowest cameras in degrees above the horizon
-    max_elevation: Degrees = 30.0  # elevation of the highest cameras in degrees; wider: seen from more sides
-    camera_distance: Annotated[float, between(2, 100)] = 4.0  # distance of cameras from the origin, in scene units
     focal: Annotated[float, between(0.2, 10)] = 1.2  # focal length in widths of the picture; longer: larger scene
     transmittance_weight: NonNegative = 0.5  # weight of the transmittance prior, lambda of eq. 6; 0: off, more clutter
     initial_opacity: PositiveShare = 0.5  # mean opacity that the prior allows at first; falls to final_opacity
@@ -96,11 +96,11 @@ class Guidance(Part):
             )
         self.guide = open_guide(words.guidance, self.origin.device)
         azimuth = degrees_between(0.0, 360.0, n.views_per_step, generator)
-        elevation = degrees_between(n.min_elevation, n.max_elevation, n.views_per_step, generator)
+        elevation = degrees_between(MIN_ELEVATION, MAX_ELEVATION, n.views_per_step, generator)
         naming = self.guide.named_views if n.view_prompts == "auto" else n.view_prompts == "yes"
         names = [named_view(a, e) for a, e in zip(azimuth.tolist(), elevation.tolist(), strict=True)]
         prompts = tuple(f"{words.prompt}, {name}" if naming else words.prompt for name in names)
-        camera = camera_around(azimuth, elevation, n.camera_distance, n.focal, n.render_width, self.origin)
+        camera = camera_around(azimuth, elevation, CAMERA_DISTANCE, n.focal, n.render_width, self.origin)
         return PromptedViews(camera, prompts)
 
     def terms(
@@ -118,7 +118,7 @@ class Guidance(Part):
         terms = {"guidance": self.guide.loss(pictures, prompts, generator, self.distillation)}
         if n.transmittance_weight:
             allowed = opacity_target(
-                n.initial_opacity, n.final_opacity, n.opacity_steps, step, n.focal, n.camera_distance
+                n.initial_opacity, n.final_opacity, n.opacity_steps, step, n.focal, CAMERA_DISTANCE
             )
             excess = (rgba[:, 3].mean() - allowed).clamp_min(0.0)
             terms["transmittance"] = n.transmittance_weight * excess

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...datasets.scene import Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, Share, between
+from ...files.ranges import Share, between
 from ...method import Part
 from .frames import DepthFrame, Moment, order_of
 from .loops import Loops
@@ -19,6 +19,8 @@ from .trajectory import KNOWN, Pose, Trajectory, relative
 
 Iterations = Annotated[int, between(0, 10_000)]
 MAX_STEP = 0.3, 0.35  # metres and radians between frames that tracking believes
+ALIGNMENT_POINTS = 3000  # pixels of a frame that are aligned with the map's surface
+ALIGNMENT_ITERATIONS = 12  # Gauss-Newton steps of that
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,7 @@ class TrackingNumbers:
     """A Config's numbers of tracking that methods share."""
 
     track: bool = False  # find the poses of frames in order, as `lumigraph track` does; else they are those given
-    first_estimate: Literal["velocity", "surface"] = (
-        "velocity"  # first pose: constant velocity, or aligned with the map
-    )
-    alignment_points: BatchSize = 3000  # pixels of a frame that are aligned with the map's surface
-    alignment_iterations: Iterations = 12  # Gauss-Newton steps of that
+    first_estimate: Literal["velocity", "surface"] = "velocity"  # first pose: by velocity, or aligned with the map
     lost_share: Share = 0.3  # share of explained pixels below which a frame is lost
     close_loops: bool = False  # recognise places by features and correct the path by a pose graph; slower
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Int
@@ -14,8 +14,11 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import RateNumbers
-from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.cloud import HasteNumbers
+from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
+from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization, round_gaussians
 from ...components.clouds.tidying import Tidying, TidyingNumbers
@@ -23,7 +26,7 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers
 from ...datasets.scene import Frame, Photograph, Scene
-from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between, changed
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, between, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
@@ -32,30 +35,28 @@ from ...method.controls import Control
 from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
 
+TIDYING = TidyingNumbers(limit_anisotropy=True)
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
 ISOTROPY_WEIGHT = 0.01  # weight of long Gaussians, which tear at joints
+INITIALIZATION: Initialization = "random"  # an option of older runs; first Gaussians are about the bones
 
 
 @dataclass(frozen=True)
 class Config:
-    """Numbers of MANUS from memory, and Kerbl's (2023) of the cloud; `cpu_preset` has those of a plain CPU."""
+    """Kerbl's (2023) numbers of the cloud, as in MANUS; those of bones and weights are ours, not the paper's."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
-    sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
-    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss; higher gives structure more weight
-    initialization: Initialization = "random"  # first Gaussians: about the bones, whatever it says
+    ssim_weight: ClassVar[float] = SSIM_WEIGHT
+    initialization: ClassVar[Initialization] = INITIALIZATION
     initial_gaussians: CloudSize = 10_000  # random Gaussians about the bones at first
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
-    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
-    bones: BoneNumbers = BoneNumbers("table", pose_lr=1e-2, pose_from=0.1)
+    bones: BoneNumbers = BoneNumbers(pose_correction="table", pose_lr=1e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
-    rates: RateNumbers = RateNumbers()
+    rates: HasteNumbers = HasteNumbers()
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
     photographs: AppearanceNumbers = AppearanceNumbers(appearance="no")
-    tidying: TidyingNumbers = TidyingNumbers(limit_anisotropy=True)
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -72,23 +73,20 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         with seeded(c.seed):
             self.skin = SkinnedCloud(frame, c.bones, c.weights)
         self.bones = self.skin.bones
-        self.tidying = Tidying(c.tidying)
+        self.tidying = Tidying(TIDYING)
 
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud without view dependence, a coarser volume, and higher rates for few steps."""
-        c = Config(sh_degree=0, initial_gaussians=6000, refine=RefineNumbers(30_000, cap_ramp=True))
-        return changed(c, half_resolution_until=0.3, most_haste=4.0, weight_cells=24, pose_smoothing=True)
+        return changed(Config(), sh_degree=0, initial_gaussians=6000, max_gaussians=30_000, cap_ramp=True,
+            half_resolution_until=0.3, most_haste=4.0, weight_cells=24, pose_smoothing=True)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians on bones, refined within some twenty quick steps."""
-        refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
-        return changed(
-            Config(refine=refine), sh_degree=1, sh_degree_interval=4, initial_gaussians=200,
-            densify_grad_threshold=1e-6, opacity_reset_interval=5, weight_cells=8, weight_code=0, weights_lr=1e-2,
-            bone_radius=0.5, pose_correction="table", pose_lr=1e-3, pose_from=0.0,
-        )  # fmt: skip
+        return changed(Config(), max_gaussians=300, cap_ramp=True, refine_until=0.8, sh_degree=1, initial_gaussians=200,
+            densify_grad_threshold=1e-6, opacity_reset_interval=5, weight_cells=8, bone_radius=0.5, pose_lr=1e-3,
+            pose_from=0.0)  # fmt: skip
 
     def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
         """Round Gaussians about the bones at rest, in random colours."""

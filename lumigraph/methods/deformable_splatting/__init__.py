@@ -15,13 +15,16 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import RateNumbers
+from ...components.clouds.cloud import HasteNumbers
 from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
+from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between, changed
+from ...files.ranges import CloudSize, Seed, Share, between, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
@@ -40,15 +43,12 @@ class Config:
     """The numbers of the authors' release, with Kerbl's (2023) of the cloud."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
-    sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
-    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
     ssim_weight: Share = 0.0  # share of D-SSIM in the loss; higher gives structure more weight
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 2000  # random Gaussians, where there are no points
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
-    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
     motion: MotionNumbers = MotionNumbers()
-    rates: RateNumbers = RateNumbers()
+    rates: HasteNumbers = HasteNumbers()
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
     photographs: AppearanceNumbers = AppearanceNumbers(appearance="no")
@@ -74,22 +74,18 @@ class DeformableSplatting(CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense, carried by nodes, coarser planes, and higher rates for few steps."""
-        c = Config(initialization="dense", refine=RefineNumbers(40_000, cap_ramp=True), tidying=ALL_RULES)
-        return changed(
-            c, initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, most_haste=4.0, half_resolution_until=0.4,
+        return changed(Config(tidying=ALL_RULES), initialization="dense", max_gaussians=40_000, cap_ramp=True,
+            initial_gaussians=10_000, ssim_weight=0.2, sh_degree=1, most_haste=4.0, half_resolution_until=0.4,
             plane_resolution=32, plane_features=8, plane_moments=32, nodes=400, still_until=0.08, planes_lr=4e-3,
-            motion_lr=1e-3, final_rate=0.1,
-        )  # fmt: skip
+            motion_lr=1e-3, final_rate=0.1)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that move, are refined and told apart within some twenty quick steps."""
-        refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
         return changed(
-            Config(refine=refine, tidying=ALL_RULES), sh_degree=1, sh_degree_interval=4, initial_gaussians=200,
-            ssim_weight=0.2, densify_grad_threshold=1e-6, opacity_reset_interval=5,
-            plane_resolution=4, plane_moments=4, plane_scales=1, plane_features=4, motion_width=8, nodes=20,
-            all_moments_from=0.3, still_until=0.0, told_apart=0.6,
+            Config(tidying=ALL_RULES), max_gaussians=300, cap_ramp=True, refine_until=0.8, sh_degree=1,
+            initial_gaussians=200, ssim_weight=0.2, densify_grad_threshold=1e-6, opacity_reset_interval=5,
+            plane_resolution=4, plane_moments=4, plane_features=4, nodes=20, all_moments_from=0.3, still_until=0.0,
         )  # fmt: skip
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:

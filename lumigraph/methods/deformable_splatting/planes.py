@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from ...components.clouds.addition import Addition, Step
 from ...components.training.schedules import falling
 from ...datasets.scene import Frame
-from ...files.ranges import LearningRate, NonNegative, PositiveShare, Share, Width, between
+from ...files.ranges import LearningRate, NonNegative, PositiveShare, Share, between
 from ...gaussians import Gaussians
 from ...geometry import multiply, to_matrix
 
@@ -33,6 +33,12 @@ Moments = Float[Tensor, " gaussian"] | float
 
 STILL_OFFSET = 0.002  # offset up to which a Gaussian stands still, as a share of the diagonal
 RIGID_SAMPLES = 1024  # Gaussians of a step whose neighbours are compared
+MAX_OFFSET = 0.5  # largest offset of a Gaussian, as a share of the box's diagonal
+PLANE_SMOOTHNESS = 1e-4  # weight of total variation of planes in space
+TIME_SPARSITY = 1e-4  # weight of the planes' distance from no motion; higher: more stands still
+TOLD_APART = 0.4  # share of the budget from which Gaussians that hardly move stand still; 1: never
+PLANE_SCALES = 2  # planes of each pair of axes, each twice as fine in space
+MOTION_WIDTH = 64  # channels of the network's hidden layer
 
 
 @dataclass(frozen=True)
@@ -41,17 +47,11 @@ class MotionNumbers:
 
     plane_resolution: Annotated[int, between(4, 1024)] = 64  # cells of the coarsest planes along an axis of space
     plane_moments: Annotated[int, between(2, 1024)] = 25  # cells of the coarsest planes along time; more move faster
-    plane_scales: Annotated[int, between(1, 6)] = 2  # planes of each pair of axes, each twice as fine in space
     plane_features: Annotated[int, between(1, 128)] = 32  # features of a cell; more hold more motion, and cost time
-    motion_width: Width = 64  # channels of the network's hidden layer
     nodes: Annotated[int, between(0, 65_536)] = 0  # places that move and carry Gaussians; 0: each moves by itself
-    max_offset: PositiveShare = 0.5  # largest offset of a Gaussian, as a share of the box's diagonal
     still_until: Share = 3000 / 23_000  # share of the budget in which nothing moves, 3000 steps; later: a better start
     all_moments_from: Share = 0.0  # share of the budget until which moments join, from the middle one on
-    told_apart: Share = 0.4  # share of the budget from which Gaussians that hardly move stand still; 1: never
-    plane_smoothness: NonNegative = 1e-4  # weight of total variation of planes in space
     time_smoothness: NonNegative = 0.01  # weight of second differences of planes along time; higher: calmer motion
-    time_sparsity: NonNegative = 1e-4  # weight of the planes' distance from no motion; higher: more stands still
     rigidity: NonNegative = 0.01  # weight of distances to neighbours that change; higher: stiffer bodies
     planes_lr: LearningRate = 1.6e-3  # learning rate of the planes at first, times the extent of the cameras
     motion_lr: LearningRate = 1.6e-4  # learning rate of the network at first, likewise
@@ -65,9 +65,9 @@ class SpaceTimePlanes(nn.Module):
     def __init__(self, numbers: MotionNumbers):
         super().__init__()
         n = numbers
-        self.width = n.plane_features * n.plane_scales
+        self.width = n.plane_features * PLANE_SCALES
         self.planes = nn.ParameterList()
-        for scale in range(n.plane_scales):
+        for scale in range(PLANE_SCALES):
             cells = [n.plane_resolution << scale] * 3 + [n.plane_moments]
             for a, b in PAIRS:
                 plane = torch.empty(1, n.plane_features, cells[b], cells[a])
@@ -144,8 +144,8 @@ class PlaneMotion(Addition):
         self.register_buffer("box", torch.stack([low, high]), persistent=False)
         self.diagonal = float((high - low).norm())
         self.planes = SpaceTimePlanes(numbers)
-        self.network = nn.Sequential(nn.Linear(self.planes.width, numbers.motion_width), nn.ReLU())
-        self.heads = nn.Linear(numbers.motion_width, 9)
+        self.network = nn.Sequential(nn.Linear(self.planes.width, MOTION_WIDTH), nn.ReLU())
+        self.heads = nn.Linear(MOTION_WIDTH, 9)
         nn.init.uniform_(self.heads.weight, -FIRST_MOTION, FIRST_MOTION)
         nn.init.zeros_(self.heads.bias)
         self.register_buffer("moves", torch.ones(count, dtype=torch.bool))
@@ -169,7 +169,7 @@ class PlaneMotion(Addition):
         space = 2 * (means - self.box[0]) / (self.box[1] - self.box[0]) - 1
         places = torch.cat([space, (2 * share - 1).expand(len(means))[:, None]], 1)
         raw = self.heads(self.network(self.planes(places)))
-        bound = self.numbers.max_offset * self.diagonal
+        bound = MAX_OFFSET * self.diagonal
         position, turn, size = raw.split(3, 1)
         turn = normalize(torch.cat([torch.ones_like(turn[:, :1]), turn], 1), dim=1)
         return bound * torch.tanh(position / bound), turn, size
@@ -275,7 +275,7 @@ class PlaneMotion(Addition):
             return
         n = self.numbers
         space, calm, moving = self.planes.terms()
-        step.terms["planes"] = n.plane_smoothness * space + n.time_smoothness * calm + n.time_sparsity * moving
+        step.terms["planes"] = PLANE_SMOOTHNESS * space + n.time_smoothness * calm + TIME_SPARSITY * moving
         if n.rigidity:
             step.terms["rigidity"] = n.rigidity * self.bending(step.whole, method.moment_of(step.camera), step.chance)
 
@@ -303,7 +303,7 @@ class PlaneMotion(Addition):
 
     def after_step(self, method: Any, step: int) -> None:
         if method.current.due or len(self.moves) != len(method.cloud):
-            apart = bool(self.active) and method.progress >= self.numbers.told_apart
+            apart = bool(self.active) and method.progress >= TOLD_APART
             self.follow_cloud(method.cloud.means.detach(), apart)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:

@@ -34,7 +34,7 @@ from ...components.training.adversarial import (
 from ...datasets.collection import Collection
 from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import Count, Layers, LearningRate, NonNegative, Positive, RaySamples, Seed, Share, Width, between
+from ...files.ranges import Layers, LearningRate, NonNegative, Positive, RaySamples, Seed, Width, between
 from ...method import Descend, Method, frozen, seeded
 from ...method.controls import Control, Value
 from ...method.field import Colours, Densities, Directions, Points
@@ -46,6 +46,17 @@ from .networks import Pictures, Style, Styles, SuperResolution, blurred, resized
 Tally = Annotated[int, between(0, 100_000_000)]
 Side = Annotated[int, between(8, 1024)]
 Label = Float[Tensor, "picture 25"]
+DISCRIMINATOR_RATE = 0.002  # Adam's learning rate of the discriminator
+DENSITY_WEIGHT = 0.25  # weight of differences in density between neighbouring points
+DENSITY_DISTANCE = 0.004  # deviation of such points from each other, in units of the planes
+DENSITY_INTERVAL = 4  # steps from one such term to the next
+SWAP_PROBABILITY = 0.5  # of conditioning the generator on another pose than that of the picture, section 4.4
+CODE_LEARNING_RATE = 0.1  # Adam's learning rate of that fit, in deviations of the styles
+CODE_PRIOR = 1e-3  # weight of a style's squared distance from the average, in deviations
+TUNE_LEARNING_RATE = 3e-4  # Adam's learning rate of tuning; higher changes the generator more
+MAPPING_LAYERS = 2  # layers of the mapping network
+GROWTH_START = 25 / 27.5  # share of the budget from which the rendering grows, over a share of 0.04
+R1_INTERVAL = 16  # steps from one R1 to the next
 
 
 @dataclass(frozen=True)
@@ -55,12 +66,9 @@ class Config:
     picture_size: Side = 512  # pixels across of pictures, a power of two; larger ones cost time
     rendering_size: Side = 64  # pixels across of the volume rendering, section 4.2; larger is sharper and slower
     final_rendering_size: Side = 128  # pixels across of the volume rendering in the end, section 5
-    growth_start: Share = 25 / 27.5  # share of the budget from which the rendering grows, over a share of 0.04
     super_resolution: Literal[2, 4] = 4  # factor from the features to the picture, section 4.3
     super_widths: tuple[Width, Width] = (256, 128)  # channels of the super-resolution's two blocks
-    field: Literal["planes", "film"] = (
-        "planes"  # planes, or pi-GAN's sines, which are rendered without super-resolution
-    )
+    field: Literal["planes", "film"] = "planes"  # planes, or pi-GAN's sines without super-resolution
     plane_size: Side = 256  # nodes across a plane, a power of two; more hold finer detail
     plane_channels: Annotated[int, between(1, 256)] = 32  # channels of a plane
     features: Annotated[int, between(4, 256)] = 32  # features of a pixel of the volume rendering, colours included
@@ -73,30 +81,18 @@ class Config:
     density_shift: Annotated[float, between(-20, 20)] = -1.0  # added ahead of the softplus; lower begins emptier
     code: Width = 512  # numbers of a random code
     style: Width = 512  # numbers of a style
-    mapping_layers: Layers = 2  # layers of the mapping network
-    channel_base: Annotated[int, between(8, 1 << 20)] = (
-        32_768  # channels at a size are this by the size; more cost time
-    )
+    channel_base: Annotated[int, between(8, 1 << 20)] = 32_768  # channels at a size, times the size; more cost time
     channel_most: Width = 512  # channels at most
     pictures_per_step: Annotated[int, between(1, 1024)] = 32  # photographs, and made pictures, of a step
     learning_rate: LearningRate = 0.0025  # Adam's learning rate of the generator
-    discriminator_rate: LearningRate = 0.002  # Adam's learning rate of the discriminator
     r1_weight: NonNegative = 1.0  # gamma of R1: 0.3 for cars, 1 for faces, 5 for cats; small batches need more
-    r1_interval: Count = 16  # steps from one R1 to the next
-    density_weight: NonNegative = 0.25  # weight of differences in density between neighbouring points
-    density_distance: Positive = 0.004  # deviation of such points from each other, in units of the planes
-    density_interval: Count = 4  # steps from one such term to the next
-    swap_probability: Share = 0.5  # of conditioning the generator on another pose than that of the picture, section 4.4
     swap_pictures: Tally = 1_000_000  # pictures over which that probability falls from one
     blur_deviation: NonNegative = 10.0  # pixels by which the discriminator's pictures are blurred at first
     blur_pictures: Tally = 200_000  # pictures over which that blur vanishes
     average_pictures: Tally = 10_000  # pictures in which the averaged weights forget half; fewer follow sooner
     # Finding the code of photographs (Roich 2021, pivotal tuning).
     code_steps: Tally = 500  # steps that fit a style to photographs; more take longer
-    code_learning_rate: LearningRate = 0.1  # Adam's learning rate of that fit, in deviations of the styles
-    code_prior: NonNegative = 1e-3  # weight of a style's squared distance from the average, in deviations
     tune_steps: Tally = 500  # steps that tune the generator to the photographs; 0: style alone
-    tune_learning_rate: LearningRate = 3e-4  # Adam's learning rate of tuning; higher changes the generator more
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
@@ -147,7 +143,7 @@ class ObjectGenerator(nn.Module):
     def __init__(self, config: Config):
         super().__init__()
         c = config
-        self.mapping = Mapping(c.code, LABEL, c.style, c.mapping_layers)
+        self.mapping = Mapping(c.code, LABEL, c.style, MAPPING_LAYERS)
         self.upscaling: SuperResolution | None = None
         if c.field == "planes":
             widths = widths_of(c.plane_size, c.channel_base, c.channel_most)
@@ -189,21 +185,20 @@ class EG3D(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """The same design for pictures of 64 pixels."""
-        return Config(
-            picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2, super_widths=(32, 16),
-            plane_size=64, plane_channels=16, features=8, decoder_width=32, film_width=64, film_layers=4,
+        return Config(picture_size=64, rendering_size=32, final_rendering_size=32, super_resolution=2, super_widths=(32,
+            16), plane_size=64, plane_channels=16, features=8, decoder_width=32, film_width=64, film_layers=4,
             coarse_samples=8, fine_samples=6, density_scale=10.0, density_shift=-3.0, code=64, style=128,
             channel_base=1024, channel_most=128, pictures_per_step=4, r1_weight=2.0, swap_pictures=10_000,
-            blur_deviation=1.0, blur_pictures=2000, average_pictures=1000, code_steps=150, tune_steps=150,
-        )  # fmt: skip
+            blur_deviation=1.0, blur_pictures=2000, average_pictures=1000, code_steps=150, tune_steps=150)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(picture_size=16, rendering_size=8, final_rendering_size=8, super_resolution=2, super_widths=(4, 4))
-        c = replace(c, plane_size=8, plane_channels=4, features=4, decoder_width=8, film_width=8, film_layers=2)
-        c = replace(c, coarse_samples=8, fine_samples=4, density_scale=10.0, code=8, style=8, mapping_layers=1)
-        c = replace(c, channel_base=64, channel_most=8, pictures_per_step=4, blur_pictures=40, swap_pictures=40)
-        return replace(c, average_pictures=16, code_steps=4, tune_steps=4)
+        return Config(
+            picture_size=16, rendering_size=8, final_rendering_size=8, super_resolution=2, super_widths=(4, 4),
+            plane_size=8, plane_channels=4, features=4, decoder_width=8, film_width=8, film_layers=2,
+            coarse_samples=8, fine_samples=4, density_scale=10.0, code=8, style=8, channel_base=64, channel_most=8,
+            pictures_per_step=4, blur_pictures=40, swap_pictures=40, average_pictures=16, code_steps=4, tune_steps=4,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -250,19 +245,19 @@ class EG3D(Method):
         real = self._discriminated(batch.real, resized(batch.real, (int(self.size),) * 2), blur)
         views, cameras = labels(batch.views), labels(batch.cameras)
 
-        penalised = step % c.r1_interval == 0 and c.r1_weight > 0
+        penalised = step % R1_INTERVAL == 0 and c.r1_weight > 0
         shown = real.detach().requires_grad_(penalised)
         seen, supposed = self.discriminator(shown, cameras), self.discriminator(fake.detach(), views)
         terms = {"discriminator": discriminator_loss(seen, supposed)}
         if penalised:
-            terms["r1"] = c.r1_interval * c.r1_weight * r1_penalty(seen, [shown])
+            terms["r1"] = R1_INTERVAL * c.r1_weight * r1_penalty(seen, [shown])
         descend(terms, [discriminators])
         self.figures = {name: float(value.detach()) for name, value in terms.items()}
 
         with frozen(self.discriminator):
             terms = {"generator": generator_loss(self.discriminator(fake, views))}
-        if step % c.density_interval == 0 and c.density_weight > 0:
-            terms["density"] = c.density_interval * c.density_weight * self._roughness(made, random)
+        if step % DENSITY_INTERVAL == 0:
+            terms["density"] = DENSITY_INTERVAL * DENSITY_WEIGHT * self._roughness(made, random)
         descend(terms, [generators])
         self.figures |= {name: float(value.detach()) for name, value in terms.items()}
         self.figures |= {"logit_real": float(seen.detach().mean()), "logit_fake": float(supposed.detach().mean())}
@@ -275,7 +270,7 @@ class EG3D(Method):
         c, generator = self.config, self.generator
         codes = torch.randn(len(views), c.code, generator=random).to(self.device)
         share = min(1.0, step * c.pictures_per_step / max(c.swap_pictures, 1))
-        swapped = torch.rand(len(views), 1, generator=random) < 1 + share * (c.swap_probability - 1)
+        swapped = torch.rand(len(views), 1, generator=random) < 1 + share * (SWAP_PROBABILITY - 1)
         own = labels(views)
         style = generator.mapping(codes, torch.where(swapped.to(self.device), own.roll(1, 0), own))
         with torch.no_grad():
@@ -294,21 +289,21 @@ class EG3D(Method):
     def _roughness(self, made: Made, random: torch.Generator) -> Tensor:
         """Mean difference of density, ahead of its activation, between random points and others close by."""
         points = 2 * torch.rand(DENSITY_POINTS, 3, generator=random).to(self.device) - 1
-        others = points + self.config.density_distance * torch.randn(points.shape, generator=random).to(self.device)
+        others = points + DENSITY_DISTANCE * torch.randn(points.shape, generator=random).to(self.device)
         both = [self.generator.field.found(one, torch.cat([points, others]))[0].chunk(2) for one in made]
         return torch.stack([(a - b).abs().mean() for a, b in both]).mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
         self._adversaries = [
-            lazy_adam(self.generator.parameters(), c.learning_rate, c.density_interval),
-            lazy_adam(self.discriminator.parameters(), c.discriminator_rate, c.r1_interval),
+            lazy_adam(self.generator.parameters(), c.learning_rate, DENSITY_INTERVAL),
+            lazy_adam(self.discriminator.parameters(), DISCRIMINATOR_RATE, R1_INTERVAL),
         ]
         return self._adversaries
 
     def before_step(self, step: int, progress: float) -> None:
         c, self._shown = self.config, None
-        grown = min(1.0, max(0.0, progress - c.growth_start) / GROWTH)
+        grown = min(1.0, max(0.0, progress - GROWTH_START) / GROWTH)
         self.size.fill_(round(c.rendering_size + grown * (c.final_rendering_size - c.rendering_size)))
 
     def after_step(self, step: int) -> None:
@@ -526,13 +521,13 @@ class EG3D(Method):
             best = candidates[int(torch.stack([error(style) for style in candidates]).argmin())]
 
         def likely(where: Float[Tensor, " style"]) -> Tensor:
-            return error(average + deviation * where) + c.code_prior * where.square().mean()
+            return error(average + deviation * where) + CODE_PRIOR * where.square().mean()
 
-        where = fitted((best - average) / deviation.clamp_min(EPSILON), likely, c.code_steps, c.code_learning_rate)
+        where = fitted((best - average) / deviation.clamp_min(EPSILON), likely, c.code_steps, CODE_LEARNING_RATE)
         style = average + deviation * where
         with torch.enable_grad():
             learning = [p.requires_grad_() for p in generator.parameters()]
-            adam = torch.optim.Adam(learning, c.tune_learning_rate)
+            adam = torch.optim.Adam(learning, TUNE_LEARNING_RATE)
             for _ in range(c.tune_steps):
                 adam.zero_grad()
                 error(style).backward()

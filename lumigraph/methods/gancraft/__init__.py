@@ -40,6 +40,11 @@ CORNER_DEVIATION = 0.1  # of features at corners at first: labels count more
 RAYS_PER_CHUNK = 16_384  # of renderings
 PER_LAND = 8  # landscapes that show the same land
 SKY = LABELS.index("sky")
+SKY_BANDS = 5  # octaves of the encoding of directions in the sky
+GAN_WEIGHT = 0.5  # of the adversary that sees landscapes as real
+PSEUDO_GAN_WEIGHT = 0.5  # of the adversary that sees pseudo truth as real
+L2_WEIGHT = 10.0  # of the squared difference from pseudo truth, of colours in [-1, 1]
+PERCEPTUAL_WEIGHT = 10.0  # of the difference of features
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,6 @@ class Config:
     bands: Octaves = 4  # octaves of that encoding
     hidden_width: Width = 256  # of the field, the sky and the neural renderer; wider costs time
     output_features: Width = 64  # numbers of a pixel from which the neural renderer makes its colour
-    sky_bands: Octaves = 5  # octaves of the encoding of directions in the sky
     style: Width = 256  # numbers of the style after its network
     style_layers: Count = 5  # layers of the style network
     code: Width = 128  # numbers of a style code
@@ -74,19 +78,15 @@ class Config:
     landscapes_per_step: Annotated[int, between(1, 64)] = 4  # of the painter; more reduce noise, and cost time
     # Losses
     adversary_width: Width = 128  # channels of the adversaries' first layer
-    gan_weight: NonNegative = 0.5  # of the adversary that sees landscapes as real
-    pseudo_gan_weight: NonNegative = 0.5  # of the adversary that sees pseudo truth as real
-    l2_weight: NonNegative = 10.0  # of the squared difference from pseudo truth, of colours in [-1, 1]
-    perceptual_weight: NonNegative = 10.0  # of the difference of features
     opacity_weight: NonNegative = 0.0  # of the light that passes through blocks; higher: blocks are opaque earlier
     kl_weight: NonNegative = 0.05  # of the style codes' divergence from the normal distribution
-    learning_rate: LearningRate = 1e-4
+    learning_rate: LearningRate = 1e-4  # Adam's learning rate of the field's networks
     corner_learning_rate: LearningRate = 1e-3  # of the features at corners
-    adversary_learning_rate: LearningRate = 4e-4
+    adversary_learning_rate: LearningRate = 4e-4  # of the adversary
     momentum: Annotated[float, between(0, 0.999)] = 0.0  # beta_1 of Adam
-    painter_learning_rate: LearningRate = 1e-4
-    painter_adversary_learning_rate: LearningRate = 4e-4
-    seed: Seed = 0
+    painter_learning_rate: LearningRate = 1e-4  # of the painter of pseudo truth
+    painter_adversary_learning_rate: LearningRate = 4e-4  # of the painter's adversary
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class GANcraft(Method):
             self.style = StyleNetwork(c.code, c.style, c.style_layers)
             shape = c.hidden_width, c.style, c.output_features
             self.field_network = BlockField(c.features, c.encoded, c.bands, len(LABELS), *shape)
-            self.sky = SkyNetwork(c.sky_bands, 5, *shape)
+            self.sky = SkyNetwork(SKY_BANDS, 5, *shape)
             self.behind = nn.Parameter(torch.zeros(c.output_features))
             self.renderer = NeuralRenderer(c.output_features, c.hidden_width, c.style)
             widths = [min(c.painter_width << k, 16 * c.painter_width) for k in range(c.painter_levels, -1, -1)]
@@ -143,27 +143,21 @@ class GANcraft(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Networks of an eighth of the width, fewer samples, parts of 64 pixels; higher learning rates."""
-        return Config(
-            features=16, encoded=8, bands=3, hidden_width=32, output_features=12, style=32, style_layers=2, code=8,
-            samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5,
-            encoder_size=32, encoder_width=12,
-            painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
-            adversary_width=12, kl_weight=3e-4, opacity_weight=0.5, momentum=0.5,
-            learning_rate=3e-3, corner_learning_rate=1e-2, adversary_learning_rate=1e-3,
-            painter_learning_rate=5e-4, painter_adversary_learning_rate=5e-4,
-        )  # fmt: skip
+        return Config(features=16, encoded=8, bands=3, hidden_width=32, output_features=12, style=32, style_layers=2,
+            code=8, samples_per_block=3, sample_depth=1.5, density_scale=1.0, crop=64, label_window=5, encoder_size=32,
+            encoder_width=12, painter_code=8, painter_width=12, painter_levels=3, landscapes=160, landscapes_per_step=2,
+            adversary_width=12, kl_weight=3e-4, opacity_weight=0.5, momentum=0.5, learning_rate=3e-3,
+            corner_learning_rate=1e-2, adversary_learning_rate=1e-3, painter_learning_rate=5e-4,
+            painter_adversary_learning_rate=5e-4)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """All networks of eight channels, parts of 16 pixels."""
-        return Config(
-            features=4, encoded=2, bands=1, hidden_width=8, output_features=4, style=8, style_layers=1, code=2,
-            samples_per_block=2, sample_depth=1.0, density_scale=1.0, crop=16, label_window=3,
-            encoder_size=8, encoder_width=4,
-            painter_code=2, painter_width=4, painter_levels=1, landscapes=4, landscapes_per_step=1,
-            painter_share=1.0, field_interval=1, opacity_weight=0.5,
-            adversary_width=4, learning_rate=1e-2, corner_learning_rate=2e-2, painter_learning_rate=1e-2,
-        )  # fmt: skip
+        return Config(features=4, encoded=2, bands=1, hidden_width=8, output_features=4, style=8, style_layers=1,
+            code=2, samples_per_block=2, sample_depth=1.0, density_scale=1.0, crop=16, label_window=3, encoder_size=8,
+            encoder_width=4, painter_code=2, painter_width=4, painter_levels=1, landscapes=4, landscapes_per_step=1,
+            painter_share=1.0, field_interval=1, opacity_weight=0.5, adversary_width=4, learning_rate=1e-2,
+            corner_learning_rate=2e-2, painter_learning_rate=1e-2)  # fmt: skip
 
     # The world
 
@@ -310,8 +304,8 @@ class GANcraft(Method):
             of_fake, of_real = halves(adversary.features(torch.cat([fake, real])), count)
             terms = {
                 "painter_gan": generator_loss(adversary.logits(of_fake, labels)),
-                "painter_l2": c.l2_weight * (fake - real).square().mean(),
-                "painter_perceptual": c.perceptual_weight * perceptual(of_fake, of_real),
+                "painter_l2": L2_WEIGHT * (fake - real).square().mean(),
+                "painter_perceptual": PERCEPTUAL_WEIGHT * perceptual(of_fake, of_real),
                 "painter_kl": c.kl_weight * divergence(mean, log_variance),
             }
             descend(terms, [self._optimizers[2]])
@@ -333,16 +327,16 @@ class GANcraft(Method):
         self.adversary.iterate()
         shown = torch.cat([real, pseudo, fake.detach()])
         for_real, for_pseudo, for_fake = self.adversary(shown, torch.cat([real_labels, labels, labels]))
-        against = c.gan_weight * discriminator_loss(for_real, for_fake)
-        against = against + c.pseudo_gan_weight * discriminator_loss(for_pseudo, for_fake)
+        against = GAN_WEIGHT * discriminator_loss(for_real, for_fake)
+        against = against + PSEUDO_GAN_WEIGHT * discriminator_loss(for_pseudo, for_fake)
         descend({"adversary": against}, [self._optimizers[1]])
         error = (fake - pseudo).square().mean()
         with frozen(self.adversary, self.painter_adversary):
             like = perceptual(*halves(self.painter_adversary.features(torch.cat([fake, pseudo])), 1))
             terms = {
-                "gan": (c.gan_weight + c.pseudo_gan_weight) * generator_loss(self.adversary(fake, labels)),
-                "l2": c.l2_weight * error,
-                "perceptual": c.perceptual_weight * like,
+                "gan": (GAN_WEIGHT + PSEUDO_GAN_WEIGHT) * generator_loss(self.adversary(fake, labels)),
+                "l2": L2_WEIGHT * error,
+                "perceptual": PERCEPTUAL_WEIGHT * like,
                 "kl": c.kl_weight * divergence(mean, log_variance),
                 "opacity": c.opacity_weight * ((1 - opacity) * (batch.labels[0] != SKY)).square().mean(),
             }
@@ -408,8 +402,7 @@ class BlockGrid:
         begin = begin.clamp_min(0)
         found = kernels.march(
             rays.origins / half - 1, rays.directions, begin / half, leave / half,
-            self.occupied, self.density, step / half, stop=math.exp(-depth / half),
-        )  # fmt: skip
+            self.occupied, self.density, step / half, stop=math.exp(-depth / half))  # fmt: skip
         return Samples(found.t_start * half, found.t_end * half, found.ray_starts)
 
     def label_at(self, places: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import RateNumbers
-from ...components.clouds.cloud_method import BLACK, CloudMethod
+from ...components.clouds.cloud import HasteNumbers
+from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
+from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
@@ -18,7 +21,7 @@ from ...components.instances import edit_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
-from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...files.ranges import CloudSize, Seed, Share, between, changed
 from ...gaussians.splatting import render
 from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
@@ -39,15 +42,12 @@ class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
-    sh_degree_interval: Steps = 1000  # steps for each further degree, section 7.1; or the share below, if sooner
-    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7; higher gives structure more weight
+    ssim_weight: ClassVar[float] = SSIM_WEIGHT
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
-    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished, appendix C; higher is faster
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
-    rates: RateNumbers = RateNumbers()
+    rates: HasteNumbers = HasteNumbers()
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
     mcmc: McmcNumbers = McmcNumbers()
@@ -98,24 +98,13 @@ class GaussianSplatting(CloudMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins dense: it learns more in the time."""
-        refine = RefineNumbers(500_000, gaussians_per_step=15.0, cap_ramp=True)
-        adaptive = AdaptiveNumbers(densify_grad_threshold=1e-4)
-        return Config(
-            initialization="dense", initial_gaussians=20_000, half_resolution_until=0.7, refine=refine,
-            adaptive=adaptive, mcmc=McmcNumbers(joining_per_step=120.0), tidying=ALL_RULES,
-            rates=RateNumbers(most_haste=4.0), sparse=FewViewNumbers("auto"), groups=CPU_GROUPS,
-        )  # fmt: skip
+        return changed(Config(tidying=ALL_RULES, groups=CPU_GROUPS), initialization="dense", initial_gaussians=20_000,
+            half_resolution_until=0.7, max_gaussians=500_000, gaussians_per_step=15.0, cap_ramp=True,
+            densify_grad_threshold=1e-4, joining_per_step=120.0, most_haste=4.0, few_views="auto")  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
-        return Config(
-            sh_degree=2,
-            sh_degree_interval=4,
-            initial_gaussians=200,
-            refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
-            tidying=ALL_RULES,
-            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
-            poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
-            photographs=AppearanceNumbers(appearance="no"),
-        )
+        return changed(Config(tidying=ALL_RULES), sh_degree=2, initial_gaussians=200, max_gaussians=300, cap_ramp=True,
+            refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, refine_cameras=True,
+            appearance="no")  # fmt: skip

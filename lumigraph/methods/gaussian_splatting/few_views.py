@@ -22,7 +22,6 @@ from ...components.clouds.dense_points import Points, compile_sweep
 from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored
-from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted, splat, view_of
 
@@ -34,21 +33,19 @@ MAX_DROP_RATE = 0.3  # share of Gaussians at the end of training, to which it gr
 DROPPED_OPACITY = -30.0  # logit
 MAX_OPACITY = 0.999
 UNOBSERVED_PIXELS = 128  # along the shorter side of an unobserved view
-SURFACE_WEIGHT = 0.1  # of the depth error at known surfaces, in terms of the colour error there
+DEPTH_WEIGHT = 0.1  # of the depth error at known surfaces, in terms of the colour error there
 OPACITY_WEIGHT = 0.1  # of light that passes a known surface, in terms of the depth error
 MAX_LOG_ERROR = 2.0  # of depth; an error beyond has no gradient
 OCCLUSION = 1.03  # times the least depth of the pixels around, beyond which a point is hidden
+ROUGHNESS_WEIGHT = 0.5  # weight of depth's roughness at unobserved views
+SURFACE_WEIGHT = 0.2  # weight of swept surfaces at unobserved views
 
 
 @dataclass(frozen=True)
 class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
-    few_views: Literal["auto", "yes", "no"] = (
-        "no"  # regularisation for few photographs; auto: if plane sweeps agree little
-    )
-    roughness_weight: NonNegative = 0.5  # weight of depth's roughness at unobserved views, with few_views; 0: off
-    surface_weight: NonNegative = 0.2  # weight of swept surfaces at unobserved views, with few_views; 0: off
+    few_views: Literal["auto", "yes", "no"] = "no"  # few photographs; auto: where plane sweeps agree little
 
 
 class FewViews(Addition):
@@ -80,10 +77,8 @@ class FewViews(Addition):
 
     @property
     def few_view_priors(self) -> tuple[str, ...]:
-        numbers, known = self.numbers, len(self.surface) > 0
-        depth = ("smooth depth",) if numbers.roughness_weight else ()
-        surface = ("plane-sweep surfaces at unobserved views",) if numbers.surface_weight and known else ()
-        return ("dropout of Gaussians", *depth, *surface) if self.active else ()
+        surface = ("plane-sweep surfaces at unobserved views",) if len(self.surface) else ()
+        return ("dropout of Gaussians", "smooth depth", *surface) if self.active else ()
 
     def compile_begin(self) -> None:
         compile_sweep()
@@ -111,12 +106,12 @@ class FewViews(Addition):
         camera = camera_between(method.cameras, step.chance).to(method.device)
         camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
         seen = splat(step.whole, view_of(camera, method.near_plane), bands=1)
-        step.terms["depth"] = self.numbers.roughness_weight * depth_roughness(seen)
-        if self.numbers.surface_weight and len(self.surface):
+        step.terms["depth"] = ROUGHNESS_WEIGHT * depth_roughness(seen)
+        if len(self.surface):
             place, depth, index = visible_points(self.surface, camera)
             if len(index):
                 error = surface_error(seen, place, depth, self.surface_colours[index])
-                step.terms["surface"] = self.numbers.surface_weight * error
+                step.terms["surface"] = SURFACE_WEIGHT * error
 
     def storage(self) -> dict[str, Stored]:
         """Rendering needs none of it."""
@@ -162,4 +157,4 @@ def surface_error(
     ratio = (seen.depth[place] / opacity.clamp_min(1e-3)).clamp_min(1e-4) / depth
     off = (ratio.log().abs().clamp(max=MAX_LOG_ERROR) * opacity.detach()).mean()
     colour = (seen.rgb[place] - colours).abs().mean()
-    return colour + SURFACE_WEIGHT * (off + OPACITY_WEIGHT * (1 - opacity).mean())
+    return colour + DEPTH_WEIGHT * (off + OPACITY_WEIGHT * (1 - opacity).mean())

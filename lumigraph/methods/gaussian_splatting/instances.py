@@ -27,6 +27,8 @@ FIRST_DEVIATION = 0.1  # of the numbers of codes at first
 MIN_SHARE = 0.4  # probability from which on a Gaussian belongs to the instance that it most likely shows
 IDENTITY_WEIGHT = 1.0  # weight of the cross entropy of rendered identities, eq. 4
 NEIGHBOUR_WEIGHT = 2.0  # weight of the neighbours' agreement, eq. 4
+NEIGHBOURS = 5  # k, nearest Gaussians that should agree, section 3.2
+NEIGHBOUR_SAMPLES = 1000  # m, Gaussians of a step that are compared with them
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,6 @@ class InstanceNumbers:
     identity_code: Annotated[int, between(4, 64)] = 16  # numbers of an identity code, section 3.2; a multiple of 4
     identity_lr: LearningRate = 2.5e-3  # learning rate of identity codes; the authors' release
     classifier_lr: LearningRate = 5e-4  # learning rate of the classifier; the authors' release
-    neighbours: Annotated[int, between(1, 64)] = 5  # k, nearest Gaussians that should agree, section 3.2
-    neighbour_samples: Annotated[int, between(16, 100_000)] = 1000  # m, Gaussians of a step that are compared with them
     identity_interval: Steps = 1  # steps between those that learn identities; more are faster
     identity_start: Share = 0.0  # share of the budget before identities are learnt; later: geometry is known
 
@@ -126,7 +126,7 @@ class Identities(Addition):
         target = torch.where(labels >= 0, labels, n.instances)
         if known.any():
             step.terms["identity"] = IDENTITY_WEIGHT * cross_entropy(logits[known], target[known])
-        if len(self.codes) > n.neighbours:
+        if len(self.codes) > NEIGHBOURS:
             step.terms["neighbours"] = NEIGHBOUR_WEIGHT * self.disagreement(step.chance)
 
     def rendered(self, step: Step) -> Float[Tensor, "height width code"]:
@@ -143,11 +143,10 @@ class Identities(Addition):
     def disagreement(self, chance: torch.Generator) -> Float[Tensor, ""]:
         """Mean KL divergence of some Gaussians' identities from those of their nearest neighbours (eq. 3), in a random
         part of the cloud that bounds the memory."""
-        n = self.numbers
-        pool = torch.randperm(len(self.codes), generator=chance)[: 20 * n.neighbour_samples]
+        pool = torch.randperm(len(self.codes), generator=chance)[: 20 * NEIGHBOUR_SAMPLES]
         places = self.places.cpu()[pool].numpy()
-        some = pool[: n.neighbour_samples]
-        count = min(n.neighbours + 1, len(pool))
+        some = pool[:NEIGHBOUR_SAMPLES]
+        count = min(NEIGHBOURS + 1, len(pool))
         _, near = cKDTree(places).query(places[: len(some)], count, workers=-1)
         near = pool[torch.from_numpy(np.asarray(near).reshape(len(some), -1)[:, 1:])]
         own = log_softmax(self.classifier(self.codes[some]), -1)

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from ...components.clouds.addition import Addition, Step
-from ...files.ranges import Share
 
 INLIER_SHARE = 0.8  # share of pixels below the threshold; the authors' release
 HISTOGRAM_DECAY = 0.95  # factor for each step
@@ -24,6 +23,7 @@ BINS = 2000  # of residuals, in [0, 1]
 SMOOTH_SHARE = 0.5  # share of inliers among the 3 x 3 pixels around one, eq. 7
 PATCH_SIZE, NEIGHBOURHOOD_SIZE = 8, 16  # pixels along a side, eq. 8
 PATCH_SHARE = 0.6  # share of inliers in a patch's neighbourhood, eq. 8
+ROBUST_START = 0.1  # share of the budget before pixels are excluded
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,6 @@ class RobustNumbers:
     """A Config's numbers of the robust mask."""
 
     robust: Literal["auto", "yes", "no"] = "auto"  # exclude moving objects (RobustNeRF); auto: where colours differ
-    robust_start: Share = 0.1  # share of the budget before pixels are excluded
 
 
 class RobustMask(Addition):
@@ -52,7 +51,7 @@ class RobustMask(Addition):
         return self.numbers.robust == "yes" or (method.appearance is not None and method.appearance.is_active)
 
     def mask(self, method: Any, step: Step) -> None:
-        if self.is_active(method) and method.progress >= self.numbers.robust_start:
+        if self.is_active(method) and method.progress >= ROBUST_START:
             counted = inliers(step.residual.abs().mean(-1), self.threshold)
             step.target = torch.where(counted[..., None], step.target, step.rgb.detach())
 

@@ -32,10 +32,12 @@ PROBED_MOMENTS = 8  # at which an update of the occupancy grid asks for density
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers from memory; `HumanNeRF.preset` has those of a plain CPU."""
+    """Numbers of the release for ZJU-MoCap, chungyiweng/humannerf, configs/default.yaml."""
 
-    backbone: BackboneNumbers = BackboneNumbers(table=HashNumbers(sh_bands=1), steps=StepNumbers(256))
-    bones: BoneNumbers = BoneNumbers(pose_from=0.05)
+    backbone: BackboneNumbers = BackboneNumbers(
+        table=HashNumbers(sh_bands=1), steps=StepNumbers(256), final_learning_rate=5e-4 * 0.1**0.8
+    )
+    bones: BoneNumbers = BoneNumbers()
     weights: WeightNumbers = WeightNumbers()
     nonrigid: NonRigidNumbers = NonRigidNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run

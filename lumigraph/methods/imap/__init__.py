@@ -18,7 +18,7 @@ from ...components.fields.hash_field import TINY_TABLE, HashNumbers
 from ...components.sampling.spaces import Box
 from ...components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
 from ...components.tracking.frames import DepthFrame, Moment
-from ...components.tracking.tracker import Iterations, Tracker, TrackingNumbers
+from ...components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
 from ...components.tracking.trajectory import Pose, moved
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
@@ -38,6 +38,9 @@ SMOOTH_POINTS, SMOOTH_STEP = 1024, 0.05  # pairs of points of the smoothness ter
 MIN_VARIANCE = 1e-6  # squared scene units of a ray's depth, below which its certainty does not grow
 EXPLAINED_PIXELS = 1000  # pixels of a frame by which it is judged
 TRACKING_RATE = 3e-3  # Adam's rate of a frame's pose, radians and scene units
+TRACKING_PIXELS = 200  # pixels of each of these descents, section 3.4
+DEPTH_TOLERANCE = 0.1  # t_D, relative error of depth up to which a pixel is explained
+COLOUR_WEIGHT = 5.0  # lambda_p, weight of colours, eq. 7
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,6 @@ class FramePoseNumbers:
     """A Config's numbers of a frame's pose (section 3.3)."""
 
     tracking_iterations: Iterations = 50  # descents on a frame's pose; more follow faster motion, slower
-    tracking_pixels: BatchSize = 200  # pixels of each of these descents, section 3.4
 
 
 @dataclass(frozen=True)
@@ -59,14 +61,12 @@ class FieldMappingNumbers:
     active_sampling: bool = True  # draw pixels and keyframes by their loss, section 3.4; else evenly
     keyframe_pose_rate: LearningRate = 3e-3  # Adam's rate of keyframes' poses; 0: they stay
     keyframe_share: Share = 0.65  # t_P, share of explained pixels below which a frame becomes a keyframe
-    depth_tolerance: Share = 0.1  # t_D, relative error of depth up to which a pixel is explained
 
 
 @dataclass(frozen=True)
 class LossNumbers:
     """A Config's weights of the loss; those of a distance are Co-SLAM's (Wang 2023, eqs. 6 to 9)."""
 
-    colour_weight: NonNegative = 5.0  # lambda_p, weight of colours, eq. 7
     depth_weight: NonNegative = 1.0  # weight of depth, eq. 6
     distance_weight: NonNegative = 0.0  # weight of the distance within the truncation, with --field hash
     free_weight: NonNegative = 0.0  # weight of free space in front of surfaces, with --field hash
@@ -127,23 +127,19 @@ class IMap(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Co-SLAM's losses on a hash table (Wang 2023), frames aligned with its surface first."""
-        return changed(
-            Config(), field="hash", hidden_width=32, learning_rate=1e-2,
-            levels=8, features_per_level=2, log2_hashmap_size=16, max_resolution=512, colour_layers=1, sh_bands=1,
-            coarse_samples=16, fine_samples=10, first_estimate="surface", tracking_iterations=0, mapping_iterations=5,
-            window=8, pixels_per_frame=128, active_sampling=False, keyframe_pose_rate=2e-4,
-            depth_weight=0.1, distance_weight=10.0, free_weight=10.0, smooth_weight=1e-3,
-        )  # fmt: skip
+        return changed(Config(), field="hash", hidden_width=32, learning_rate=1e-2, levels=8, features_per_level=2,
+            log2_hashmap_size=16, max_resolution=512, colour_layers=1, sh_bands=1, coarse_samples=16, fine_samples=10,
+            first_estimate="surface", tracking_iterations=0, mapping_iterations=5, window=8, pixels_per_frame=128,
+            active_sampling=False, keyframe_pose_rate=2e-4, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
+            smooth_weight=1e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny hash table and few descents a frame."""
-        return changed(
-            Config(replace(TINY_TABLE, sh_bands=1)), field="hash", hidden_width=16, truncation=0.2, sharpness=4.0,
-            learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1, first_iterations=2, window=4,
-            pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1, distance_weight=10.0, free_weight=10.0,
-            smooth_weight=1e-4,
-        )  # fmt: skip
+        return changed(Config(table=TINY_TABLE), sh_bands=1, field="hash", hidden_width=16, truncation=0.2,
+            sharpness=4.0, learning_rate=2e-2, coarse_samples=12, fine_samples=8, mapping_iterations=1,
+            first_iterations=2, window=4, pixels_per_frame=64, keyframe_share=1.0, depth_weight=0.1,
+            distance_weight=10.0, free_weight=10.0, smooth_weight=1e-4)  # fmt: skip
 
     # The sequence
 
@@ -207,7 +203,7 @@ class IMap(FieldMethod):
         look = seen.look(field)
         found = composite(look.samples, look.density, look.rgb)
         error = (found.depth * found.opacity).nan_to_num(0, 0) - depth
-        return float((error.abs() / depth < self.config.mapping.depth_tolerance).float().mean())
+        return float((error.abs() / depth < DEPTH_TOLERANCE).float().mean())
 
     # Tracking (section 3.3)
 
@@ -221,7 +217,7 @@ class IMap(FieldMethod):
             optimizer = PoseAdam([twist], TRACKING_RATE)
             for i in range(t.tracking_iterations):
                 optimizer.param_groups[0]["lr"] = TRACKING_RATE * (1 - i / t.tracking_iterations)
-                pixels = frame.drawn(t.tracking_pixels, chance, measured=True)
+                pixels = frame.drawn(TRACKING_PIXELS, chance, measured=True)
                 rays = self.world_rays(frame.rays[pixels], moved(pose[None], twist))
                 terms, _ = self.errors(rays, frame.rgb[pixels], frame.depth[pixels], chance)
                 (twist.grad,) = torch.autograd.grad(torch.stack(list(terms.values())).sum(), [twist])
@@ -229,9 +225,9 @@ class IMap(FieldMethod):
             return moved(pose[None], twist.detach())[0]
 
     def aligned(self, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
-        t, field = self.config.tracking, self.network
+        field = self.network
         assert isinstance(field, DistanceTable)
-        pixels = frame.drawn(t.alignment_points, chance, measured=True)
+        pixels = frame.drawn(ALIGNMENT_POINTS, chance, measured=True)
         points = frame.rays[pixels].at(frame.depth[pixels])
         deviation = sensor_deviation(frame.depth[pixels] / self.unit) * self.unit / field.truncation
 
@@ -240,7 +236,7 @@ class IMap(FieldMethod):
             return field.distance_of(features), field.colour(features, world)  # the direction does not matter
 
         rgb = frame.rgb[pixels]
-        return aligned(seen, pose, points, rgb, deviation, COLOUR_DEVIATION, self.unit, t.alignment_iterations).pose
+        return aligned(seen, pose, points, rgb, deviation, COLOUR_DEVIATION, self.unit, ALIGNMENT_ITERATIONS).pose
 
     # Mapping (section 3.3)
 
@@ -343,12 +339,12 @@ class IMap(FieldMethod):
             colour, depths = residual.abs().mean(-1), away
         else:  # Wang 2023, eqs. 6 and 7
             colour, depths = residual.square().mean(-1), (away / self.unit).square()
-        terms = {"colour": c.colour_weight * colour.mean(), "depth": c.depth_weight * depths.sum() / count}
+        terms = {"colour": COLOUR_WEIGHT * colour.mean(), "depth": c.depth_weight * depths.sum() / count}
         if isinstance(self.network, DistanceTable):
             terms |= self.distance_terms(self.network, seen, depth, chance)
         if not known.any():
             terms = {"colour": terms["colour"]} | {name: terms[name] for name in ("smooth",) if name in terms}
-        return terms, (c.colour_weight * colour + c.depth_weight * depths).detach()
+        return terms, (COLOUR_WEIGHT * colour + c.depth_weight * depths).detach()
 
     def distance_terms(
         self, field: DistanceTable, seen: Pass, depth: Float[Tensor, " ray"], chance: torch.Generator

@@ -95,16 +95,14 @@ class MeshFit(Method):
     @classmethod
     def cpu_preset(cls) -> Any:
         """From the hull, with a photograph or two a step and a little smoothness against the noise of that."""
-        c = Config(start="hull", first_cells=48, cells=80, remeshings=2, views_per_step=2)
-        c = replace(c, learning_rate=6e-2, final_learning_rate=6e-3, colour_learning_rate=0.1)
-        return replace(c, laplacian_weight=0.01, normal_weight=0.02)
+        return Config(start="hull", first_cells=48, cells=80, views_per_step=2, learning_rate=6e-2,
+            final_learning_rate=6e-3, colour_learning_rate=0.1, laplacian_weight=0.01, normal_weight=0.02)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred triangles that are remeshed once."""
-        c = Config(first_cells=16, cells=18, remeshings=1, remeshing_until=0.5, views_per_step=2, learning_rate=3e-2)
-        c = replace(c, final_learning_rate=3e-3, colour_learning_rate=0.2)
-        return replace(c, laplacian_weight=0.01, normal_weight=0.01)
+        return Config(first_cells=16, cells=18, remeshings=1, remeshing_until=0.5, views_per_step=2, learning_rate=3e-2,
+            final_learning_rate=3e-3, colour_learning_rate=0.2, laplacian_weight=0.01, normal_weight=0.01)  # fmt: skip
 
     @property
     def near_plane(self) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -32,10 +32,8 @@ from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import (
     BatchSize,
-    Layers,
     LearningRate,
     NonNegative,
-    Octaves,
     PositiveShare,
     Seed,
     Share,
@@ -53,6 +51,20 @@ from .shading import MIN_ROUGHNESS, LearntReflectance, microfacet, shaded
 from .surface import SurfaceGrid, surface_distance
 
 FINAL_GEOMETRY_RATE = 1e-3  # learning rate of the geometry at its end
+PROPERTY_LAYERS = 4  # layers of a property's network, section 3
+POSITION_FREQUENCIES = 10  # octaves of encoded points; more give finer detail, and noise
+DIRECTION_FREQUENCIES = 4  # octaves of encoded directions to lights
+ANGLE_FREQUENCIES = 2  # octaves of encoded half-difference angles, of the learnt reflectance
+CODE_WIDTH = 3  # numbers of a code of the learnt reflectance, section 3.3
+PRIOR_STEPS = 20_000  # steps in which the reflectance is learnt beforehand
+JITTER = 0.01  # standard deviation of the offsets of smoothness, scene units
+NORMAL_WEIGHT = 0.1  # weight of the distance from the geometry's normals; higher follows them
+VISIBILITY_WEIGHT = 0.1  # weight of the distance from traced visibility
+NORMAL_SMOOTHNESS = 0.01  # weight of smooth normals
+VISIBILITY_SMOOTHNESS = 0.01  # weight of smooth visibility
+ALBEDO_SMOOTHNESS = 0.01  # weight of smooth albedo; higher leaves more to shading
+CODE_SMOOTHNESS = 0.01  # weight of smooth reflectance
+LIGHT_VARIATION = 5e-6  # weight of the squared differences of neighbouring pixels of the light
 
 
 @dataclass(frozen=True)
@@ -70,24 +82,10 @@ class Config:
     geometry_share: Share = 0.5  # share of the budget in which geometry learns, before all else
     shape_share: Share = 0.2  # share of the rest in which normals and visibility alone learn, with networks
     hidden_width: Width = 64  # neurons of a hidden layer behind hash tables; wider costs time
-    property_layers: Layers = 4  # layers of a property's network, section 3
     property_width: Width = 128  # width of a property's network, section 3
-    position_frequencies: Octaves = 10  # octaves of encoded points; more give finer detail, and noise
-    direction_frequencies: Octaves = 4  # octaves of encoded directions to lights
-    angle_frequencies: Octaves = 2  # octaves of encoded half-difference angles, of the learnt reflectance
-    code_width: Annotated[int, between(1, 16)] = 3  # numbers of a code of the learnt reflectance, section 3.3
-    prior_steps: Annotated[int, between(1, 1_000_000)] = 20_000  # steps in which the reflectance is learnt beforehand
     light_rows: Annotated[int, between(4, 64)] = 16  # rows of the light's map, section 3.4; twice as many columns
     grid_resolution: Annotated[int, between(8, 512)] = 256  # cells along the box that hold the geometry
     surface_rays: BatchSize = 1024  # rays of a step once geometry is learnt; more reduce noise, and cost time
-    jitter: NonNegative = 0.01  # standard deviation of the offsets of smoothness, scene units
-    normal_weight: NonNegative = 0.1  # weight of the distance from the geometry's normals; higher follows them
-    visibility_weight: NonNegative = 0.1  # weight of the distance from traced visibility
-    normal_smoothness: NonNegative = 0.01  # weight of smooth normals
-    visibility_smoothness: NonNegative = 0.01  # weight of smooth visibility
-    albedo_smoothness: NonNegative = 0.01  # weight of smooth albedo; higher leaves more to shading
-    code_smoothness: NonNegative = 0.01  # weight of smooth reflectance
-    light_variation: NonNegative = 5e-6  # weight of the squared differences of neighbouring pixels of the light
     learning_rate: LearningRate = 1e-3  # Adam's learning rate of properties and light
     final_learning_rate: LearningRate = 5e-4  # the same at the end, reached exponentially
     light_rate: LearningRate = 1e-3  # learning rate of the light's logarithm
@@ -148,18 +146,18 @@ class NeRFactor(FieldMethod):
         c = config or Config()
         super().__init__(frame, c)
         space = space_of(frame)
-        code = c.code_width if c.reflectance == "learnt" else 1
+        code = CODE_WIDTH if c.reflectance == "learnt" else 1
         with seeded(c.seed):
             self.network = HashField(c.table, c.hidden_width, space, frame.reach)
             if c.properties == "hash":
                 self.properties = HashProperties(c.table, c.hidden_width, code, space, frame.reach)
             else:
-                self.properties = NetworkProperties(c.position_frequencies, c.property_layers, c.property_width, code)
-            sizes = c.property_layers, c.property_width
-            frequencies = c.position_frequencies, c.direction_frequencies
+                self.properties = NetworkProperties(POSITION_FREQUENCIES, PROPERTY_LAYERS, c.property_width, code)
+            sizes = PROPERTY_LAYERS, c.property_width
+            frequencies = POSITION_FREQUENCIES, DIRECTION_FREQUENCIES
             self.lights_seen = VisibilityNetwork(*frequencies, *sizes) if c.visibility == "network" else None
             learnt = c.reflectance == "learnt"
-            self.lobes = LearntReflectance(c.code_width, c.angle_frequencies, *sizes) if learnt else None
+            self.lobes = LearntReflectance(CODE_WIDTH, ANGLE_FREQUENCIES, *sizes) if learnt else None
         self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         self.grid = SurfaceGrid(frame, c.grid_resolution)
         shape = c.light_rows, 2 * c.light_rows
@@ -173,24 +171,23 @@ class NeRFactor(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables, traced visibility, microfacets, a smaller grid and smaller steps."""
-        c = Config(**CPU_HASH, hidden_width=32, geometry_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
-        c = replace(c, properties="hash", visibility="traced", reflectance="microfacet", geometry_share=0.6)
-        c = replace(c, shape_share=0.0, grid_resolution=128, surface_rays=256, normal_weight=0.1)
-        return replace(c, learning_rate=1e-2, final_learning_rate=1e-3, light_rate=3e-2)
+        return Config(
+            **CPU_HASH, hidden_width=32, geometry_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3,
+            properties="hash", visibility="traced", reflectance="microfacet", geometry_share=0.6, shape_share=0.0,
+            grid_resolution=128, surface_rays=256, learning_rate=1e-2, final_learning_rate=1e-3, light_rate=3e-2,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and a light of few pixels, in all stages within some twenty steps."""
-        return Config(
-            **TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced",
+        return Config(**TINY_HASH, hidden_width=16, geometry_rate=2e-2, properties="hash", visibility="traced",
             reflectance="microfacet", geometry_share=0.6, shape_share=0.0, grid_resolution=16, huber_delta=1.0,
-            light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2,
-        )  # fmt: skip
+            light_rows=4, surface_rays=128, learning_rate=3e-2, light_rate=3e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         pairs = 2 * config.light_rows**2 * config.surface_rays * 4
-        kept = 4 + 2 * config.property_layers * config.property_width * (config.visibility == "network")
+        kept = 4 + 2 * PROPERTY_LAYERS * config.property_width * (config.visibility == "network")
         return sampling_bytes(frame, config, learning) + pairs * kept * learning
 
     def _choose_learning(self) -> None:
@@ -258,7 +255,7 @@ class NeRFactor(FieldMethod):
         super().begin(data, seconds)
         self._begin_light(data)
         if self.lobes is not None:
-            self.lobes.learn(self.config.prior_steps, 1e-2, self.random(1))
+            self.lobes.learn(PRIOR_STEPS, 1e-2, self.random(1))
 
     def _begin_light(self, data: Scene) -> None:
         """Load the photographs' light."""
@@ -286,7 +283,7 @@ class NeRFactor(FieldMethod):
             self.sampler.begin_from(known, chance)
             self.sampler.settle(self.density, chance)
         if self.lobes is not None:
-            self.lobes.learn(self.config.prior_steps, 1e-2, self.random(1))
+            self.lobes.learn(PRIOR_STEPS, 1e-2, self.random(1))
 
     def _is_alike(self, teacher: Any) -> bool:
         """True if a teacher has a hash table of the same sizes and the same sampler, so that nothing need be taught."""
@@ -332,7 +329,7 @@ class NeRFactor(FieldMethod):
             solid &= batch.alpha > 1 - 1e-3
         rays, points, light = batch.rays[solid], points[solid], light[solid]
         given, raw = self.grid.normals(points, -rays.directions), self.properties(points)
-        jittered = points + c.jitter * torch.randn(points.shape, generator=chance).to(points)
+        jittered = points + JITTER * torch.randn(points.shape, generator=chance).to(points)
         other = self.properties(jittered)
         seen = self.shade(points, -rays.directions, raw, given, self.pixels[0], self.power(rays))
         near = self.properties.oriented(other.normals, given)
@@ -342,23 +339,23 @@ class NeRFactor(FieldMethod):
             return values.sum() / (len(batch) * values.shape[-1])
 
         terms = {
-            "normals": c.normal_weight * mean((seen.normals - given).square()),
-            "normal_smoothness": c.normal_smoothness * mean((seen.normals - near).abs()),
+            "normals": NORMAL_WEIGHT * mean((seen.normals - given).square()),
+            "normal_smoothness": NORMAL_SMOOTHNESS * mean((seen.normals - near).abs()),
         }
         if self.lights_seen is not None:
             traced = self.grid.visibility(points, seen.normals.detach(), self.pixels[0])
             beside = self.lights_seen(jittered, self.pixels[0])
-            terms["visibility"] = c.visibility_weight * mean((seen.visibility - traced).square())
-            terms["visibility_smoothness"] = c.visibility_smoothness * mean((seen.visibility - beside).abs())
+            terms["visibility"] = VISIBILITY_WEIGHT * mean((seen.visibility - traced).square())
+            terms["visibility_smoothness"] = VISIBILITY_SMOOTHNESS * mean((seen.visibility - beside).abs())
         if self._over(self.progress) < c.shape_share:
             return terms
         error = mean((tone(seen.radiance) - tone(light)).square())
         self.figures = {"mse": float(error.detach()), "rays": len(batch), "surface_points": len(points)}
         terms["colour"] = error
-        terms["albedo_smoothness"] = c.albedo_smoothness * mean((seen.albedo - albedo_of(other.albedo)).abs())
-        terms["code_smoothness"] = c.code_smoothness * mean((seen.code - self.code_of(other.code)).abs())
+        terms["albedo_smoothness"] = ALBEDO_SMOOTHNESS * mean((seen.albedo - albedo_of(other.albedo)).abs())
+        terms["code_smoothness"] = CODE_SMOOTHNESS * mean((seen.code - self.code_of(other.code)).abs())
         if c.light == "unknown":
-            terms["light_variation"] = c.light_variation * variation(self.log_light.exp())
+            terms["light_variation"] = LIGHT_VARIATION * variation(self.log_light.exp())
         return terms
 
     def _over(self, progress: float) -> float:

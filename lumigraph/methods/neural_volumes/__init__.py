@@ -16,7 +16,7 @@ from ...components.sampling.sampling import stratified
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, LearningRate, NonNegative, RaySamples, Seed, Width, between
+from ...files.ranges import BatchSize, LearningRate, RaySamples, Seed, Width, between
 from ...method import RayMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Colours, Densities, Directions, Points
@@ -27,13 +27,16 @@ Side = Annotated[int, between(8, 1024)]
 
 
 SHARED_RATE = 25.0  # learning rate of what all moments share, as a multiple of the others'
+ENCODER_CAMERAS = 3  # cameras whose pictures are encoded, section 4.1
+DIVERGENCE_WEIGHT = 1e-3  # of the code's divergence from the unit Gaussian
+OPACITY_WEIGHT = 0.01  # of rays that are neither opaque nor clear, section 5.4
+SMOOTH_WEIGHT = 0.01  # of the total variation of log opacity, section 5.4
 
 
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers; `NeuralVolumes.preset` has those of a plain CPU."""
 
-    encoder_cameras: Annotated[int, between(1, 32)] = 3  # cameras whose pictures are encoded, section 4.1
     encoder_size: Side = 512  # pixels a side of those pictures, a power of two; larger ones cost memory and time
     encoder_width: Width = 64  # channels of the encoder's first layers; later ones have up to 4 times as many
     code: Annotated[int, between(1, 4096)] = 256  # numbers of a moment's code, section 4.1
@@ -48,9 +51,6 @@ class Config:
     samples: RaySamples = 128  # samples of a ray; more are sharper, slower
     moments_per_step: Annotated[int, between(1, 256)] = 16  # moments in a step; each is decoded
     rays_per_step: BatchSize = 1 << 18  # rays of a step, of all its moments; the release has 128 x 128 of each
-    divergence_weight: NonNegative = 1e-3  # of the code's divergence from the unit Gaussian
-    opacity_weight: NonNegative = 0.01  # of rays that are neither opaque nor clear, section 5.4
-    smooth_weight: NonNegative = 0.01  # of the total variation of log opacity, section 5.4
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher: faster, may diverge
     final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
@@ -78,11 +78,11 @@ class NeuralVolumes(RayMethod):
         c = config or Config()
         super().__init__(frame, c)
         with seeded(c.seed):
-            self.encoder = Encoder(c.encoder_cameras, c.encoder_size, c.encoder_width, c.code)
+            self.encoder = Encoder(ENCODER_CAMERAS, c.encoder_size, c.encoder_width, c.code)
             warp = c.affines, c.warp_resolution, c.warp_width
             sides = c.shared_resolution, c.view_dependence
             self.decoder = VolumeDecoder(c.code, c.volume_resolution, c.volume_width, *warp, *sides)
-        self.rig = Rig(c.encoder_cameras, c.encoder_size)
+        self.rig = Rig(ENCODER_CAMERAS, c.encoder_size)
         self.backgrounds = Backgrounds(frame, c.background_size, learns_background=not frame.has_alpha)
         self.decoded: tuple[Any, Any] = (None, None)  # of the last picture
 
@@ -94,17 +94,18 @@ class NeuralVolumes(RayMethod):
     def cpu_preset(cls) -> Any:
         """Smaller pictures and networks, one moment in a step, a higher learning rate, and a finer volume that all
         moments share."""
-        c = Config(encoder_size=64, encoder_width=16, code=64, volume_resolution=32, volume_width=256, affines=8)
-        c = replace(c, shared_resolution=64)
-        c = replace(c, warp_resolution=16, warp_width=64, background_size=32, samples=64, moments_per_step=1)
-        return replace(c, rays_per_step=2048, learning_rate=2e-3, final_learning_rate=2e-4, decay_start=0.3)
+        return Config(
+            encoder_size=64, encoder_width=16, code=64, volume_resolution=32, volume_width=256, affines=8,
+            shared_resolution=64, warp_resolution=16, warp_width=64, background_size=32, samples=64,
+            moments_per_step=1, rays_per_step=2048, learning_rate=2e-3, final_learning_rate=2e-4, decay_start=0.3,
+        )  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny pictures and volumes of 16 voxels a side, within some twenty quick steps."""
-        c = Config(encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2)
-        c = replace(c, warp_resolution=8, warp_width=8, background_size=8, samples=24, moments_per_step=1)
-        return replace(c, shared_resolution=16, rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3)
+        return Config(encoder_size=8, encoder_width=4, code=8, volume_resolution=16, volume_width=32, affines=2,
+            warp_resolution=8, warp_width=8, background_size=8, samples=24, moments_per_step=1, shared_resolution=16,
+            rays_per_step=256, learning_rate=1e-2, final_learning_rate=1e-3)  # fmt: skip
 
     # Codes and volumes
 
@@ -230,9 +231,9 @@ class NeuralVolumes(RayMethod):
                 error = (seen - target[own][group]).square().mean() * (len(group) / len(target))
                 terms["image"] = terms["image"] + error
                 share = 1 / (len(moments) * len(groups))
-                terms["opacity"] = terms["opacity"] + share * c.opacity_weight * opacity_prior(opacity)
-                terms["smooth"] = terms["smooth"] + share * c.smooth_weight * opacity_roughness(volume[0])
-            terms["divergence"] = terms["divergence"] + c.divergence_weight / len(moments) * divergence(mean, deviation)
+                terms["opacity"] = terms["opacity"] + share * OPACITY_WEIGHT * opacity_prior(opacity)
+                terms["smooth"] = terms["smooth"] + share * SMOOTH_WEIGHT * opacity_roughness(volume[0])
+            terms["divergence"] = terms["divergence"] + DIVERGENCE_WEIGHT / len(moments) * divergence(mean, deviation)
         self.figures["mse"] = float(terms["image"].detach())
         return terms | {"image": terms["image"] / self.rig.deviation**2}
 

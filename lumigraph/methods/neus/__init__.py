@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -21,7 +21,7 @@ from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between
+from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, Width, between, changed
 from ...method import FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
@@ -35,6 +35,8 @@ ROOM_RADIUS = 0.9  # the same of a hollow sphere, seen from inside
 CLEAR_RADIUS = 0.5  # largest radius of it, of the distance from its middle to the nearest camera
 TAPS = 5  # evaluations of the hash table for each section: in its middle, and around it for the gradient
 MIN_OPACITY = 1e-3  # opacities of the mask term stay so far from 0 and 1, where its slope has no end
+EIKONAL_WEIGHT = 0.1  # lambda, weight of the eikonal term, eq. 17; higher keeps f closer to a distance
+MASK_WEIGHT = 0.1  # beta, weight of the mask term, eq. 18, where photographs have alpha
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Config:
 
     network: DistanceNumbers = DistanceNumbers()
     table: HashNumbers = HashNumbers()
-    rays: RayNumbers = RayNumbers(64, 64, rays_per_step=512)
+    rays: RayNumbers = RayNumbers(coarse_samples=64, fine_samples=64, rays_per_step=512)
     mask: MaskNumbers = MaskNumbers()
     measured: DepthNumbers = DepthNumbers()
     field: Literal["network", "hash"] = "network"  # distance field: the paper's network, or a faster hash table
@@ -52,8 +54,6 @@ class Config:
     samples_per_step: Annotated[int, between(0, 1 << 24)] = 0  # sections of a step, which sets its rays; 0: fixed rays
     outside_samples: RaySamples = 32  # samples of a ray behind the box of an open capture; more are sharper, slower
     weight_threshold: Share = 0.0  # weight of a section below which it is left out; higher is faster, less exact
-    eikonal_weight: NonNegative = 0.1  # lambda, weight of the eikonal term, eq. 17; higher keeps f closer to a distance
-    mask_weight: NonNegative = 0.1  # beta, weight of the mask term, eq. 18, where photographs have alpha
     curvature_weight: NonNegative = 0.0  # weight of the Laplacian's magnitude, with --field hash; higher smooths
     cosine_annealing: Share = 1 / 6  # share of the budget in which slopes are annealed, where nothing has alpha
     coarse_to_fine: Share = 0.0  # share of the budget in which levels of the hash table are added; 0: at once
@@ -111,18 +111,18 @@ class NeuS(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table whose levels join one by one, a grid of what is empty, sections that matter alone."""
-        c = Config(table=CPU_TABLE, rays=RayNumbers(48, 16, rays_per_step=768), mask=MaskNumbers(64), field="hash")
-        c = replace(c, hidden_width=32, upsampling_rounds=2, outside_samples=24, weight_threshold=1e-3)
-        c = replace(c, samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02)
+        return changed(Config(table=CPU_TABLE), coarse_samples=48, fine_samples=16, rays_per_step=768,
+            occupancy_resolution=64, field="hash", hidden_width=32, upsampling_rounds=2, outside_samples=24,
+            weight_threshold=1e-3, samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5,
+            learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.15, warmup=0.02)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table whose levels join, with a grid of what is empty, within some twenty quick steps."""
-        c = Config(table=TINY_TABLE, rays=RayNumbers(16, 8, rays_per_step=192), mask=MaskNumbers(16), field="hash")
-        c = replace(c, hidden_width=16, upsampling_rounds=2, samples_per_step=2048, outside_samples=8)
-        c = replace(c, weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.1)
+        return changed(Config(table=TINY_TABLE), coarse_samples=16, fine_samples=8, rays_per_step=192,
+            occupancy_resolution=16, field="hash", hidden_width=16, upsampling_rounds=2, samples_per_step=2048,
+            outside_samples=8, weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1,
+            learning_rate=2e-2, final_learning_rate=1e-3, sharpness_rate=0.1)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -167,12 +167,12 @@ class NeuS(FieldMethod):
         anywhere, filled = self.network.shape.surface(points), self.sampler.empty.may_hold(points)
         if filled is not None:  # nothing else is learnt where the mask says that nothing is
             terms["empty"] = ((-anywhere.distance).clamp_min(0) * ~filled).mean()
-        terms["eikonal"] = c.eikonal_weight * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
+        terms["eikonal"] = EIKONAL_WEIGHT * eikonal(torch.cat([gradient[inside], anywhere.gradient]))
         if c.curvature_weight and laplacian:
             bent = laplacian[0][inside].abs()
             terms["curvature"] = c.curvature_weight * bent.sum() / max(len(bent), 1)
-        if batch.alpha is not None and c.mask_weight:
-            terms["mask"] = c.mask_weight * mask_error(rendering.opacity, batch.alpha)
+        if batch.alpha is not None:
+            terms["mask"] = MASK_WEIGHT * mask_error(rendering.opacity, batch.alpha)
         return terms
 
     def _anywhere(self, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:

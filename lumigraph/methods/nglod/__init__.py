@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -20,12 +20,14 @@ from ...components.training.shape_points import PointNumbers, PointPools
 from ...datasets.scene import Frame
 from ...datasets.shapes import PointBatch, Shapes
 from ...errors import LumigraphError
-from ...files.ranges import LearningRate, NonNegative, Seed, Width, between
+from ...files.ranges import LearningRate, NonNegative, Seed, Width, between, changed
 from ...kernels.octree_cells import MAX_LEVELS, Crossed
 from ...method import seeded
 from ...method.controls import Control
 from .loops import trace
 from .octree import CodeOctree
+
+MAX_STEPS = 64  # steps of sphere tracing at most
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,6 @@ class Config:
     learning_rate: LearningRate = 1e-3  # Adam's learning rate at first
     final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
     hit_distance: NonNegative = 3e-4  # scene units from the surface at which a ray meets it; smaller costs steps
-    max_steps: Annotated[int, between(1, 1024)] = 64  # steps of sphere tracing at most
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
@@ -71,14 +72,14 @@ class NGLOD(SurfaceMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller codes and decoders, and more points in a step."""
-        points = PointNumbers(300_000, near_share=0.8, near_spread=0.04, fine_spread=0.006)
-        c = Config(points, features=16, hidden_width=64, points_per_step=1 << 13, learning_rate=1e-2)
-        return replace(c, final_learning_rate=5e-4, hit_distance=1e-3)
+        return changed(Config(), pool_points=300_000, near_spread=0.04, fine_spread=0.006, features=16, hidden_width=64,
+            points_per_step=1 << 13, learning_rate=1e-2, final_learning_rate=5e-4, hit_distance=1e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        points = PointNumbers(4096, near_share=0.8, near_spread=0.02, fine_spread=0.0)
-        return Config(points, levels=2, features=4, hidden_width=16, points_per_step=512, learning_rate=1e-2)
+        return changed(
+            Config(), pool_points=4096, near_spread=0.02, levels=2, features=4, hidden_width=16, learning_rate=1e-2,
+        )  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -161,7 +162,7 @@ class NGLOD(SurfaceMethod):
         given = [x.contiguous().numpy() for x in (0.5 * rays.origins + 0.5, rays.directions, tree.cells, tree.rows)]
         near, hit = np.float32(0.5 * self.frame.near), np.float32(0.5 * self.config.hit_distance)
         found = [x.numpy() for x in (t, normals)]
-        trace(*given, tree.depth, near, *(x.detach().numpy() for x in tables), hit, self.config.max_steps, *found)
+        trace(*given, tree.depth, near, *(x.detach().numpy() for x in tables), hit, MAX_STEPS, *found)
         return 2 * t, normals
 
     def _traced(self, rays: Rays) -> Float[Tensor, " ray"]:
@@ -174,7 +175,7 @@ class NGLOD(SurfaceMethod):
         row = (found.ray_starts.diff() > 0).nonzero()[:, 0]
         place = 2 * found.t_start[found.ray_starts[row]]
         before, ahead = place, torch.zeros_like(place)  # 0: no value in front of it
-        for _ in range(c.max_steps):
+        for _ in range(MAX_STEPS):
             if not len(row):
                 break
             value = self.distance(rays[row].at(place))

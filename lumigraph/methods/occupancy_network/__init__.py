@@ -23,7 +23,7 @@ from ...datasets.scene import Frame, Photograph
 from ...datasets.shapes import HALF_SIDE, PointBatch, Shape, Shapes
 from ...datasets.shapes.pictures import picture_of
 from ...errors import LumigraphError
-from ...files.ranges import Count, Layers, LearningRate, Seed, Width, between
+from ...files.ranges import Count, Layers, LearningRate, Seed, Width, between, changed
 from ...method import seeded
 from .networks import VOXELS, OccupancyDecoder, PointEncoder, VoxelEncoder, WholePictureEncoder
 
@@ -32,6 +32,8 @@ Input = Literal["points", "voxels", "picture"]
 
 FIT_LEARNING_RATE = 0.02  # Adam's learning rate of a new code, in deviations of the learnt codes
 CLOUD_NOISE = 0.01  # deviation of noise of a cloud's points in training, scene units
+VIEWS = 24  # pictures of each shape to learn from, around it, section 4.2
+FINAL_LEARNING_RATE = 1e-4  # learning rate at the end of the budget, reached exponentially
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,11 @@ class Config:
     """The paper's numbers; where it leaves them open, those of the published code (configs/)."""
 
     input: Input = "points"  # evidence that a shape is encoded from: a cloud of points, voxels, or one picture
-    points: PointNumbers = PointNumbers(100_000, near_share=0.0)
+    points: PointNumbers = PointNumbers(pool_points=100_000, near_share=0.0)
     cloud_points: Annotated[int, between(8, 65_536)] = 300  # points of a cloud as input, section 4.3
     bend: Annotated[float, between(0, 0.6)] = 0.0  # largest bend of axes in training, of points alone; more vary shapes
     stretch: Annotated[float, between(0, 2)] = 0.0  # largest |log| of factors of axes in training, likewise
     picture_size: Annotated[int, between(16, 512)] = 224  # pixels a side of a picture as input
-    views: Annotated[int, between(1, 256)] = 24  # pictures of each shape to learn from, around it, section 4.2
     code: Width = 512  # numbers of a code, appendix A; more hold more shapes
     encoder_width: Width = 512  # channels of the encoder, appendix A; wider costs time
     hidden_width: Width = 256  # channels of the decoder, appendix A; wider costs time
@@ -55,7 +56,6 @@ class Config:
     shapes_per_step: Annotated[int, between(1, 1024)] = 64  # shapes in a step, section 4; more reduce noise
     points_per_shape: Annotated[int, between(1, 1 << 20)] = 2048  # points of each shape in a step, section 3.2
     learning_rate: LearningRate = 1e-4  # Adam's learning rate at first, appendix A
-    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
     code_steps: Annotated[int, between(0, 10_000)] = 0  # steps that fit an encoded cloud's code to it; many overfit
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -133,16 +133,15 @@ class OccupancyNetwork(CodedSurface):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller networks, points close to the surface too, waves, and warped members."""
-        c = Config(points=PointNumbers(80_000, near_share=0.6), picture_size=64, code=128, encoder_width=64)
-        c = replace(c, hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=16)
-        c = replace(c, points_per_shape=256, learning_rate=2e-3, final_learning_rate=1e-4)
-        return replace(c, bend=0.4, stretch=0.3, code_steps=30)
+        return changed(Config(), pool_points=80_000, near_share=0.6, picture_size=64, code=128, encoder_width=64,
+            hidden_width=64, octaves=3, threshold=0.5, members=256, shapes_per_step=16, points_per_shape=256,
+            learning_rate=2e-3, bend=0.4, stretch=0.3, code_steps=30)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(points=PointNumbers(4096, near_share=0.5), cloud_points=32, code=4, encoder_width=8, hidden_width=8)
-        c = replace(c, blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512)
-        return replace(c, learning_rate=2e-2, final_learning_rate=1e-2)
+        return changed(Config(), pool_points=4096, near_share=0.5, cloud_points=32, code=4, encoder_width=8,
+            hidden_width=8, blocks=1, octaves=1, threshold=0.5, members=4, shapes_per_step=1, points_per_shape=512,
+            learning_rate=2e-2)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -193,7 +192,7 @@ class OccupancyNetwork(CodedSurface):
         return known if c.input == "voxels" else known[int(torch.randint(len(known), (), generator=generator))]
 
     def _pictures(self, shape: Shape, member: int) -> Float[Tensor, "view height width"]:
-        cameras = ring(shape.frame.bounds, size=self.config.picture_size, count=self.config.views)
+        cameras = ring(shape.frame.bounds, size=self.config.picture_size, count=VIEWS)
         shots = [picture_of(shape, cameras[i], self.random(1000 + member)) for i in range(len(cameras))]
         return torch.stack([grey(shot) for shot in shots])
 
@@ -214,7 +213,7 @@ class OccupancyNetwork(CodedSurface):
         return [torch.optim.Adam(learnt, self.config.learning_rate, foreach=True)]
 
     def learning_rate(self, step: int, progress: float) -> float:
-        return falling(self.config.learning_rate, self.config.final_learning_rate, progress)
+        return falling(self.config.learning_rate, FINAL_LEARNING_RATE, progress)
 
     # Shapes
 

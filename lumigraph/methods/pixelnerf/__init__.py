@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -29,7 +29,6 @@ from ...files.ranges import (
     Layers,
     LearningRate,
     NonNegative,
-    Octaves,
     Positive,
     RaySamples,
     Seed,
@@ -45,6 +44,8 @@ from ...volume import composite, weights_of
 from .networks import STRIDE, PictureEncoder, ResidualNetwork, look_up
 
 Views = Annotated[int, between(1, 64)]
+POSITION_FREQUENCIES = 6  # octaves of positions, appendix B.1; the lowest turns by 1.5 radians a unit
+DEPTH_DEVIATION = 0.01  # standard deviation of these, as a share of the ray's length in the scene
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,10 @@ class Config:
     encoder_blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)  # blocks of the encoder's three stages; more cost time
     encoder_pool: bool = True  # halve the resolution after the encoder's stem; off: finer features, slower
     encoder_weights: str = ""  # file of torchvision's resnet34 weights to begin with; without, begin at random
-    position_frequencies: Octaves = 6  # octaves of positions, appendix B.1; the lowest turns by 1.5 radians a unit
     centred: bool = True  # positions relative to an object's centre, as published; off: to each camera
     coarse_samples: RaySamples = 64  # coarse samples of a ray, appendix B.2; more find thinner things, slower
     fine_samples: RaySamples = 16  # fine samples of a ray, by the coarse weights, appendix B.2; more are sharper
     depth_samples: Annotated[int, between(0, 4096)] = 16  # samples around the coarse depth, appendix B.2; 0: none
-    depth_deviation: Positive = 0.01  # standard deviation of these, as a share of the ray's length in the scene
     networks: Annotated[int, between(1, 2)] = 2  # networks: one for each pass, or 1 for both, which is faster
     coarse_loss_weight: NonNegative = 1.0  # weight of the coarse pass's colours; 0: it only guides the fine one
     density: Literal["relu", "softplus"] = "relu"  # activation of density; softplus has a gradient below zero too
@@ -133,7 +132,7 @@ class PixelNeRF(RayMethod):
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
         super().__init__(frame, c)
-        self.encode = FrequencyEncoding(3, c.position_frequencies, base=1.5)
+        self.encode = FrequencyEncoding(3, POSITION_FREQUENCIES, base=1.5)
         self.encoder = PictureEncoder(c.encoder_widths, c.encoder_blocks, c.encoder_pool, bool(c.encoder_weights))
         shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, c.blocks, c.view_blocks, not c.bfloat16)
         self.networks = torch.nn.ModuleList(ResidualNetwork(*shape) for _ in range(c.networks))
@@ -144,17 +143,17 @@ class PixelNeRF(RayMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A smaller encoder and network of the same design."""
-        c = Config(hidden_width=64, encoder_widths=(32, 32, 64, 128), encoder_blocks=(2, 2, 2), encoder_pool=False)
-        c = replace(c, coarse_samples=20, fine_samples=12, depth_samples=0, networks=1, empty_threshold=1e-2)
-        c = replace(c, density="softplus", density_scale=10.0, members_per_step=3, rays_per_member=128, boxed=0.5)
-        return replace(c, coarse_loss_weight=0.1, learning_rate=1e-3, final_learning_rate=1e-4, warmup=0.02)
+        return Config(hidden_width=64, encoder_widths=(32, 32, 64, 128), encoder_blocks=(2, 2, 2), encoder_pool=False,
+            coarse_samples=20, fine_samples=12, depth_samples=0, networks=1, empty_threshold=1e-2, density="softplus",
+            density_scale=10.0, members_per_step=3, boxed=0.5, coarse_loss_weight=0.1, learning_rate=1e-3,
+            warmup=0.02)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16)
-        c = replace(c, blocks=2, view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2)
-        c = replace(c, coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96)
-        return replace(c, learning_rate=1e-2, final_learning_rate=3e-3)
+        return Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16,
+            blocks=2, view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2,
+            coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96,
+            learning_rate=1e-2, final_learning_rate=3e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -332,7 +331,7 @@ class PixelNeRF(RayMethod):
             total = weights.sum(-1, keepdim=True)
             depth = torch.where(total > 0, (weights * shares).sum(-1, keepdim=True) / total.clamp_min(1e-9), 0.5)
             spread = 2 * stratified(count, c.depth_samples, generator, device) - 1
-            places.append((depth + c.depth_deviation * 2**0.5 * torch.erfinv(spread.clamp(-0.999, 0.999))).clamp(0, 1))
+            places.append((depth + DEPTH_DEVIATION * 2**0.5 * torch.erfinv(spread.clamp(-0.999, 0.999))).clamp(0, 1))
         return torch.cat(places, -1)
 
     def _ask(

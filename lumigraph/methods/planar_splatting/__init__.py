@@ -7,7 +7,7 @@ Each Gaussian is flattened into a disc, whose plane gives unbiased depth and a n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 
@@ -16,15 +16,17 @@ from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.addition import Addition, Step
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import RateNumbers
-from ...components.clouds.cloud_method import CloudMethod
+from ...components.clouds.cloud import HasteNumbers
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
+from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
+from ...components.clouds.cloud_method import SSIM_WEIGHT, TRANSMITTANCE_THRESHOLD, CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, CloudSize, Count, NonNegative, PositiveShare, Seed, Share, Steps, between
+from ...files.ranges import BatchSize, CloudSize, NonNegative, Seed, Share, between, changed
 from ...gaussians.splatting import splat, view_of
 from ...geometry import unit
 from ...method.depth import DepthNumbers
@@ -33,6 +35,8 @@ from .consistency import PlaneView, grey_of, multi_view_errors, near_views, patc
 from .planes import discs, plane_maps
 
 STOPS = {"mean": 1e-4, "median": 0.5}  # transmittance at which the planes of a pixel are finished
+FLATNESS_WEIGHT = 100.0  # lambda_1, weight of the smallest scales; higher: flatter Gaussians
+NEAR_VIEWS = 8  # nearest photographs, of which a step draws the other view
 
 
 @dataclass(frozen=True)
@@ -40,14 +44,12 @@ class PlaneNumbers:
     """A Config's numbers of planes."""
 
     depth: Literal["mean", "median"] = "mean"  # planes of all Gaussians on a ray, or none behind the median one
-    flatness_weight: NonNegative = 100.0  # lambda_1, weight of the smallest scales; higher: flatter Gaussians
     normal_weight: NonNegative = 0.015  # lambda_2, weight of depth-normal consistency; higher: smoother surfaces
     photometric_weight: NonNegative = 0.15  # lambda_3, weight of 1 - NCC between views; 0: photographs one by one
     geometric_weight: NonNegative = 0.03  # lambda_4, weight of reprojection errors in pixels
     consistency_from: Share = 7000 / 30_000  # share of the budget before consistency counts
     patches: BatchSize = 102_400  # pixels of a step that are compared with another view; fewer are faster
     patch_side: Annotated[int, between(3, 31)] = 7  # pixels along a patch, an odd number
-    near_views: Count = 8  # nearest photographs, of which a step draws the other view
     view_angle: Annotated[float, between(1, 180)] = 30.0  # degrees between the axes of two views, at most
     both_views: bool = True  # move the other view's planes too; off: its picture needs no backward pass, faster
     discs: bool = False  # begin as discs across the points' normals; off: as balls
@@ -63,15 +65,12 @@ class Config:
     """The paper's numbers, those of 3D Gaussian Splatting where it gives none."""
 
     sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
-    sh_degree_interval: Steps = 1000  # steps for each further degree; or the share below, if sooner
-    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss; higher gives structure more weight
+    ssim_weight: ClassVar[float] = SSIM_WEIGHT
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
     initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points
     half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
-    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished; higher is faster
     planes: PlaneNumbers = PlaneNumbers()
-    rates: RateNumbers = RateNumbers()
+    rates: HasteNumbers = HasteNumbers()
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
     poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
@@ -111,7 +110,7 @@ class Planes(Addition):
         """lambda_1 L_s, and lambda_2 to lambda_4 times the consistency terms."""
         c, cloud = self.numbers, step.cloud
         visible = step.picture.opacities > 0
-        step.terms["flatness"] = c.flatness_weight * cloud.log_scales[visible].amin(-1).exp().mean()
+        step.terms["flatness"] = FLATNESS_WEIGHT * cloud.log_scales[visible].amin(-1).exp().mean()
         if method.progress < c.consistency_from:
             return
         here = PlaneView(step.camera, grey_of(step.photograph), plane_maps(cloud, step.picture, step.camera, c.stop))
@@ -121,7 +120,7 @@ class Planes(Addition):
             return
         camera = method.refined(other.camera)
         with torch.set_grad_enabled(c.both_views):
-            picture = splat(step.whole, view_of(camera, method.near_plane), 1, method.config.transmittance_threshold)
+            picture = splat(step.whole, view_of(camera, method.near_plane), 1, TRANSMITTANCE_THRESHOLD)
             there = PlaneView(camera, grey_of(other), plane_maps(step.whole, picture, camera, c.stop))
         middle = patch_centres(step.photograph, here.maps, c.patch_side, c.patches, step.chance)
         photometric, geometric = multi_view_errors(here, there, *middle, c.patch_side)
@@ -146,35 +145,24 @@ class PlanarSplatting(CloudMethod):
     def cpu_preset(cls) -> Any:
         """A smaller cloud that begins as discs on dense points. Consistency counts from early on and for more. Patches
         are fewer, and smaller because photographs are."""
-        planes = PlaneNumbers(
-            depth="median", normal_weight=0.05, photometric_weight=0.6, geometric_weight=0.1, consistency_from=0.05,
-            patches=2048, patch_side=5, both_views=False, discs=True,
-        )  # fmt: skip
-        return Config(
-            initialization="dense", initial_gaussians=20_000, half_resolution_until=0.3, planes=planes,
-            refine=RefineNumbers(60_000, cap_ramp=True), tidying=ALL_RULES, rates=RateNumbers(most_haste=4.0),
-        )  # fmt: skip
+        return changed(Config(tidying=ALL_RULES), initialization="dense", initial_gaussians=20_000,
+            half_resolution_until=0.3, depth="median", normal_weight=0.05, photometric_weight=0.6, geometric_weight=0.1,
+            consistency_from=0.05, patches=2048, patch_side=5, both_views=False, discs=True, max_gaussians=60_000,
+            cap_ramp=True, most_haste=4.0)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Some hundred Gaussians that are refined, reset and made consistent within some twenty quick steps."""
-        return Config(
-            sh_degree=1,
-            sh_degree_interval=4,
-            initial_gaussians=200,
-            planes=PlaneNumbers(depth="median", consistency_from=0.1, patches=64, patch_side=3, view_angle=180.0),
-            refine=RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8),
-            tidying=ALL_RULES,
-            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
-            photographs=AppearanceNumbers(appearance="no"),
-        )
+        return changed(Config(tidying=ALL_RULES), sh_degree=1, initial_gaussians=200, depth="median",
+            consistency_from=0.1, patches=64, patch_side=3, view_angle=180.0, max_gaussians=300, cap_ramp=True,
+            refine_until=0.8, densify_grad_threshold=1e-6, opacity_reset_interval=5, appearance="no")  # fmt: skip
 
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
         """The next photograph, and one of those that were taken beside it."""
         c, seen, train = self.config.planes, super().batch(data, generator), data.splits["train"]
         assert self.cameras is not None and seen.camera.image_index is not None
         index = int((train == seen.camera.image_index.cpu()).nonzero()[0, 0])
-        near = near_views(self.cameras, index, c.near_views, c.view_angle)
+        near = near_views(self.cameras, index, NEAR_VIEWS, c.view_angle)
         other = None
         if len(near):
             chosen = near[int(torch.randint(len(near), (1,), generator=generator))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -23,18 +23,7 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import (
-    BatchSize,
-    LearningRate,
-    NonNegative,
-    Positive,
-    PositiveShare,
-    Seed,
-    Share,
-    Steps,
-    between,
-    changed,
-)
+from ...files.ranges import BatchSize, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, between, changed
 from ...kernels import total_variation
 from ...kernels.harmonic_grid import BANDS
 from ...method import Field, FieldMethod
@@ -45,6 +34,12 @@ from .sparse_voxels import Cells, SparseVoxels, VoxelRows
 
 Resolution = Annotated[int, between(4, 1024)]
 DensityRate = Annotated[float, between(1e-6, 1e4)]
+INITIAL_DENSITY = 0.1  # density of all nodes at first, per unit of coordinates
+WEIGHT_THRESHOLD = 5e-3  # least weight of a voxel in a picture, section 3.3; higher prunes more
+TV_DENSITY = 1e-5  # weight of density's total variation, eq. 3; higher smooths
+TV_HARMONICS = 1e-3  # weight of harmonics' total variation, eq. 3; higher smooths
+OPEN_TV_DENSITY = 5e-4  # the same of density where there is no bound, the release's
+OPEN_TV_HARMONICS = 5e-3  # the same of harmonics where there is no bound
 
 
 @dataclass(frozen=True)
@@ -65,18 +60,12 @@ class Config:
     open_max_resolution: Resolution = 640  # voxels per axis in the end where there is no bound
     refine_until: Share = 0.3  # share of the budget at which the grid has its final resolution
     step_size: Annotated[float, between(0.05, 4)] = 0.5  # distance of samples in voxels; larger is faster, less exact
-    initial_density: Positive = 0.1  # density of all nodes at first, per unit of coordinates
-    weight_threshold: Share = 5e-3  # least weight of a voxel in a picture, section 3.3; higher prunes more
     rays_per_step: BatchSize = 5000  # rays in a step at most, section 4; more reduce noise, and cost time
     density_learning_rate: DensityRate = 30.0  # density's rate, for 256 voxels per axis; in proportion to these
     final_density_learning_rate: DensityRate = 0.05  # density's rate at the end of the budget
     density_delay: Share = 0.12  # share of the budget in which density's rate rises; longer settles colours first
     harmonics_learning_rate: LearningRate = 1e-2  # rate of the harmonics at first
     final_harmonics_learning_rate: LearningRate = 5e-6  # rate of the harmonics at the end of the budget
-    tv_density: NonNegative = 1e-5  # weight of density's total variation, eq. 3; higher smooths
-    tv_harmonics: NonNegative = 1e-3  # weight of harmonics' total variation, eq. 3; higher smooths
-    open_tv_density: NonNegative = 5e-4  # the same of density where there is no bound, the release's
-    open_tv_harmonics: NonNegative = 5e-3  # the same of harmonics where there is no bound
     tv_share: PositiveShare = 0.01  # share of a step's nodes for total variation; more smooth more, and cost time
     tv_interval: Steps = 1  # steps between total variation terms; more are faster and smooth less
     sparsity: NonNegative = 1e-11  # weight of the Cauchy loss of density, eq. 4; higher empties more
@@ -125,7 +114,7 @@ class HarmonicField(Field):
         super().__init__()
         self.config, self.space = config, space
         first, _ = config.resolutions(space.is_open)
-        self.voxels = SparseVoxels(cells_of(space, first), config.initial_density)
+        self.voxels = SparseVoxels(cells_of(space, first), INITIAL_DENSITY)
         self.touched: tuple[Tensor, VoxelRows]
 
     def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
@@ -181,25 +170,20 @@ class Plenoxels(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        return changed(
-            Config(), samples_per_step=1 << 16, transmittance_threshold=1e-3, occupancy_threshold=0.02,
-            base_resolution=128, max_resolution=192, open_base_resolution=64, open_max_resolution=192,
-            refine_until=0.4, step_size=1.0, rays_per_step=4096, tv_share=0.1, tv_interval=8, sparsity=0.0,
-            density_learning_rate=40.0, final_density_learning_rate=4.0, density_delay=0.2,
-            harmonics_learning_rate=0.15, final_harmonics_learning_rate=0.02, occupancy_resolution=128,
-            occupancy_interval=16,
-        )  # fmt: skip
+        return changed(Config(), samples_per_step=1 << 16, transmittance_threshold=1e-3, occupancy_threshold=0.02,
+            base_resolution=128, max_resolution=192, open_base_resolution=64, open_max_resolution=192, refine_until=0.4,
+            step_size=1.0, rays_per_step=4096, tv_share=0.1, tv_interval=8, sparsity=0.0, density_learning_rate=40.0,
+            final_density_learning_rate=4.0, density_delay=0.2, harmonics_learning_rate=0.15,
+            final_harmonics_learning_rate=0.02, occupancy_resolution=128, occupancy_interval=16)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A grid of three sizes with every loss, within some twenty quick steps."""
-        return changed(
-            Config(), occupancy_resolution=16, occupancy_interval=4, base_resolution=8, max_resolution=32,
+        return changed(Config(), occupancy_resolution=16, occupancy_interval=4, base_resolution=8, max_resolution=32,
             open_base_resolution=8, open_max_resolution=32, refine_until=0.5, step_size=1.0, rays_per_step=128,
             tv_share=0.5, tv_interval=2, density_learning_rate=60.0, final_density_learning_rate=10.0,
             density_delay=0.1, harmonics_learning_rate=0.2, final_harmonics_learning_rate=0.05, sparsity=1e-5,
-            beta=1e-4, exposure_correction="yes",
-        )  # fmt: skip
+            beta=1e-4, exposure_correction="yes")  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -276,8 +260,8 @@ class Plenoxels(FieldMethod):
         if step % config.tv_interval == 0:
             drawn = torch.rand(len(rows), generator=generator).to(rows.device) < config.tv_share
             chosen = self.voxels.numbers[rows[drawn]].long()
-            bounded = config.tv_density, config.tv_harmonics
-            weights = (config.open_tv_density, config.open_tv_harmonics) if is_open else bounded
+            bounded = TV_DENSITY, TV_HARMONICS
+            weights = (OPEN_TV_DENSITY, OPEN_TV_HARMONICS) if is_open else bounded
             for name, weight in zip(("density", "harmonics"), weights, strict=True):
                 if weight:
                     terms[f"tv_{name}"] = weight * total_variation(chosen, part.nodes, getattr(part, name))
@@ -317,7 +301,7 @@ class Plenoxels(FieldMethod):
     def _kept(self) -> Bool[Tensor, "x y z"]:
         """Cells that are not pruned. Where there is no bound, a step's few long rays leave most nodes without a known
         weight; there a voxel goes that would stop less light than the threshold, as in the release."""
-        least = self.config.weight_threshold
+        least = WEIGHT_THRESHOLD
         if not self.sampler.is_open:
             return self.voxels.important(least)
         return self.voxels.dense(least * int(self.voxels.cells.amax()) / 2)

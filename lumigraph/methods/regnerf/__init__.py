@@ -67,7 +67,7 @@ class Config:
     random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
     annealing: Share = 512 / 69_768  # share of the budget in which samples spread along rays, eq. 10
     forward_annealing_start: PositiveShare = 1e-4  # share of forward-facing rays, from the far plane on, at first
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
     # Of the network.
     hidden_width: Width = 256  # channels of a layer
     density_noise: NonNegative = 1.0  # deviation of noise on raw density in training; 0: none

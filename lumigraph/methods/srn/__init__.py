@@ -20,10 +20,20 @@ from ...components.fields.kept_photographs import Kept, chance, photographed, ra
 from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
+from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Seed, Share, Width, between
 from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value
 from .networks import Layer, RayMarcher, SceneHyperNetwork, perceptron, scene_features
+
+CODE_DEVIATION = 0.01  # standard deviation of codes at first
+HYPER_LAYERS = 2  # hidden layers of the hypernetwork, as wide as the code
+MARCHER_STATE = 16  # numbers of the ray marcher's state
+START_DISTANCE = 0.05  # distance along a ray at which it starts, scene units
+START_DEVIATION = 5e-4  # standard deviation of that in training, scene units
+COLOUR_WEIGHT = 200.0  # weight of the colours' squared error, of colours in [-1, 1]
+DEPTH_WEIGHT = 10.0  # weight of the square of negative distances, eq. 6
+CODE_WEIGHT = 1.0  # weight of the codes' mean square, eq. 6; higher keeps codes near zero
+CODE_LEARNING_RATE = 1e-2  # Adam's learning rate of that fit
 
 
 @dataclass(frozen=True)
@@ -31,30 +41,21 @@ class Config:
     """The paper's numbers, as its published code has them (srns.py, train.py)."""
 
     code: Width = 256  # numbers of a scene's code; more hold more scenes
-    code_deviation: Positive = 0.01  # standard deviation of codes at first
-    hyper_layers: Annotated[int, between(1, 8)] = 2  # hidden layers of the hypernetwork, as wide as the code
     hidden_width: Width = 256  # channels of the scene's network and of the pixel generator; wider costs time
     depth: Layers = 4  # layers of the scene's network; more hold more detail, and cost time
     pixel_layers: Layers = 5  # hidden layers of the pixel generator; more cost time
     march_steps: Annotated[int, between(1, 128)] = 10  # steps of the ray marcher; more find farther surfaces, slower
-    marcher_state: Width = 16  # numbers of the ray marcher's state
     start: Literal["camera", "box"] = "camera"  # where rays start: near the camera, or where they enter the scene's box
-    start_distance: Positive = 0.05  # distance along a ray at which it starts, scene units
-    start_deviation: NonNegative = 5e-4  # standard deviation of that in training, scene units
     members: Count = 4096  # members of a collection at most; each has a code, so more cost memory
     members_per_step: Annotated[int, between(1, 1024)] = 64  # scenes in a step; more reduce noise, and cost time
     rays_per_member: BatchSize = 4096  # rays of each scene in a step; more reduce noise, and cost time
     targets: Annotated[int, between(1, 64)] = 1  # photographs of a member that a step's rays come from
-    colour_weight: NonNegative = 200.0  # weight of the colours' squared error, of colours in [-1, 1]
-    depth_weight: NonNegative = 10.0  # weight of the square of negative distances, eq. 6
-    code_weight: NonNegative = 1.0  # weight of the codes' mean square, eq. 6; higher keeps codes near zero
     opacity_weight: NonNegative = 1.0  # of the squared error of opacity, beside that of colours, with alpha
     learning_rate: LearningRate = 4e-5  # Adam's learning rate at first; higher learns faster, and may diverge
     final_learning_rate: LearningRate = 4e-5  # learning rate at the end of the budget, reached exponentially
     warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
     # Finding the code of one scene.
     code_steps: Annotated[int, between(0, 100_000)] = 1000  # steps that fit the code of a new scene; more take longer
-    code_learning_rate: LearningRate = 1e-2  # Adam's learning rate of that fit
     fit_rays: BatchSize = 1024  # rays of a step of that fit; more reduce noise, and cost time
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -90,8 +91,8 @@ class SRN(RayMethod):
         c = config or Config()
         super().__init__(frame, c)
         with seeded(c.seed):
-            self.hyper = SceneHyperNetwork(c.code, (3, *[c.hidden_width] * c.depth), c.hyper_layers)
-            self.marcher = RayMarcher(c.hidden_width, c.marcher_state, c.march_steps)
+            self.hyper = SceneHyperNetwork(c.code, (3, *[c.hidden_width] * c.depth), HYPER_LAYERS)
+            self.marcher = RayMarcher(c.hidden_width, MARCHER_STATE, c.march_steps)
             outputs = 4 if frame.has_alpha else 3
             widths = [c.hidden_width] * (c.pixel_layers + 1)
             self.pixel_generator = perceptron(*widths, outputs, normalised=False)
@@ -101,15 +102,15 @@ class SRN(RayMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller networks; rays start where they enter the scene's box."""
-        c = Config(code=64, hidden_width=64, start="box", members=1024, members_per_step=4, rays_per_member=256)
-        c = replace(c, targets=4, learning_rate=2e-3, final_learning_rate=1e-4, warmup=0.02)
-        return replace(c, code_steps=200, code_learning_rate=1e-2, fit_rays=512)
+        return Config(
+            code=64, hidden_width=64, start="box", members=1024, members_per_step=4, rays_per_member=256, targets=4,
+            learning_rate=2e-3, final_learning_rate=1e-4, warmup=0.02, code_steps=200, fit_rays=512)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        c = Config(code=4, hidden_width=16, depth=2, pixel_layers=1, march_steps=4, start="box", members=8)
-        c = replace(c, members_per_step=1, rays_per_member=128, learning_rate=1e-2, final_learning_rate=3e-3)
-        return replace(c, code_steps=5, fit_rays=64)
+        return Config(code=4, hidden_width=16, depth=2, pixel_layers=1, march_steps=4, start="box", members=8,
+            members_per_step=1, rays_per_member=128, learning_rate=1e-2, final_learning_rate=3e-3, code_steps=5,
+            fit_rays=64)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -122,7 +123,7 @@ class SRN(RayMethod):
 
     def begin(self, data: Collection, seconds: float = math.inf) -> None:
         self.codes.check_room(len(data), data.source)
-        self.codes.begin(data.splits["train"], self.config.code_deviation, self.random(1))
+        self.codes.begin(data.splits["train"], CODE_DEVIATION, self.random(1))
 
     def steps_per_pass(self, data: Collection) -> float:
         return len(data.splits["train"]) / self.config.members_per_step
@@ -144,7 +145,7 @@ class SRN(RayMethod):
         """L_img, L_depth and L_latent (eq. 6)."""
         codes = self.codes(torch.tensor(batch.members, device=self.device))
         terms = self._errors(codes, batch.batches, batch.backgrounds, self.random(step))
-        return terms | {"code": self.config.code_weight * codes.square().mean()}
+        return terms | {"code": CODE_WEIGHT * codes.square().mean()}
 
     def _errors(
         self,
@@ -163,13 +164,13 @@ class SRN(RayMethod):
         error = (before(rgb, opacity, behind) - target).square().mean()
         self.figures = {"mse": float(error.detach())}
         terms = {
-            "colour": 4 * c.colour_weight * error,  # of colours in [-1, 1]
-            "depth": c.depth_weight * distance.clamp_max(0).square().mean(),
+            "colour": 4 * COLOUR_WEIGHT * error,  # of colours in [-1, 1]
+            "depth": DEPTH_WEIGHT * distance.clamp_max(0).square().mean(),
         }
         if self.frame.has_alpha:
             known = [torch.ones_like(x.rays.radius) if x.alpha is None else x.alpha for x in batches]
             off = (opacity - torch.stack(known)).square().mean()
-            terms["opacity"] = 4 * c.colour_weight * c.opacity_weight * off
+            terms["opacity"] = 4 * COLOUR_WEIGHT * c.opacity_weight * off
         return terms
 
     def _seen(
@@ -181,14 +182,14 @@ class SRN(RayMethod):
     ) -> tuple[Float[Tensor, "member ray"], Float[Tensor, "member ray 3"], Float[Tensor, "member ray"]]:
         """Distance, colour and opacity of rays, which start at slightly random distances with a generator."""
         c, shape = self.config, origins.shape[:2]
-        start = torch.full(shape, c.start_distance, device=self.device)
+        start = torch.full(shape, START_DISTANCE, device=self.device)
         if c.start == "box":
             rays = Rays(origins.flatten(0, 1), directions.flatten(0, 1), start.flatten())
             enter, leave = rays.through_box(torch.tensor(self.frame.bounds, device=self.device))
             enter = torch.where(enter < leave, enter, 0.5 * (enter + leave))  # close to the box, where a ray misses it
             start = start.maximum(enter.view(shape))
         if generator is not None:
-            start = start + c.start_deviation * torch.randn(shape, generator=generator).to(start)
+            start = start + START_DEVIATION * torch.randn(shape, generator=generator).to(start)
         distance = self.marcher(layers, origins, directions, start)
         features = scene_features(layers, origins + distance[..., None] * directions)
         seen = self.pixel_generator(features)
@@ -268,11 +269,11 @@ class SRN(RayMethod):
         def error(code: Float[Tensor, " code"]) -> Tensor:
             rays = rays_through(photographs, c.fit_rays, False, generator).to(self.device)
             terms = self._errors(code[None], [rays], [scene.frame.background])
-            return torch.stack([*terms.values()]).sum() + c.code_weight * code.square().mean()
+            return torch.stack([*terms.values()]).sum() + CODE_WEIGHT * code.square().mean()
 
         known = self.codes.rows.detach()[self.codes.learnt]
         some = torch.randperm(len(known), generator=self.random(3))[:MAX_CANDIDATES]
         candidates = torch.cat([self.codes.average[None], known[some.to(known.device)]])
         with torch.no_grad():
             errors = torch.stack([error(code) for code in candidates])
-        return fitted(candidates[int(errors.argmin())], error, c.code_steps, c.code_learning_rate)
+        return fitted(candidates[int(errors.argmin())], error, c.code_steps, CODE_LEARNING_RATE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
@@ -24,7 +24,7 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important
-from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Seed, Share, Steps, Width, between, changed
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod, seeded
@@ -39,6 +39,7 @@ Components = Annotated[int, between(1, 1024)]  # of each factor
 
 TV_DENSITY_WEIGHT = 0.02  # weight of density's total variation, in the open
 TV_APPEARANCE_WEIGHT = 0.02  # weight of appearance's total variation, in the open
+DENSITY_SCALE = 25.0  # factor behind the softplus, the code's; higher learns density faster
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,6 @@ class Config:
     feature_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the features' encoding, the code's
     direction_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the directions' encoding, the code's
     density_shift: Annotated[float, between(-30, 30)] = -7.0  # shift ahead of the softplus; higher begins denser
-    density_scale: Positive = 25.0  # factor behind the softplus, the code's; higher learns density faster
     step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # sample distance over node distance; larger is faster
     rays_per_step: BatchSize = 4096  # rays in a step at most, section 5; more reduce noise, and cost time
     open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 17  # the same where there is no bound
@@ -141,7 +141,7 @@ class TensorField(Field):
         c, places = self.config, self.places(points)
         inside = ((places > 0) & (places < 1)).all(-1)  # points before the plane of a forward capture are on it
         total = self.density_grid(places, summed=True)[:, 0]
-        density = c.density_scale * nn.functional.softplus(total + c.density_shift) * inside
+        density = DENSITY_SCALE * nn.functional.softplus(total + c.density_shift) * inside
         return density * self.space.stretch(points) if self.space.is_open else density, places
 
     def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
@@ -201,20 +201,19 @@ class TensoRF(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05)
-        c = Config(occupancy, initial_resolution=96, final_resolution=200, open_final_resolution=320)
-        c = replace(c, appearance_components=16, hidden_width=64, feature_frequencies=0, density_shift=-8.0)
-        c = replace(c, open_samples_per_step=1 << 15, step_ratio=1.0, weight_threshold=1e-3)
-        return replace(c, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8)
+        return changed(Config(), samples_per_step=1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05,
+            initial_resolution=96, final_resolution=200, open_final_resolution=320, appearance_components=16,
+            hidden_width=64, feature_frequencies=0, density_shift=-8.0, open_samples_per_step=1 << 15, step_ratio=1.0,
+            weight_threshold=1e-3, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Few components and nodes, all upsamplings, a grid of three sizes, within some twenty quick steps."""
-        occupancy = OccupancyNumbers(4096, occupancy_resolution=16, occupancy_threshold=0.005)
-        c = Config(occupancy, initial_resolution=8, final_resolution=16, open_final_resolution=16)
-        c = replace(c, density_components=4, appearance_components=6, appearance_features=8, hidden_width=16)
-        c = replace(c, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0)
-        return replace(c, rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)
+        return changed(
+            Config(), samples_per_step=4096, occupancy_resolution=16, initial_resolution=8, final_resolution=16,
+            open_final_resolution=16, density_components=4, appearance_components=6, appearance_features=8,
+            hidden_width=16, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0,
+            rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
