@@ -166,10 +166,8 @@ class NeRFW(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        return changed(
-            Config(), **CPU_BACKBONE, coarse_samples=64, fine_samples=64,
-            transient_layers=2, transient_width=32, transient_start=0.1, beta_min=0.1,
-        )  # fmt: skip
+        return changed(Config(), **CPU_BACKBONE, coarse_samples=64, fine_samples=64, transient_layers=2,
+            transient_width=32, transient_start=0.1, beta_min=0.1)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

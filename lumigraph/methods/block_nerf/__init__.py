@@ -103,20 +103,16 @@ class BlockNeRF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        return changed(
-            Config(), **CPU_BACKBONE, coarse_samples=128, fine_samples=128, rays_per_step=4096,
-            visibility_layers=2, visibility_width=64, head_layers=1, head_width=16,
-            pose_penalty=0.0, final_pose_penalty=0.0, warmup_steps=RISE, huber_delta=0.3,
-        )  # fmt: skip
+        return changed(Config(), **CPU_BACKBONE, coarse_samples=128, fine_samples=128, rays_per_step=4096,
+            visibility_layers=2, visibility_width=64, head_layers=1, head_width=16, pose_penalty=0.0,
+            final_pose_penalty=0.0, warmup_steps=RISE, huber_delta=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with tiny networks, every part of it, within some twenty quick steps."""
-        return changed(
-            Config(), **TINY_BACKBONE, refine_cameras=True, residual_masks=True, appearance_code=4,
+        return changed(Config(), **TINY_BACKBONE, refine_cameras=True, residual_masks=True, appearance_code=4,
             exposure_frequencies=2, visibility_frequencies=3, visibility_layers=1, visibility_width=16,
-            warmup_steps=RISE, pose_penalty=1.0,
-        )  # fmt: skip
+            warmup_steps=RISE, pose_penalty=1.0)  # fmt: skip
 
     # Learning
 

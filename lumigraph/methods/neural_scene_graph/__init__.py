@@ -98,19 +98,16 @@ class NeuralSceneGraph(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
-        return changed(
-            Config(), **CPU_BACKBONE, class_log2_hashmap_size=15, class_max_resolution=96, code_width=16,
-            code_weight=1e-3, box_samples=16, box_scale=1.1, pose_input="heading", symmetric=True, huber_delta=0.3,
-        )  # fmt: skip
+        return changed(Config(), **CPU_BACKBONE, class_log2_hashmap_size=15, class_max_resolution=96, code_width=16,
+            code_weight=1e-3, box_samples=16, box_scale=1.1, pose_input="heading", symmetric=True,
+            huber_delta=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and networks with corrections of poses, within some twenty quick steps."""
-        return changed(
-            Config(), **TINY_BACKBONE | {"final_learning_rate": 2e-3}, class_log2_hashmap_size=10,
+        return changed(Config(), **TINY_BACKBONE | {"final_learning_rate": 2e-3}, class_log2_hashmap_size=10,
             class_max_resolution=16, code_width=4, box_samples=8, box_scale=1.1, pose_input="heading",
-            refine_tracks=True,
-        )  # fmt: skip
+            refine_tracks=True)  # fmt: skip
 
     # The graph
 

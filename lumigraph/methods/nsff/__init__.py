@@ -107,11 +107,9 @@ class NSFF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables instead of networks, one neighbour in a step, fewer levels, samples and cells."""
-        return changed(
-            changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, levels=6, max_resolution=192,
-            steps_per_diagonal=192, samples_per_step=1 << 13, occupancy_resolution=64,
-            both_ways=False, neighbours=1, max_flow=0.3, prior_interval=0.3,
-        )  # fmt: skip
+        return changed(changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, levels=6, max_resolution=192,
+            steps_per_diagonal=192, samples_per_step=1 << 13, occupancy_resolution=64, both_ways=False, neighbours=1,
+            max_flow=0.3, prior_interval=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

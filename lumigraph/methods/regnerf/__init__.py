@@ -147,13 +147,12 @@ class RegNeRF(FieldMethod):
     def cpu_preset(cls) -> Any:
         """A hash table, for after a laptop's minutes a network is still a blur; a smaller network for objects of few
         photographs. Fewer patches, and a larger share of the budget for what the paper does in its first steps."""
-        return changed(
-            Config(**CPU_NETWORK), depth=6, skip_layer=3, unseen_patches=8, annealing=0.25, depth_settling=0.25,
-            depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5, density_noise=0.0,
-            gradient_clip=0.0, coarse_to_fine=0.9, field="auto", table=CPU_HASH["table"], steps=CPU_HASH["steps"],
-            table_width=32, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15,
-            table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3,
-        )  # fmt: skip
+        return changed(Config(**CPU_NETWORK), depth=6, skip_layer=3, unseen_patches=8, annealing=0.25,
+            depth_settling=0.25, depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5,
+            density_noise=0.0, gradient_clip=0.0, coarse_to_fine=0.9, field="auto", table=CPU_HASH["table"],
+            steps=CPU_HASH["steps"], table_width=32, samples_per_step=1 << 15, transmittance_threshold=1e-3,
+            table_occupancy_threshold=0.15, table_learning_rate=2e-2, hash_weight_decay=0.3,
+            huber_delta=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
