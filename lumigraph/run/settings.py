@@ -114,33 +114,41 @@ class Settings:
 
 
 def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
-    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. Options
-    that are constants now, by their names in capitals beside the Config or a part of it, are left out, with a warning
-    of another value."""
-    found, owners = dict(leaves(said)), list[type]()
+    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. What is a
+    constant now, by its name in capitals beside the Config or a part of it, is left out, with a warning of another
+    value."""
+    parts = [*parts_of(kind)]
+    modules = [vars(sys.modules[part.__module__]) for part in parts]
+    known = {name for part in parts for name in hints(part)}
+
+    def constants(name: str) -> list[Any]:
+        return [module[name.upper()] for module in modules if name.upper() in module and name not in known]
+
+    def leaves(said: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+        for name, value in said.items():
+            yield from leaves(value) if isinstance(value, dict) and not constants(name) else [(name, value)]
 
     def placed(part: Any) -> dict[str, Any]:
-        owners.append(part)
         inner = {name: held for name, held in hints(part).items() if is_dataclass(held)}
-        own = {name: found.pop(name) for name in hints(part).keys() - inner if name in found}
+        own = {name: found.pop(name) for name in hints(part) if name in found and name not in inner}
         return own | {name: placed(held) for name, held in inner.items()}
 
+    found = dict(leaves(said))
     made = placed(kind)
-    modules = [vars(sys.modules[owner.__module__]) for owner in owners]
     for name, value in found.items():
-        constants = [module[name.upper()] for module in modules if name.upper() in module]
-        if not constants:
+        if not (values := constants(name)):
             made[name] = value
-        elif value not in map(msgspec.to_builtins, constants):
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constants[0])} now"
+        elif value not in map(msgspec.to_builtins, values):
+            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(values[0])} now"
             warnings.warn(text, LumigraphWarning, stacklevel=2)
     return made
 
 
-def leaves(said: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Values of nested JSON that are no dictionaries, by their names."""
-    for name, value in said.items():
-        yield from leaves(value) if isinstance(value, dict) else [(name, value)]
+def parts_of(kind: Any) -> Iterator[Any]:
+    """A dataclass and those that it holds."""
+    yield kind
+    for part in filter(is_dataclass, hints(kind).values()):
+        yield from parts_of(part)
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
