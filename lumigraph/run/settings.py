@@ -119,14 +119,15 @@ def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[s
     value."""
     parts = [*parts_of(kind)]
     modules = [vars(sys.modules[part.__module__]) for part in parts]
-    known = {name for part in parts for name in hints(part)}
+    known = {name: held for part in parts for name, held in hints(part).items()}
 
     def constants(name: str) -> list[Any]:
         return [module[name.upper()] for module in modules if name.upper() in module and name not in known]
 
     def leaves(said: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         for name, value in said.items():
-            yield from leaves(value) if isinstance(value, dict) and not constants(name) else [(name, value)]
+            is_part = isinstance(value, dict) and is_dataclass(known.get(name, kind)) and not constants(name)
+            yield from leaves(value) if is_part else [(name, value)]
 
     def placed(part: Any) -> dict[str, Any]:
         inner = {name: held for name, held in hints(part).items() if is_dataclass(held)}

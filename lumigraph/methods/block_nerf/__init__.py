@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField
 from ...components.sampling.cone_sampler import ConeSampler
@@ -23,7 +23,7 @@ from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.schedules import RISE
+from ...components.training.schedules import RISE, held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, changed
 from ...method import FieldMethod, seeded
@@ -70,7 +70,7 @@ FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 class BlockNeRF(FieldMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | FrustumField
     in_blocks = True
 

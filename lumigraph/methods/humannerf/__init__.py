@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.hash_field import HashNumbers
 from ...components.sampling.occupancy_sampler import StepNumbers
 from ...components.sampling.samplers import sampling_bytes
@@ -19,6 +19,7 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
 from ...components.training.photometric import backdrop
+from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
 from ...files.ranges import Seed, changed
 from ...method import FieldMethod, Pass, seeded
@@ -46,7 +47,7 @@ class Config:
 class HumanNeRF(Articulated, FieldMethod):
     """A canonical field, and the way to it from a body in any pose."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: PosedField
 
     def __init__(self, frame: Frame, config: Any = None):

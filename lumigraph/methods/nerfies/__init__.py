@@ -13,14 +13,14 @@ from torch.nn.functional import pad, softplus
 
 from ...camera.rays import Rays
 from ...components.fields.appearance import AppearanceCodes
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import BandSchedule, joining_of
+from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between, changed
 from ...method import FieldMethod, Pass, seeded
@@ -79,7 +79,7 @@ class Config:
 class Nerfies(FieldMethod):
     """A canonical scene, and a field of motions from each moment to it."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: WarpedField
     background_points: Tensor
     grows = ("background_points",)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from ...camera.rays import Look, Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import CoordinateField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
@@ -21,6 +21,7 @@ from ...components.sampling.sampling import stratified
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.schedules import held_decay
 from ...composition.composed import union
 from ...datasets.scene import Batch, Frame, Scene
 from ...datasets.tracks import BoxTrack, GraphNode, TrackEdit, TrackEdits, nodes_of
@@ -65,7 +66,7 @@ class NeuralSceneGraph(FieldMethod):
     found:       tracks and codes of instances that were found in another scene's photographs
     """
 
-    Config, learning_rate, accepts = Config, backbone_decay, (Scene, TrackEdits)
+    Config, learning_rate, accepts = Config, held_decay, (Scene, TrackEdits)
     further_bytes = staticmethod(sampling_bytes)
     network: HashField | CoordinateField
     rays_per_chunk: ClassVar[int] = 4096  # type: ignore[misc]

@@ -12,10 +12,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera.rays import Rays, Rendering, Samples
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
+from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
 from ...method import FieldMethod, seeded
@@ -78,7 +79,7 @@ class Hop(NamedTuple):
 class NSFF(FieldMethod):
     """Two fields: one stands still, and one knows for each point and moment where it was and where it goes."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: BlendedField
     known_moments: Tensor
 

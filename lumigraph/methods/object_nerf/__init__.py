@@ -18,7 +18,7 @@ from torch.nn.functional import max_pool3d, softplus
 
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.appearance import CodeWidth
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import CoordinateField, LatentField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.fields.instance_codes import InstanceCodes
@@ -27,6 +27,7 @@ from ...components.sampling.hierarchical_sampler import HierarchicalSampler, Ray
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import huber
+from ...components.training.schedules import held_decay
 from ...composition.composed import kept, union
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
@@ -69,7 +70,7 @@ REGION_DILATION = 2  # cells around, whose soft edge goes along
 class ObjectNeRF(FieldMethod):
     """A scene that can be taken apart by the instances of its photographs' masks."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | CoordinateField
     branch: ObjectTable | LatentField
 
