@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from ..system.progress import counting
 from . import compressed_ply, fourdgs, glb, moving_ply, ply, sog, splat, spz, streamed_sog, usd
 from .checks import checked, without_unsound
 
-WRITERS = {
+WRITERS: dict[str, Callable[..., None]] = {
     ".compressed.ply": compressed_ply.write,
     ".ply": ply.write,
     ".splat": splat.write,

@@ -43,9 +43,8 @@ def exponential_decay(method: Any, step: int, progress: float) -> float:
 
 
 def held_decay(method: Any, step: int, progress: float) -> float:
-    """`Method.learning_rate` that is `held`, by the numbers of the Config."""
-    c = method.config
-    rise = getattr(c, "warmup_steps", RISE)
+    """`Method.learning_rate` that is `held`, by the numbers of the Config or of its backbone."""
+    c, rise = getattr(method.config, "backbone", method.config), getattr(method.config, "warmup_steps", RISE)
     return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start, rise)
 
 
