@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -197,22 +198,8 @@ def train(
     made = command("train", method, scene, output=output, **options)
     bar = NotebookBar() if progress is None and in_notebook() else None
     told = progress or bar
-    (folder, code), _ = quietly(lambda: made.learn(Told(told) if told else None))
+    (folder, code), _ = quietly(lambda: made.learn(told and SimpleNamespace(asked=False, note=told)))
     finished(code)
     if bar:
         bar.end()
     return open(folder)
-
-
-class Told:
-    """A Watch that tells a function of each step, and never asks training to yield."""
-
-    asked = False
-
-    def __init__(self, progress: Progress):
-        self.progress = progress
-
-    def give_way(self, stopping: Callable[[], object]) -> None: ...
-
-    def note(self, step: int, progress: float, row: dict[str, Any]) -> bool:
-        return bool(self.progress(step, progress, row))

@@ -14,11 +14,11 @@ from .. import methods
 from ..budget import Budget
 from ..errors import LumigraphError
 from ..files import claim
+from ..files.options import DeviceOption, Overwrite, ReaderOption, SeedOption, StepsOption, needed, option
 from ..files.ranges import Count, Downscale, Scales, Seconds, Seed, Share, Steps
 from ..training.options import DEFAULT_SECONDS
 from .capture import posed
 from .common import choose_device, preset_device, say, scene_name, show, show_table
-from .options import DeviceOption, Overwrite, ReaderOption, SeedOption, StepsOption, needed, option
 
 FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
 
@@ -375,7 +375,7 @@ class BenchShapes:
             Cell(name, scene_name(place), place, budget, self.seed)
             for place in map(place_of, self.shapes)
             for name in names
-            if not (is_folder(place) and learns_one(name))
+            if not (Path(place).is_dir() and learns_one(name))
         ]
         if code := conduct(cells, settings, self.output, say):
             return code
@@ -384,10 +384,6 @@ class BenchShapes:
         measure(measured, self.members, self.points, self.cells, self.output, say)
         show({"table": str(self.output / "shapes.md"), "figures": str(self.output / "shapes.json")})
         return 0
-
-
-def is_folder(place: str) -> bool:
-    return Path(place).is_dir()
 
 
 def learns_one(name: str) -> bool:

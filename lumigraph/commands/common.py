@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from .. import methods
-from ..budget import Budget, Quality, about_quality
+from ..budget import about_quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
 from ..files.names import next_free as next_free
@@ -69,11 +69,6 @@ def value_of(name: str, arguments: Sequence[str], default: str) -> str:
         if argument == name and i + 1 < len(arguments):
             return arguments[i + 1]
     return default
-
-
-def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
-    """The steps of --quality for a method on its data."""
-    return Budget(method.steps_for(quality, data), quality=quality)
 
 
 def quality_of(kind: Any) -> str:

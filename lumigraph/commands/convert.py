@@ -12,9 +12,9 @@ from tyro.conf import Positional
 
 from ..derive.options import ConvertOptions
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, needed
 from .common import choose_device, method_config, say, show_table, typed
 from .compress import size
-from .options import DeviceOption, needed
 from .results import Reports, Result
 
 LIST_WIDTH, INDENT = 80, 12  # letters

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option
 from ..files.ranges import Count, Downscale, Seconds, Steps, between
 from .common import choose_device, say, scene_name, show
-from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option
 
 Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 OCTAVES = tuple(2.0**octave for octave in range(8))  # scales of encodings, 1 to 128

@@ -26,9 +26,9 @@ from ..export.options import (
     SplatsOptions,
 )
 from ..files import claim
+from ..files.options import DeviceOption, Overwrite, Set, SourceOption, needed, option
 from ..files.ranges import between
 from .common import choose_device, say, show
-from .options import DeviceOption, Overwrite, Set, SourceOption, needed, option
 from .results import Exported, Reports
 
 

@@ -13,6 +13,7 @@ from .. import methods
 from ..budget import Quality, given_budget
 from ..errors import LumigraphError
 from ..files.names import counted
+from ..files.options import ViewerOptions, needed, option
 from ..training.options import BlockOptions, TrainOptions
 from .capture import posed
 from .common import (
@@ -27,7 +28,6 @@ from .common import (
     show,
     typed,
 )
-from .options import ViewerOptions, needed, option
 from .results import Output
 
 
@@ -138,8 +138,8 @@ class Train(ViewerOptions, TrainOptions, Output):
         """
         from ..opening import open_dataset
         from ..run import check_new
-        from ..training import fit
         from ..training.beginning import begin_run, check_source
+        from ..training.loop import fit
         from .outcome import show_outcome
         from .view import end_training, keep_showing, watching
 

@@ -12,10 +12,10 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, Set, ViewerToken, needed, option
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
 from .common import choose_device, show
-from .options import DeviceOption, Set, ViewerToken, needed, option
 
 
 @dataclass(frozen=True)
