@@ -164,7 +164,7 @@ class ExplainLightField:
         folder = self.output or run.folder / "lightfield"
         for file in ("lightfield.png", "lightfield.svg", "lightfield.json"):
             claim(folder / file, "figure", self.overwrite)
-        name, camera = view_of(run, "test", self.view)
+        name, camera = run.find_view("test", self.view)
         method = controlled(run, run.method(choose_device(self.device)), self.settings)
         camera = camera.resized(self.size / int(camera.size.max())).to(method.device)
         focus = focal_distance(method, camera)
@@ -215,7 +215,7 @@ class ExplainRay:
         from ..system.progress import counting
 
         run = Run(self.run_folder)
-        name, camera = view_of(run, self.split, self.view)
+        name, camera = run.find_view(self.split, self.view)
         x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         for file in (output, output.with_suffix(".json")):
@@ -318,12 +318,6 @@ class ExplainTemplate:
         draw(folder, f"{run.title}: train, move, continue", first, found)
         show({f"{x.method}, {x.stage}": str(x) for x in found} | {"files": str(folder)})
         return 0
-
-
-def view_of(run: Any, split: str, view: str) -> tuple[str, Any]:
-    """Name and Camera of a photograph, by its name or number in a split of a Run."""
-    number = run.find_view(split, view)
-    return run.view_names()[split][number], run.cameras()[split][number]
 
 
 What = (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..budget import Budget, given_budget
+from ..budget import Budget
 from ..errors import LumigraphError
 from ..files.options import RunOption, ViewerOptions
 from ..training.options import ResumeOptions
@@ -64,9 +64,8 @@ class Resume(ViewerOptions, ResumeOptions):
                 f"{run.folder} was made by a prior and learns nothing itself; go on with the prior: "
                 + typed("resume", made.prior)
             )
-        given = given_budget(self.steps, self.seconds, self.quality)
         if self.quality is None:
-            budget = budget_from_now(run, given)
+            budget = budget_from_now(run, self.budget)
         device = choose_device(run.settings.device if self.device == "same" else self.device)
         method, data = run.new_method(device), run.dataset(self.scene)
         if self.quality is not None:

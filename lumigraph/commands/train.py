@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
-from ..budget import Quality, given_budget
+from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.names import counted
 from ..files.options import ViewerOptions, needed, option
@@ -54,7 +54,7 @@ def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | No
         device = torch.device("cuda" if train.device == "gpu" else train.device)
     config = method_config(train, methods.check(blocks.field or train.method))
     run, plan, workers = begin_blocks(source, places, train.method, config, device, train, blocks, train.output)
-    show_plan(run, plan, given_budget(train.steps, train.seconds, train.quality))
+    show_plan(run, plan, train.budget)
     return run, train_all(run, plan, workers)
 
 

@@ -94,9 +94,9 @@ class Loaded:
 
     def camera(self, view: str | None) -> Camera:
         """Camera of a training photograph by name or number; None for the one in the middle of all."""
-        train = self.cameras["train"]
-        middle = view is None
-        return train[Surroundings(train, self.frame).middle if middle else self.opened.find_view("train", view or "")]
+        if view is None:
+            return self.cameras["train"][Surroundings(self.cameras["train"], self.frame).middle]
+        return self.method.refined(self.opened.find_view("train", view)[1])
 
     def unwanted(self, gaussians: Gaussians, crop: Crop | None) -> dict[str, Bool[Tensor, " gaussian"]]:
         """Masks of the Gaussians to remove, by reason. Raises LumigraphError if none is left."""

@@ -142,8 +142,8 @@ class Opened(ABC):
         """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         return {}
 
-    def find_view(self, split: str, view: str) -> int:
-        """Number of a photograph in a split, by its name or number. Raises LumigraphError if there is none."""
+    def find_view(self, split: str, view: str) -> tuple[str, Camera]:
+        """Name and camera of a photograph, by its name or number in a split. Raises LumigraphError if there is none."""
         names = self.view_names().get(split, [])
         if not names:
             raise LumigraphError(f"{self.path} has no views in the split {split!r}; choose another --split")
@@ -153,7 +153,7 @@ class Opened(ABC):
                 f"There is no view {view!r} in the split {split!r} of {self.path}; give --view a number from 0 to "
                 f"{len(names) - 1}, or a name such as {names[0]}"
             )
-        return number
+        return names[number], self.cameras()[split][number]
 
     def survey(self, cameras: Camera) -> Camera:
         """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
