@@ -200,13 +200,7 @@ class BenchMethods(Cells):
         return self.conduct(cells, settings)
 
 
-@dataclass(frozen=True)
-class Place:
-    """A scene: its source, its short name, and the name of its collection, if any."""
-
-    source: str
-    scene: str
-    collection: str = ""
+Place = tuple[str, str, str]  # a scene: its source, its short name, and the name of its collection, if any
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,13 +280,13 @@ class BenchViews(Cells):
         from ..opening import kind_of, open_dataset, sources_of
 
         if kind_of(source) is not Collection:
-            yield Place(source, scene_name(source))
+            yield source, scene_name(source), ""
             return
         collection, of_member = open_dataset(source), sources_of(source)
         assert isinstance(collection, Collection)
         held_out = [collection.names[i] for i in collection.splits["test"].tolist()]
         for name in evenly(held_out, self.members):
-            yield Place(of_member[name], scene_name(name), scene_name(source) + MEMBERS)
+            yield of_member[name], scene_name(name), scene_name(source) + MEMBERS
 
     def cells_of(
         self, place: Place, names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
@@ -300,11 +294,12 @@ class BenchViews(Cells):
         """A place's cells: each number of photographs, each seed, each method."""
         from ..lab.benchmark.cell import Cell
 
-        there = self.there(place.source)
-        for number in self.possible(place.source, there):
+        source, scene, collection = place
+        there = self.there(source)
+        for number in self.possible(source, there):
             for seed in self.seeds:
                 for name in names:
-                    cell = Cell(name, place.scene, place.source, budget, seed, number, place.collection)
+                    cell = Cell(name, scene, source, budget, seed, number, collection)
                     if name in learnt:  # a prior gets all photographs as input
                         cell = replace(cell, views=number or there, prior=str(learnt[name][seed]))
                     yield cell

@@ -58,22 +58,15 @@ class ViewCommand:
 
 def page_of(opened: Any, method: Any, cameras: Any) -> Any:
     """A function that makes the page of a baked method; `None` for any other method, and before it is baked."""
-    from ..export.page import browsable, is_baked
+    from ..export.page import browsable, is_baked, volume_bytes
+    from ..paths.opening import opening_of_scene
 
-    if not is_baked(method):
-        return None
     try:
-        volume, _ = browsable(method)
+        volume = browsable(method)[0] if is_baked(method) else None
     except LumigraphError:
         return None
-
-    def page() -> bytes:
-        from ..export.page import volume_bytes
-        from ..paths.opening import opening_of_scene
-
-        return volume_bytes(volume, opening_of_scene(opened.title, cameras["train"], opened.frame))
-
-    return page
+    opening = opening_of_scene(opened.title, cameras["train"], opened.frame)
+    return volume and (lambda: volume_bytes(volume, opening))
 
 
 def behind_of(opened: Any, method: Any, cameras: Any) -> Any:
