@@ -200,9 +200,6 @@ class BenchMethods(Cells):
         return self.conduct(cells, settings)
 
 
-Place = tuple[str, str, str]  # a scene: its source, its short name, and the name of its collection, if any
-
-
 @dataclass(frozen=True, kw_only=True)
 class BenchViews(Cells):
     """Train methods on fewer and fewer photographs of a scene, and compare the same held-out views.
@@ -272,8 +269,8 @@ class BenchViews(Cells):
                 cells += trained
         return learnt, cells
 
-    def places(self, source: str) -> Iterator[Place]:
-        """The source itself, or held-out members of the collection that it is."""
+    def places(self, source: str) -> Iterator[tuple[str, str, str]]:
+        """Source, short name and collection of the source, or of held-out members of the collection that it is."""
         from ..datasets.collection import Collection
         from ..geometry import evenly
         from ..lab.benchmark.cell import MEMBERS
@@ -289,7 +286,7 @@ class BenchViews(Cells):
             yield of_member[name], scene_name(name), scene_name(source) + MEMBERS
 
     def cells_of(
-        self, place: Place, names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
+        self, place: tuple[str, str, str], names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
     ) -> Iterator[Cell]:
         """A place's cells: each number of photographs, each seed, each method."""
         from ..lab.benchmark.cell import Cell

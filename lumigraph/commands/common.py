@@ -76,11 +76,8 @@ def quality_of(kind: Any) -> str:
     from ..method import RayMethod
 
     unit = "pixel" if issubclass(kind, RayMethod) else "photograph"
-    efforts = {
-        name: f": {effort.passes:g} epochs over all {unit}s, at least {effort.at_least:,} steps"
-        for name, effort in kind.efforts.items()
-    }
-    return about_quality(efforts)
+    said = ": {0.passes:g} epochs over all {1}s, at least {0.at_least:,} steps"
+    return about_quality({name: said.format(effort, unit) for name, effort in kind.efforts.items()})
 
 
 def say(text: str) -> None:

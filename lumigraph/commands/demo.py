@@ -64,11 +64,12 @@ class Demo:
         film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit, FilmOptions(depth=True))
         report = write_report(run)
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
-        rows = {
-            f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
-            "film": str(orbit),
-            "report": str(report),
-            "run": str(run.folder),
-        }
-        show(rows)
+        show(
+            {
+                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
+                "film": str(orbit),
+                "report": str(report),
+                "run": str(run.folder),
+            }
+        )
         return 0

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subco
 from ..errors import LumigraphError
 from ..files.options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option
 from ..files.ranges import Count, Downscale, Seconds, Steps, between
-from .common import choose_device, say, scene_name, show
+from .common import choose_device, scene_name, show
 
 Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 OCTAVES = tuple(2.0**octave for octave in range(8))  # scales of encodings, 1 to 128
@@ -224,7 +224,9 @@ class ExplainRay:
         camera = method.refined(camera)
         with counting("Sampling the ray"):
             sight = along_ray(method, camera, pixel)
-        sight = sight.beside(self._photograph(run, name))
+        scene = run.photographs(self.scene, "The figure does without the photograph")
+        if scene is not None:
+            sight = sight.beside(scene.photograph(scene.names.index(name)).before(run.frame.background))
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
         write_bytes(output, standalone(ray_figure(sight, title)), "figure")
         about: dict[str, Any] = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
@@ -232,18 +234,6 @@ class ExplainRay:
         write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
         return 0
-
-    def _photograph(self, run: Any, name: str) -> Any:
-        """The photograph before the run's background, or None if it was moved and --scene is not given."""
-        try:
-            scene = run.scene(self.scene)
-            photograph = scene.photograph(scene.names.index(name))
-        except LumigraphError as error:
-            if self.scene:
-                raise
-            say(f"The figure does without the photograph: {error}")
-            return None
-        return photograph.before(run.frame.background)
 
 
 @dataclass(frozen=True)

@@ -102,9 +102,8 @@ class Loaded:
         """Masks of the Gaussians to remove, by reason. Raises LumigraphError if none is left."""
         part = self.part
         strength = (STRENGTH if part.clean else 0.0) if part.strength is None else part.strength
-        reasons = unwanted(
-            gaussians, crop, part.max_scale, floaters(gaussians, self.photographers, self.frame, strength)
-        )
+        floating = floaters(gaussians, self.photographers, self.frame, strength)
+        reasons = unwanted(gaussians, crop, part.max_scale, floating)
         if len(gaussians) and gone(reasons).all():
             raise LumigraphError(
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
@@ -149,10 +148,7 @@ def export_splats(
     part: Keeping = Keeping(),
     scaling: Scaling = Scaling(),
 ) -> Gaussians:
-    """Write a cloud as it is at one moment, and return it. A splat file's own numbers stay as they are.
-
-    settings: controls, NAME=VALUE
-    """
+    """Write a cloud as it is at one moment, and return it; a splat file's numbers stay. settings: controls, NAME=VALUE"""
     if isinstance(opened, SplatFile):
         if settings:
             raise LumigraphError(f"{opened.path} is a file of Gaussians, which has no controls; leave out --set")

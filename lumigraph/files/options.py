@@ -33,16 +33,16 @@ def option_name(field: str, kind: Any) -> str:
     return next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), field).replace("-", "_")
 
 
-DEVICE = "Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."
-DeviceOption = Annotated[str, option("NAME", about=DEVICE)]
+DeviceOption = Annotated[
+    str, option("NAME", about="Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1.")
+]
 BEFORE_READING = "Reduce the photographs by this whole number before reading."
 DownscaleOption = Annotated[Downscale | None, option("N", "to 1100 pixels, if it has over 1320", BEFORE_READING)]
 PHOTOGRAPHS = "Path of the photographs, if they were moved since training."
 PhotographsOption = Annotated[str | None, option("SCENE", "the path used in training", PHOTOGRAPHS)]
 ReaderOption = Annotated[Reader | None, option("NAME", "detected", f"Layout of the folder: {LISTED}.")]
 SeedOption = Annotated[Seed, option("N", about="Seed of all random choices.")]
-INSTEAD = "Train for this number of steps instead."
-StepsOption = Annotated[Steps | None, option("N", "as long as --seconds", INSTEAD)]
+StepsOption = Annotated[Steps | None, option("N", "as long as --seconds", "Train for this number of steps instead.")]
 OVERWRITE = (
     "Replace existing files of other origin too. Unchanged files that Lumigraph wrote are replaced anyway; folders "
     "with other files in them never are."
