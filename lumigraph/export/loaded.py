@@ -148,7 +148,7 @@ def export_splats(
     part: Keeping = Keeping(),
     scaling: Scaling = Scaling(),
 ) -> Gaussians:
-    """Write a cloud as it is at one moment, and return it; a splat file's numbers stay. settings: controls, NAME=VALUE"""
+    """Write a cloud as it is at one moment, and return it; a splat file's numbers stay. settings: NAME=VALUE"""
     if isinstance(opened, SplatFile):
         if settings:
             raise LumigraphError(f"{opened.path} is a file of Gaussians, which has no controls; leave out --set")
