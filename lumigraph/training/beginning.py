@@ -1,4 +1,4 @@
-"""Begin a run: open its data, build its method, decide how long it trains."""
+"""Begin a run: check its data, build its method, decide how long it trains."""
 
 from __future__ import annotations
 
