@@ -252,6 +252,9 @@ def test_meshes_of_moments(run, tmp_path):
     assert (tmp_path / "m-000.ply").read_bytes() != (tmp_path / "m-001.ply").read_bytes()
     assert main([*words, "--set", "time=1"]) == 0
     assert (tmp_path / "m.ply").read_bytes() == (tmp_path / "m-000.ply").read_bytes()
+    pytest.importorskip("coacd")
+    assert main(["export", "collision", run, str(tmp_path / "m.glb"), *words[4:], "--moments", "2"]) == 0
+    assert sorted(x.name for x in tmp_path.glob("*.glb")) == ["m-000.glb", "m-001.glb"]
 
 
 def test_clean_compress_and_compose_keep_the_motion(run, tmp_path):

@@ -32,7 +32,7 @@ from ...method import Method
 from ...run import Run, State
 from ...system.threads import TASKS_FOLDER, Contention
 from ...system.work import at_work
-from ...training import advance
+from ...training.loop import advance
 
 KINDS = "kernel", "operation", "optimizer", "data", "check", "autograd", "Python"
 WHOLE = {"data": "photographs and rays", "check": "finite loss and gradients"}  # parts of a step that are one row

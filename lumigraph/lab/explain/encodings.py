@@ -17,7 +17,7 @@ from ...metrics import psnr
 from ...run import build
 from ...system.progress import track
 from ...system.signals import go_on_unless
-from ...training import fit
+from ...training.loop import fit
 
 UNSCALED_ENCODINGS: tuple[Encoding, ...] = ("none", "basic")
 SCALED_ENCODINGS: tuple[Encoding, ...] = ("positional", "gaussian")

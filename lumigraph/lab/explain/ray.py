@@ -85,10 +85,9 @@ class Sight:
         width, height = self.camera.size[0].tolist()
         return width, height
 
-    def beside(self, photograph: Float[Tensor, "height width 3"] | None) -> Sight:
+    def beside(self, photograph: Float[Tensor, "height width 3"]) -> Sight:
         """The same with the photograph's colour at the pixel."""
-        x, y = self.pixel
-        return self if photograph is None else replace(self, photograph=photograph[y, x])
+        return replace(self, photograph=photograph[self.pixel[1], self.pixel[0]])
 
     def rows(self) -> dict[str, str]:
         """Figures for the text, by name."""

@@ -21,7 +21,7 @@ from ...files import write_bytes, write_json
 from ...method import Method
 from ...run import Run, build
 from ...system.signals import go_on_unless
-from ...training import fit
+from ...training.loop import fit
 
 STAGES = "trained", "moved", "continued", "from nothing"
 
