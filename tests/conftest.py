@@ -47,6 +47,7 @@ shape_checks.install()
 
 from lumigraph.system.allocation import settle_memory  # noqa: E402
 
+gc.set_threshold(20_000)  # at 700, looking for cycles is a seventh of compiling and four fifths of parsing
 settle_memory()  # as commands do: memory that one training step frees is kept for the next
 
 
@@ -70,7 +71,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     LEDGER.methods = len(methods.available())
     gc.collect()
-    gc.freeze()  # what collection made stays to the end; looking through it again takes a second each time
+    gc.freeze()  # looking again and again through what collection made, which stays, takes a second each time
 
 
 @pytest.hookimpl(wrapper=True)
