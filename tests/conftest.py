@@ -21,8 +21,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= {"OMP_NUM_THREADS": "1", "GOMP_SPINCOUNT": "0"}
 
 # Byte code is kept, here and in the processes that tests start: compiling takes each worker 20 s and each process 3 s.
-sys.dont_write_bytecode = False
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    sys.dont_write_bytecode = False
 
 import lumigraph  # noqa: F401  # isort: skip
 import pytest  # isort: skip

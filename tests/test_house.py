@@ -443,9 +443,7 @@ def rooms_table() -> str:
         for name in sorted(rooms):
             path = PACKAGE / name / "__init__.py"
             source = (path if path.is_file() else PACKAGE / f"{name}.py").read_text(encoding="utf-8")
-            rows.append(
-                f"| {number} | `{name}` | {(ast.get_docstring(parsed(source)) or '').partition(chr(10))[0]} |"
-            )
+            rows.append(f"| {number} | `{name}` | {(ast.get_docstring(parsed(source)) or '').partition(chr(10))[0]} |")
     return "\n".join(rows) + "\n"
 
 
