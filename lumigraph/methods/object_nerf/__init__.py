@@ -199,7 +199,7 @@ class ObjectNeRF(FieldMethod):
 
     def without(self, rays: Rays, number: int) -> Look:
         """The scene branch, without what goes with an instance."""
-        if isinstance(self.network, HashField):  # its samplers end rays at the first surface, which may be the instance
+        if self.config.backbone.hashed:  # its samplers end rays at the first surface, which may be the instance
             scene = SceneWithout(self.network, lambda points: self.belongs(points, number))
             return self.sampler.sample(rays, scene)[-1].look(scene)
         look = super().looks(rays)[-1]
@@ -229,7 +229,8 @@ class ObjectNeRF(FieldMethod):
 
     def _region(self, number: int, low: Tensor, high: Tensor, sides: Tensor) -> Bool[Tensor, "x y z"]:
         """Cells of an instance, remembered until it changes."""
-        state = int(self.branch.density_network.weights[0]._version) if isinstance(self.branch, ObjectTable) else 0
+        *_, last = self.branch.parameters()
+        state = last._version  # which each step changes
         if (found := self._regions.get((number, state))) is not None:
             return found
         axes = [(torch.arange(int(n), device=self.device) + 0.5) / n for n in sides]

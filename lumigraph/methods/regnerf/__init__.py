@@ -245,7 +245,7 @@ class RegNeRF(FieldMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
-        if isinstance(self.network, HashField):
+        if self.by_table:
             own = self.network.optimizers_at(c.table_learning_rate, c.hash_weight_decay)
         else:
             own = [clipped(torch.optim.Adam(self.network.parameters(), c.learning_rate), c.gradient_clip)]
