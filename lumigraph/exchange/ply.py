@@ -39,9 +39,7 @@ ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 def read(path: Path, header: Header | None = None) -> Gaussians:
-    """Read text and both binary orders, with any scalar types. Raises LumigraphError for point clouds and truncated
-    files.
-    """
+    """Read text and both binary orders, with any scalars. Raises LumigraphError for point clouds and short files."""
     header = header or read_header(path)
     here = header.properties.get("vertex", [])
     missing = [name for name in [*MEAN, *COLOUR, *OPACITY, *SCALE, *ROTATION] if name not in here]

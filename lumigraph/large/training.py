@@ -26,7 +26,7 @@ from ..budget import Budget
 from ..components.fields.appearance import Appearance
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
-from ..files.locks import held
+from ..files.locks import lock_folder
 from ..method.capabilities import HasGaussians, can
 from ..readers import Places
 from ..system.signals import Interrupt
@@ -61,7 +61,7 @@ def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Condu
     unavailable workers.
     """
     folders = {block.name: place_of(run, block) for block in plan.blocks}
-    with held(run, "trained"), Watching(run, folders, show):
+    with lock_folder(run, "trained"), Watching(run, folders, show):
         if workers.count is not None or workers.address is not None:
             return on_workers(folders, workers)
         found = Conducted({}, {})
@@ -121,7 +121,7 @@ def update(
     """
     if not files.is_file(run / PLAN_FILE):
         raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
-    with held(run, "trained"):
+    with lock_folder(run, "trained"):
         plan = Plan.read(run / PLAN_FILE)
         block = again(plan.block(name), source, places, options, budget)
         task, place = plan.task(block), place_of(run, block)

@@ -104,8 +104,7 @@ class Opened(ABC):
 
     @property
     def open_scene(self) -> Callable[..., Scene] | None:
-        """Function that opens the photographs again, given their present path if they have moved; None without
-        photographs."""
+        """Function that opens the photographs again, given their present path; None without photographs."""
         return None
 
     @property
@@ -119,9 +118,7 @@ class Opened(ABC):
         return size_of(self.path)
 
     def source_gaussians(self) -> Gaussians:
-        """Cloud in the source's frame, in the order of the method's. Raises LumigraphError for a model without
-        Gaussians.
-        """
+        """Cloud in the source's frame, in the order of the method's. Raises LumigraphError without Gaussians."""
         return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix)
 
     def view_names(self) -> dict[str, list[str]]:

@@ -15,7 +15,7 @@ from .. import files, methods
 from ..budget import Budget
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, shown, typed, value_of
+from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, format_value, hints, numbers, typed, value_of
 from ..files.reading import reads
 from ..method import Method
 from ..readers import CapturePart, Unposed
@@ -107,8 +107,7 @@ class Settings:
         return {"format": RUN_FORMAT} | self.said | own | parts
 
     def method_config(self, kind: type[Method], file: Path) -> Any:
-        """The numbers as the Config of a kind of method. file: named in faults for one that is unknown, of another
-        type, or out of range"""
+        """The numbers as the Config of a kind of method. file: named in faults for invalid ones"""
         return typed(kind.Config, without_constants(self.config, kind.Config, file), file, closed=True)
 
 
@@ -122,7 +121,9 @@ def without_constants(said: Any, kind: Any, file: Path | str) -> Any:
         if name in known or name.upper() not in module:
             kept[name] = without_constants(value, known.get(name), file)
         elif msgspec.to_builtins(constant := module[name.upper()]) != value:
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constant)} now"
+            text = (
+                f"{file}: {name} was {format_value(value)} in this training, and is always {format_value(constant)} now"
+            )
             warnings.warn(text, LumigraphWarning, stacklevel=2)
     return kept
 

@@ -164,8 +164,7 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, with their times in seconds, up to the first damaged one. Raises LumigraphError if no frame can
-    be decoded."""
+    """Frames in order, with times in seconds, up to the first damaged one. Raises LumigraphError without any."""
     rate, count = speed(film), 0
     try:
         for frame in film.decode(video=0):
@@ -224,7 +223,7 @@ class Odometer:
         tiles = cut(picture)
         if self._reference is None:
             self._reference = tiles
-        distance = moved(self._reference, tiles)
+        distance = measure_displacement(self._reference, tiles)
         if distance >= REFERENCE_STRIDE:
             self.travelled, self._reference, distance = self.travelled + distance, tiles, 0.0
         return self.travelled + distance
@@ -241,7 +240,7 @@ def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile r
     return (tiles - tiles.mean((1, 2), keepdims=True)) * window[:, None] * window
 
 
-def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
+def measure_displacement(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
     """Mean length of the tiles' displacements by phase correlation; 0 without texture. Tiles are tracked one by one, so
     that walking forward or rolling the camera counts as well."""
     textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > MIN_VARIANCE * WINDOW_MEAN_SQUARE
