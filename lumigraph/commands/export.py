@@ -258,7 +258,7 @@ class ExportSplats(Reports):
             if self.part.crops or self.part.removes:
                 frame = frame_of(written)
                 crop = self.part.crop(frame)
-                written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source), frame, None)
+                written = self.part.of_gaussians(written, crop and crop.transformed(frame.to_source), frame, None)
         else:
             opened = open_any(self.source)
             self.scaling.remember(opened)
