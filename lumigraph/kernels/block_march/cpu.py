@@ -34,9 +34,7 @@ def placed(o, d, t, ball):
 
 @njit(inline="always")
 def nearest(o, d, ball):
-    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared distance to
-    the centre.
-    """
+    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared radius."""
     middle = TWO * ball - HALF
     u, v, w = o[0] - middle, o[1] - middle, o[2] - middle
     along = u * d[0] + v * d[1] + w * d[2]
@@ -95,9 +93,7 @@ def from_sides(x, b, block):
 
 @njit(inline="always")
 def past(x, y, z, d, bx, by, bz, number, block, ball):
-    """Number of steps, at least one, that skip the empty space around a block; conservative, since contracted rays
-    curve.
-    """
+    """Number of steps, at least one, over the empty space around a block; conservative, since rays may curve."""
     if ball == ZERO:
         return beyond(x, y, z, d[0], d[1], d[2], bx, by, bz, block)
     clear = min(from_sides(x, bx, block), from_sides(y, by, block), from_sides(z, bz, block))

@@ -31,9 +31,7 @@ def _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED: tl.constexpr):
 
 @triton.jit
 def _nearest(ox, oy, oz, dx, dy, dz, ball):
-    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared distance to
-    the centre.
-    """
+    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared radius."""
     middle = 2 * ball - 0.5
     u, v, w = ox - middle, oy - middle, oz - middle
     along = u * dx + v * dy + w * dz
@@ -92,9 +90,7 @@ def _cell_of(x, b, B: tl.constexpr):
 
 @triton.jit
 def _voxel_of(x, y, z, bx, by, bz, B: tl.constexpr):
-    """The lowest of the eight voxels around each position, counted within its block, and the fractional position
-    above it.
-    """
+    """The lowest of the eight voxels around each position, within its block, and the fractional position above."""
     cx, fx = _cell_of(x, bx, B)  # one pair a line: Triton 3.6 assigns to no nested tuple
     cy, fy = _cell_of(y, by, B)
     cz, fz = _cell_of(z, bz, B)

@@ -34,7 +34,7 @@ def _colour(harmonics, row, y):
 
 
 @njit(inline="always")
-def _shown(met, weights, count, harmonics, y, asked):
+def _sum_colours(met, weights, count, harmonics, y, asked):
     """Weighted sums of cells' colours. All rows are prefetched first, so that memory latencies overlap."""
     last = harmonics.shape[1] - 1
     for i in range(count):
@@ -77,14 +77,14 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
                         met[waiting], weights[waiting] = row, weight
                         waiting += weight > ZERO
                         if waiting == CELLS_PER_CHUNK:
-                            r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
+                            r_, g_, b_ = _sum_colours(met, weights, waiting, harmonics, y, asked)
                             red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
                     if outside(u2, v2, w2, side) or through < stop:
                         break
                     level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
                     u, v, w, t = u2, v2, w2, end
                 if waiting:
-                    r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
+                    r_, g_, b_ = _sum_colours(met, weights, waiting, harmonics, y, asked)
                     red, green, blue = red + r_, green + g_, blue + b_
             rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue
             distance[r], opacity[r], counts[r] = way, spent, count
