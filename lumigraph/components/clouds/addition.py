@@ -93,7 +93,7 @@ class Addition(Part):
 
     # Rendering
 
-    def shown(
+    def apply_appearance(
         self, method: Any, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
     ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "... 3"]]:
         """Colours over black and the background, under the method's settings."""

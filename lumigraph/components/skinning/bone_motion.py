@@ -155,7 +155,7 @@ class BoneMotion(Part):
         second = torch.where((first * second).sum(-1, keepdim=True) < 0, -second, second)
         return torch.lerp(first, second, share), torch.lerp(self.positions[before], self.positions[after], share)
 
-    def shown(
+    def pose_joints(
         self, method: Any, times: Float[Tensor, " time"]
     ) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
         """Rotations and positions of joints under the method's settings: of the capture, or of a user's poses."""
@@ -182,7 +182,7 @@ class BoneMotion(Part):
 
     def at(self, method: Any, time: float) -> Float[Tensor, "bone 3 4"]:
         """Transforms of the bones at a time under the method's settings."""
-        return self.transforms(*self.shown(method, torch.tensor([time], device=self.times.device)))[0]
+        return self.transforms(*self.pose_joints(method, torch.tensor([time], device=self.times.device)))[0]
 
     # Learning
 
