@@ -44,8 +44,7 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder. Raises LumigraphError for a damaged model, an unsupported camera model, and missing
-    image folders."""
+    """The capture in a folder. Raises LumigraphError for a damaged model, other cameras, and missing images."""
     place = model_folder(folder)
     assert place is not None
     model = read_model(place)
