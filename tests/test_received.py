@@ -246,7 +246,7 @@ def test_a_received_run_does_not_lead_its_files_elsewhere(tmp_path, ball_run):
     (folder / "metrics.jsonl").unlink()
     (folder / "metrics.jsonl").symlink_to(tmp_path / "secret")
     (folder / "renders").symlink_to(tmp_path)
-    with pytest.raises(LumigraphError, match="is a link"), Run(folder).held():
+    with pytest.raises(LumigraphError, match="is a link"), Run(folder).lock():
         pass
     with pytest.raises(LumigraphError, match="is a link"):
         _ = Run(folder).renders

@@ -104,8 +104,7 @@ class Control:
 
 
 def blend(value: str) -> tuple[str, str, float]:
-    """The two choices of a value of a blending control, and its position between them; 0 for a single choice, NaN for
-    text without a position."""
+    """Two choices of a blending control's value, and its position between them; 0 for one choice, NaN if missing."""
     first, *rest = value.split(":")
     if not rest:
         return first, first, 0.0

@@ -25,7 +25,7 @@ from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers,
 from ..components.sampling.spaces import space_of
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.regularizers import normalized_distance
-from ..components.training.schedules import held
+from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
 from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
@@ -238,7 +238,7 @@ class RawNeRF(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, DECAY_START)
+        return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, DECAY_START)
 
     # Being seen
 

@@ -81,7 +81,7 @@ class HumanNeRF(Articulated, FieldMethod):
 
     def posed(self, times: Float[Tensor, " moment"]) -> PosedField:
         """The field in the poses of moments, under the settings."""
-        turns, places = self.bones.shown(self.settings, times)
+        turns, places = self.bones.pose_joints(self.settings, times)
         return self.network.posed(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
 
     def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Pass]:

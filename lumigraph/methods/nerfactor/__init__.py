@@ -27,7 +27,7 @@ from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbe
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber, residuals
-from ...components.training.schedules import falling, held
+from ...components.training.schedules import falling, hold_and_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import (
@@ -376,7 +376,7 @@ class NeRFactor(FieldMethod):
         c = self.config
         spent = min(progress / max(c.geometry_share, 1e-9), 1.0)
         return {
-            "": held(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
+            "": hold_and_decay(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
             "properties": falling(c.learning_rate, c.final_learning_rate, self._over(progress)),
             "light": falling(
                 c.light_rate, c.light_rate * c.final_learning_rate / c.learning_rate, self._over(progress)

@@ -33,7 +33,7 @@ from ...components.training.regularizers import (
     roughness,
     unseen_cameras,
 )
-from ...components.training.schedules import BandSchedule, falling, held, joining_of
+from ...components.training.schedules import BandSchedule, falling, hold_and_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between, changed
 from ...method import FieldMethod, seeded
@@ -254,7 +254,7 @@ class RegNeRF(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
         if self.by_table:
-            return held(c.table_learning_rate, FINAL_TABLE_LEARNING_RATE, step, progress, DECAY_START)
+            return hold_and_decay(c.table_learning_rate, FINAL_TABLE_LEARNING_RATE, step, progress, DECAY_START)
         return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
