@@ -27,7 +27,7 @@ from ..fields.teacher import teacher_of
 from ..training.pose_refinement import PoseRefinement
 from .addition import Addition, Step, TrainingViews
 from .appearance import SplatAppearance
-from .cloud import Cloud, picture_share, thinned
+from .cloud import SH_DEGREE_INTERVAL, SH_DEGREE_INTERVAL_SHARE, TRANSMITTANCE_THRESHOLD, Cloud, picture_share, thinned
 from .dense_points import Points, compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl
 from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
@@ -35,10 +35,6 @@ from .interval_schedule import intervals
 from .moved_cloud import seen_from
 
 BLACK = 0.0, 0.0, 0.0
-SH_DEGREE_INTERVAL = 1000  # steps for each further degree of harmonics, section 7.1; or the share below, if sooner
-SH_DEGREE_INTERVAL_SHARE = 1 / 8  # of the budget
-SSIM_WEIGHT = 0.2  # share of D-SSIM in the loss, eq. 7
-TRANSMITTANCE_THRESHOLD = 1e-4  # transmittance at which a pixel is finished, appendix C
 SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
 NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
 LEAST_PIXELS = 4096  # of a photograph that is reduced

@@ -14,11 +14,8 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
+from ...components.clouds.cloud import SSIM_WEIGHT, HasteNumbers
+from ...components.clouds.cloud_method import BLACK, CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization, round_gaussians
 from ...components.clouds.tidying import Tidying, TidyingNumbers
@@ -35,7 +32,7 @@ from ...method.controls import Control
 from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
 
-TIDYING = TidyingNumbers(limit_anisotropy=True)
+PRUNE_NEAR, LIMIT_SCALE, LIMIT_ANISOTROPY, OBSERVED_HARMONICS = False, False, True, False  # rules of tidying
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
 ISOTROPY_WEIGHT = 0.01  # weight of long Gaussians, which tear at joints
 INITIALIZATION: Initialization = "random"  # an option of older runs; first Gaussians are about the bones
@@ -73,7 +70,7 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         with seeded(c.seed):
             self.skin = SkinnedCloud(frame, c.bones, c.weights)
         self.bones = self.skin.bones
-        self.tidying = Tidying(TIDYING)
+        self.tidying = Tidying(TidyingNumbers(PRUNE_NEAR, LIMIT_SCALE, LIMIT_ANISOTROPY, OBSERVED_HARMONICS))
 
     @classmethod
     def cpu_preset(cls) -> Any:

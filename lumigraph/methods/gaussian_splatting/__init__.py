@@ -9,11 +9,8 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
+from ...components.clouds.cloud import SSIM_WEIGHT, HasteNumbers
+from ...components.clouds.cloud_method import BLACK, CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers

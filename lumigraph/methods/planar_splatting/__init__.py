@@ -16,10 +16,8 @@ from ...camera.rays import Rendering
 from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
 from ...components.clouds.addition import Addition, Step, TrainingViews
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import Cloud, HasteNumbers
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import SSIM_WEIGHT, TRANSMITTANCE_THRESHOLD, CloudMethod
+from ...components.clouds.cloud import SSIM_WEIGHT, TRANSMITTANCE_THRESHOLD, Cloud, HasteNumbers
+from ...components.clouds.cloud_method import CloudMethod
 from ...components.clouds.density_control import RefineNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
