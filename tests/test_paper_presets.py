@@ -809,12 +809,15 @@ def test_the_preset_paper_has_the_published_numbers(name):
 
 
 def number_of(config: Any, path: str) -> Any:
-    """An option by its path in the part of a Config that holds it, or the constant of its name in the part's module."""
+    """An option by its path in the part of a Config that holds it, or the constant of its name beside it."""
     *parts, name = path.split(".")
     owner = config
     for part in parts:
         owner = value_of(owner, part)
-    return value_of(owner, name) if holds(owner, name) else vars(sys.modules[type(owner).__module__])[name.upper()]
+    if holds(owner, name):
+        return value_of(owner, name)
+    modules = [vars(sys.modules[type(group).__module__]) for group in groups_of(owner)]
+    return next(module[name.upper()] for module in modules if name.upper() in module)
 
 
 @pytest.mark.parametrize("name", NAMES)
