@@ -86,7 +86,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "steps.steps_per_diagonal": 192,  # num_samples, from 4 - sqrt(3) to 4 + sqrt(3)
         "table.sh_bands": 1,  # viewdirs: False
     },
-    # dreamgaussian/dreamgaussian, configs/text.yaml. From memory
+    # dreamgaussian/dreamgaussian, configs/text.yaml
     "dream-splats": WORDS
     | {
         "initial_gaussians": 5000,
@@ -585,7 +585,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "tidying.limit_anisotropy": False,
         "tidying.observed_harmonics": False,
     },
-    "pixelnerf": {  # sxyu/pixel-nerf, conf/default.conf and conf/default_mv.conf; the last three from memory
+    "pixelnerf": {  # sxyu/pixel-nerf, conf/default.conf, conf/default_mv.conf, train/train.py and src/util/args.py
         "hidden_width": 512,
         "blocks": 5,
         "view_blocks": 3,
@@ -597,7 +597,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "networks": 2,
         "coarse_loss_weight": 1.0,
         "learning_rate": 1e-4,
-        "members_per_step": 4,
+        "members_per_step": 4,  # from memory; 16 where no option says another
         "rays_per_member": 128,
     },
     "mesh-fit": {  # Nicolet 2021; lambda and a sphere from the release's tutorial, from memory
