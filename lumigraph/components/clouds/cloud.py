@@ -32,10 +32,6 @@ REST_BANDS_SCALE = 1 / 20  # of the harmonics' learning rate, beyond the first b
 
 # Learning rates of 3D Gaussian Splatting, graphdeco-inria/gaussian-splatting, arguments/__init__.py; see `RateNumbers`.
 MEANS_LR, FINAL_MEANS_LR, SH_LR, OPACITIES_LR, SCALES_LR, QUATERNIONS_LR = 1.6e-4, 1.6e-6, 2.5e-3, 0.05, 5e-3, 1e-3
-SH_DEGREE_INTERVAL = 1000  # steps for each further degree of harmonics, section 7.1; or the share below, if sooner
-SH_DEGREE_INTERVAL_SHARE = 1 / 8  # of the budget
-SSIM_WEIGHT = 0.2  # share of D-SSIM in the loss, eq. 7
-TRANSMITTANCE_THRESHOLD = 1e-4  # transmittance at which a pixel is finished, appendix C
 MOST_HASTE = 1.0  # factor on rates in short runs, where it is no option
 
 
