@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from .opening import open_scene as open_scene
     from .run import Opened as Opened
     from .run import Run as Run
-    from .training import fit as fit
+    from .training.loop import fit as fit
     from .volume import composite as composite
 
 __version__ = "0.1.0"

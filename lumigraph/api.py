@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,6 @@ from .method import Method
 from .opening import open_scene
 from .run import Opened
 from .system.progress import Listener, heard_by
-
-Progress = Callable[[int, float, dict[str, Any]], object]
 
 
 class Model:
@@ -104,15 +103,15 @@ class Model:
 
     def convert(self, method: str, output: Path | str, /, **options: Any) -> Model:
         """Run of another method, initialised from this one. options: those of `lumigraph convert`."""
-        return self._derived("convert", output, method, **options)
+        return open(self._made("convert", method, output=output, **options).path)
 
     def compress(self, output: Path | str, /, **options: Any) -> Model:
         """Run of a fraction of the size. options: those of `lumigraph compress`."""
-        return self._derived("compress", output, **options)
+        return open(self._made("compress", output=output, **options).path)
 
     def clean(self, output: Path | str, /, **options: Any) -> Model:
         """Run or splat file without floaters, or cropped. options: those of `lumigraph clean`."""
-        return self._derived("clean", output, **options)
+        return open(self._made("clean", output=output, **options).path)
 
     def metrics(self) -> dict[str, Num[np.ndarray, " row"]]:
         """Training metrics as columns by name, "step" first; NaN in rows without a value. Empty where unknown.
@@ -127,10 +126,6 @@ class Model:
         """Result of a command on what is opened."""
         asked: Reports = command(name, self.opened.path, *arguments, **options)
         return quietly(lambda: asked.of(self.opened), progress)[0]
-
-    def _derived(self, name: str, output: Path | str, *arguments: object, **options: Any) -> Model:
-        """Run or file that a command makes of what is opened."""
-        return open(self._made(name, *arguments, output=output, **options).path)
 
 
 def open(path: str | Path) -> Model:
@@ -149,21 +144,16 @@ def call(name: str, /, *arguments: object, **options: Any) -> dict[str, str]:
     return {title: str(value) for title, value in rows.items()}
 
 
-def capture(
-    photographs: str | Path | Iterable[str | Path],
-    output: str | Path | None = None,
-    progress: Listener | None = None,
-    **options: Any,
-) -> Scene:
+def capture(photographs: str | Path | Iterable[str | Path], output: str | Path | None = None, **options: Any) -> Scene:
     """Find the camera poses of photographs or of a video, and open the scene.
 
     photographs: a folder, a video, or image files
     output:  folder of the scene; None: scenes/NAME. What lies there already of the same photographs is not done again
-    options: those of `lumigraph capture`
+    options: those of `lumigraph capture`, and progress
     """
     many = [photographs] if isinstance(photographs, str | Path) else list(photographs)
     folder = Path(output) if output is not None else scene_folder(tuple(map(Path, many)))
-    with heard_by(progress):
+    with heard_by(options.pop("progress", None)):
         call("capture", *many, output=folder, **options)
     return open_scene(folder)
 
@@ -173,7 +163,7 @@ def train(
     method: str | type[Method] = "gaussian-splatting",
     output: str | Path | None = None,
     *,
-    progress: Progress | None = None,
+    progress: Callable[[int, float, dict[str, Any]], object] | None = None,
     **options: Any,
 ) -> Model:
     """Train a method, and open the run.
@@ -197,22 +187,8 @@ def train(
     made = command("train", method, scene, output=output, **options)
     bar = NotebookBar() if progress is None and in_notebook() else None
     told = progress or bar
-    (folder, code), _ = quietly(lambda: made.learn(Told(told) if told else None))
+    (folder, code), _ = quietly(lambda: made.learn(told and SimpleNamespace(asked=False, note=told)))
     finished(code)
     if bar:
         bar.end()
     return open(folder)
-
-
-class Told:
-    """A Watch that tells a function of each step, and never asks training to yield."""
-
-    asked = False
-
-    def __init__(self, progress: Progress):
-        self.progress = progress
-
-    def give_way(self, stopping: Callable[[], object]) -> None: ...
-
-    def note(self, step: int, progress: float, row: dict[str, Any]) -> bool:
-        return bool(self.progress(step, progress, row))

@@ -122,12 +122,19 @@ BY_PHOTOGRAPH: Efforts = {"draft": Effort(10, 500), "good": Effort(60, 3000), "b
 BY_RAY: Efforts = {"draft": Effort(0.05, 500), "good": Effort(0.5, 3000), "best": Effort(5.0, 10_000)}
 
 
-def given_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
-    """The Budget of --steps or --seconds; `None` without them. Raises LumigraphError, before anything is opened, for an
-    impossible value, and for more than one of these options."""
-    if sum(given is not None for given in (steps, seconds, quality)) > 1:
-        raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
-    return None if steps is None and seconds is None else Budget(steps, seconds)
+class Limited:
+    """Options that end training after steps, after seconds or after the steps of a quality."""
+
+    def check(self) -> None:
+        """Raises LumigraphError for more than one of them."""
+        if sum(getattr(self, name) is not None for name in ("steps", "seconds", "quality")) > 1:
+            raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
+
+    @property
+    def budget(self) -> Budget | None:
+        """Budget of the steps or the seconds; None without them."""
+        steps, seconds = getattr(self, "steps", None), getattr(self, "seconds", None)
+        return None if steps is None and seconds is None else Budget(steps, seconds)
 
 
 def about_quality(numbers: Mapping[str, str] = {}) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -194,6 +195,11 @@ def is_similarity(matrix: Tensor) -> bool:
     if size <= 0:
         return False
     return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= SIMILARITY_TOLERANCE)
+
+
+def is_far(points: Float[np.ndarray, "point 3"], size: float) -> bool:
+    """True if float32 rounds points by more than a hundredth of a size, as far from the origin."""
+    return bool(len(points)) and float(np.finfo(np.float32).eps * np.abs(points).max()) > 0.01 * size
 
 
 def evenly(items: Sequence[T], count: int) -> list[T]:

@@ -21,8 +21,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ |= {"OMP_NUM_THREADS": "1", "GOMP_SPINCOUNT": "0"}
 
 # Byte code is kept, here and in the processes that tests start: compiling takes each worker 20 s and each process 3 s.
-sys.dont_write_bytecode = False
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    sys.dont_write_bytecode = False
 
 import lumigraph  # noqa: F401  # isort: skip
 import pytest  # isort: skip
@@ -47,6 +47,7 @@ shape_checks.install()
 
 from lumigraph.system.allocation import settle_memory
 
+gc.set_threshold(20_000)  # at 700, looking for cycles is a seventh of compiling and four fifths of parsing
 settle_memory()  # as commands do: memory that one training step frees is kept for the next
 
 
@@ -70,7 +71,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     LEDGER.methods = len(methods.available())
     gc.collect()
-    gc.freeze()  # what collection made stays to the end; looking through it again takes a second each time
+    gc.freeze()  # looking again and again through what collection made, which stays, takes a second each time
 
 
 @pytest.hookimpl(wrapper=True)

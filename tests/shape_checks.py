@@ -6,6 +6,7 @@ thousands of times. The first CHECKED_CALLS calls of a function in each test are
 
 from __future__ import annotations
 
+import ast
 import functools
 import inspect
 import re
@@ -30,6 +31,15 @@ def checked_modules() -> set[str]:
     """Modules that state shapes, but those that hold compiled functions: compilers cannot read them with checks."""
     sources = {path: path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
     return {module_name(path) for path, x in sources.items() if "jaxtyping" in x and not JIT.search(x)}
+
+
+parsed = functools.cache(ast.parse)  # the package's syntax trees, until a test file ends that has looked at them all
+
+
+@functools.cache
+def nodes(source: str) -> list[ast.AST]:
+    """All nodes of a source, from its root."""
+    return list(ast.walk(parsed(source)))
 
 
 def module_name(path: Path) -> str:

@@ -144,7 +144,7 @@ def test_weights_are_loaded_once_for_all_calls(own_run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("how", ["raise", "true"])
-@pytest.mark.parametrize("work", ["film", "mesh", "points", "web", "evaluate", "convert"])
+@pytest.mark.parametrize("work", ["film", "mesh", "points", "web", "evaluate"])
 def test_work_is_heard_of_and_cancelled_without_a_trace(work, how, own_run, tmp_path, monkeypatch):
     """Its function hears of stages; an exception of it, and true, end the work before any file is there."""
     heard = []
@@ -163,7 +163,6 @@ def test_work_is_heard_of_and_cancelled_without_a_trace(work, how, own_run, tmp_
         "points": lambda: own_run.export("points", tmp_path / "new.ply", **small),
         "web": lambda: own_run.export("web", tmp_path / "new.html", as_="views", **small),
         "evaluate": lambda: own_run.evaluate(views=2, progress=progress),
-        "convert": lambda: own_run.convert("voxel-grid", tmp_path / "new", steps=3, views=1, progress=progress),
     }
     before = {path: path.read_bytes() for path in own_run.path.rglob("*") if path.is_file()}
     with pytest.raises(ValueError if how == "raise" else KeyboardInterrupt):
@@ -171,6 +170,20 @@ def test_work_is_heard_of_and_cancelled_without_a_trace(work, how, own_run, tmp_
     assert heard[0][1] == 0 and heard[-1][1] == 1 and all(total is None or count <= total for _, count, total in heard)
     assert not list(tmp_path.glob("new*")) and not list(tmp_path.glob(".*partial*"))
     assert {path: path.read_bytes() for path in own_run.path.rglob("*") if path.is_file()} == before
+
+
+def test_a_conversion_that_is_cancelled_goes_on(own_run, tmp_path):
+    heard = []
+
+    def progress(description, count, total):
+        heard.append(description)
+        return (description, count) == ("Training", 2)
+
+    options = {"steps": 4, "views": 1}
+    with pytest.raises(KeyboardInterrupt):
+        own_run.convert("voxel-grid", tmp_path / "new", progress=progress, **options)
+    assert heard[-1] == "Training" and len(set(heard)) > 1
+    assert own_run.convert("voxel-grid", tmp_path / "new", **options).state.step == 4
 
 
 def test_training_that_is_cancelled_keeps_its_last_state(ball_folder, tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -199,3 +200,52 @@ def test_what_is_short_or_not_known_is_said_in_a_sentence(tmp_path):
     assert "glTF of version 1" in refusal(path)
     path.write_bytes(data[:-1])
     assert "ends early" in refusal(path) and is_splat_file(path)
+
+
+# OpenUSD
+
+
+@pytest.mark.parametrize("suffix", [".usdc", ".usda", ".usd"])
+def test_usd_has_what_usd_core_reads(tmp_path, suffix):
+    pxr = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom, UsdVol
+
+    cloud = make(7, 2)
+    write_gaussians(tmp_path / f"a{suffix}", cloud)
+    stage = pxr.Stage.Open(str(tmp_path / f"a{suffix}"))
+    found = UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/World/Gaussians"))
+    prim = found.GetPrim()
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat" and UsdGeom.GetStageUpAxis(stage) == "Y"
+    turn = np.array([1, -1, -1])
+    np.testing.assert_allclose(np.array(prim.GetAttribute("positions").Get()), cloud.means.numpy() * turn, rtol=1e-6)
+    np.testing.assert_allclose(np.array(prim.GetAttribute("scales").Get()), cloud.log_scales.exp().numpy(), rtol=1e-5)
+    np.testing.assert_allclose(
+        np.array(prim.GetAttribute("opacities").Get()), cloud.opacities.sigmoid().numpy(), rtol=1e-5
+    )
+    turned = cloud.quaternions / cloud.quaternions.norm(dim=-1, keepdim=True) * torch.tensor([1, 1, -1, -1])
+    for quaternion, expected in zip(prim.GetAttribute("orientations").Get(), turned, strict=True):
+        np.testing.assert_allclose([quaternion.GetReal(), *quaternion.GetImaginary()], expected, atol=1e-6)
+    harmonics = np.array(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get()).reshape(7, 9, 3)
+    np.testing.assert_allclose(harmonics[:, 0], cloud.harmonics[:, 0].numpy(), rtol=1e-6)
+    assert prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() == 2
+    low, high = found.GetExtentAttr().Get()
+    assert all(low[i] < (cloud.means.numpy() * turn)[:, i].min() for i in range(3)) and high[0] > low[0]
+    with pytest.raises(LumigraphError, match="written and not read"):
+        read_gaussians(tmp_path / f"a{suffix}")
+
+
+def test_usd_keeps_an_offset_in_doubles(tmp_path):
+    pxr = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    near = make(5, 0)
+    offset = torch.tensor([512345.0, 4649776.0, 312.0], dtype=torch.float64)
+    write_gaussians(
+        tmp_path / "a.usdc", replace(near, means=near.means.double() + offset, log_scales=near.log_scales - 3)
+    )
+    stage = pxr.Stage.Open(str(tmp_path / "a.usdc"))
+    cache = UsdGeom.XformCache()
+    matrix = np.array(cache.GetLocalToWorldTransform(stage.GetPrimAtPath("/World/Gaussians")))
+    local = np.array(stage.GetPrimAtPath("/World/Gaussians").GetAttribute("positions").Get()).astype(float)
+    places = (local @ matrix[:3, :3] + matrix[3, :3]) * np.array([1, -1, -1])
+    np.testing.assert_allclose(places, (near.means.double() + offset).numpy(), atol=1e-6)

@@ -31,6 +31,8 @@ EXCEPTIONS = {
     "tqdm": "MPL: unchanged; of the weights' download in guidance by words",
     "pathspec": "MPL: unchanged; of the type checker",
     "frozendict": "LGPL: plain Python, imported by the reader of Minecraft's worlds, extra `worlds`",
+    "openexr": "BSD 3-clause, by the LICENSE.md in its wheel; its metadata name none",
+    "usd-core": "Tomorrow Open Source Technology 1.0: Apache 2.0 with other words on trademarks; extra `usd`",
     "nvidia-*": "NVIDIA's own: libraries of CUDA that PyTorch's build for GPUs requires; nothing of ours contains them",
     "cuda-*": "NVIDIA's own: as nvidia-*",
 }

@@ -32,7 +32,7 @@ from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import best_way, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.options import MeshOptions, PointsOptions
-from lumigraph.export.points import extract_points, thinned, write_points
+from lumigraph.export.points import PointCloud, extract_points, thinned, write_points
 from lumigraph.export.surface import BLOCK, Grid, border, majority, manifold, simplified, smoothed, zero_level
 from lumigraph.files.ply import read_rows
 from lumigraph.gaussians import Gaussians
@@ -508,3 +508,41 @@ def test_bad_input_gets_one_sentence(arguments, tmp_path, monkeypatch, capsys):
     told = capsys.readouterr()
     assert told.out == "" and len(told.err.splitlines()) == 1 and told.err.startswith("lumigraph: ")
     assert list(tmp_path.iterdir()) == []
+
+
+FAR = np.array([512345.7, 4649776.2, 312.4])
+
+
+@pytest.mark.parametrize("ending", [".ply", ".obj", ".glb", ".usdz"])
+def test_far_from_the_origin_meshes_keep_their_places(tmp_path, solid_ball, ending):
+    far = replace(solid_ball, vertices=solid_ball.vertices.astype(np.float64) + FAR)
+    path = tmp_path / f"a{ending}"
+    write_mesh(path, far)
+    if ending == ".usdz":  # about its own base, with the place as data
+        data = path.read_bytes()
+        row = data[data.index(b"sourceFromUpright") :].split(b"(", 5)[5].split(b")")[0]
+        x, y, z, _ = map(float, row.split(b","))
+        assert abs(x - FAR[0]) < 1 and abs(y - FAR[1]) < 1
+        return
+    found = trimesh.load(path, process=False, maintain_order=True)
+    if ending == ".glb":
+        matrix, name = found.graph["source"]
+        upright, _ = found.graph["upright"]
+        local = np.asarray(found.geometry[name].vertices, np.float64)
+        places = (local @ matrix[:3, :3].T + matrix[:3, 3]) @ upright[:3, :3]
+    else:
+        places = np.asarray(found.vertices)
+    distance, _ = cKDTree(far.vertices).query(places)
+    assert distance.max() < 1e-4 and len(places) == len(far.vertices)
+
+
+def test_far_points_are_doubles(tmp_path):
+    random = np.random.default_rng(0)
+    near = random.normal(size=(500, 3))
+    for offset, kind in ((0.0, "<f4"), (FAR, "<f8")):
+        points = PointCloud(near + offset, np.tile([0.0, 0.0, 1.0], (500, 1)), np.full((500, 3), 9, np.uint8))
+        write_points(tmp_path / "a.ply", points)
+        rows = read_rows(tmp_path / "a.ply", ["vertex"])["vertex"]
+        assert rows.dtype["x"].str == kind
+        found = np.stack([rows[name] for name in "xyz"], 1)
+        np.testing.assert_allclose(found, near + offset, atol=1e-5)

@@ -19,7 +19,7 @@ from windows import some_camera
 from lumigraph.commands.cli import main
 from lumigraph.composition import FilteredCloud, PlayedCloud
 from lumigraph.errors import LumigraphError
-from lumigraph.exchange import fourdgs, read_gaussians
+from lumigraph.exchange import fourdgs, read_gaussians, write_gaussians
 from lumigraph.export.loaded import Loaded
 from lumigraph.export.options import Keeping
 from lumigraph.export.page import moving_page
@@ -252,6 +252,9 @@ def test_meshes_of_moments(run, tmp_path):
     assert (tmp_path / "m-000.ply").read_bytes() != (tmp_path / "m-001.ply").read_bytes()
     assert main([*words, "--set", "time=1"]) == 0
     assert (tmp_path / "m.ply").read_bytes() == (tmp_path / "m-000.ply").read_bytes()
+    pytest.importorskip("coacd")
+    assert main(["export", "collision", run, str(tmp_path / "m.glb"), *words[4:], "--moments", "2"]) == 0
+    assert sorted(x.name for x in tmp_path.glob("*.glb")) == ["m-000.glb", "m-001.glb"]
 
 
 def test_clean_compress_and_compose_keep_the_motion(run, tmp_path):
@@ -266,3 +269,16 @@ def test_clean_compress_and_compose_keep_the_motion(run, tmp_path):
         begin, end = (method.given(time=t).render(camera).rgb for t in (1.0, 3.0))
         assert psnr(begin, end) < 35
         assert torch.equal(method.render(replace(camera, time=torch.tensor([3.0]))).rgb, end)
+
+
+def test_a_cloud_that_stands_still_is_one_span_each(tmp_path, made):
+    still = MovingGaussians.still(turning(0.0), 3.0)
+    fourdgs.write_moving(tmp_path / "a.4dgs", still)
+    found = fourdgs.read_moving(tmp_path / "a.4dgs")
+    assert found.moving == 0 and len(found) == 60 and found.duration == 3
+    for time in (0.0, 1.4, 2.9):
+        now, places = found.at(time).means, turning(0.0).means
+        assert (now[:, None] - places).norm(dim=-1).amin(1).max() < 0.005
+    write_gaussians(tmp_path / "a.ply", turning(0.0))
+    assert main(["export", "splats", str(tmp_path / "a.ply"), str(tmp_path / "b.4dgs")]) == 0
+    assert len(fourdgs.read_moving(tmp_path / "b.4dgs")) == 60

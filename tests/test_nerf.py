@@ -167,7 +167,9 @@ def wall(reach: float, forward: bool) -> Scene:
 @pytest.mark.parametrize("forward", [True, False], ids=["ndc", "contracted"])
 def test_it_learns_in_every_space(kind, forward):
     scene = wall(4.0, forward)
-    made = method(kind, scene.frame, **({"density_noise": 0.0} if kind is nerf.NeRF else {}))
+    made = method(kind, scene.frame)
+    for field in (made.network, made.network.coarse or made.network):
+        field.noise = 0.0
     fit(made, scene, steps=120, show=False, rehearsal=False)
     evaluation = evaluate(made, scene)
     assert evaluation.psnr > 20

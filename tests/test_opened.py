@@ -66,7 +66,7 @@ def test_everything_opens_by_one_door(folder, name, title, photographed, renders
 def test_a_film_does_not_replace_the_composition_it_is_of(folder):
     before = (folder / "both.json").read_bytes()
     with pytest.raises(LumigraphError, match=r"both\.json would be replaced"):
-        render.Render(folder / "both.json", output=folder / "both.gif", frames=2, size=16).run()
+        render.Render(source=folder / "both.json", output=folder / "both.gif", frames=2, size=16).run()
     assert (folder / "both.json").read_bytes() == before and not (folder / "both.gif").exists()
 
 

@@ -809,14 +809,13 @@ def test_the_preset_paper_has_the_published_numbers(name):
 
 
 def number_of(config: Any, path: str) -> Any:
-    """An option by its path in the part of a Config that holds it, or the constant of its name beside it."""
+    """An option by its path in a Config, or the constant of its name beside the Config or a part of it."""
     *parts, name = path.split(".")
-    owner = config
     for part in parts:
-        owner = value_of(owner, part)
-    if holds(owner, name):
-        return value_of(owner, name)
-    modules = [vars(sys.modules[type(group).__module__]) for group in groups_of(owner)]
+        config = value_of(config, part)
+    if holds(config, name):
+        return value_of(config, name)
+    modules = [vars(sys.modules[type(group).__module__]) for group in groups_of(config)]
     return next(module[name.upper()] for module in modules if name.upper() in module)
 
 

@@ -263,7 +263,7 @@ def test_a_table_has_numbers_of_its_own():
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
     assert (network.learning_rate, network.hidden_width) == (4e-3, 128)
     assert table == known  # all of them
-    assert table.proposals.sweep_weight == config.sweep_weight
+    assert table.proposals == config.proposals
 
 
 def test_few_photographs_of_an_object_are_learnt_by_the_network():

@@ -22,6 +22,7 @@ from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.files import replacing, write_json
 from lumigraph.files.plain import alike, flatten, unflatten
 from lumigraph.files.ranges import typed
+from lumigraph.methods import articulated_splatting
 from lumigraph.run import Run, State
 from lumigraph.run.settings import of_this_version
 from lumigraph.training import fit
@@ -72,6 +73,9 @@ def test_an_option_that_became_a_constant_opens(run):
             assert older.method_config(kind, run.folder) == kind.smallest()
     kind = methods.find("deepsdf")
     older = replace(settings, config=asdict(kind.smallest()) | {"fit_weight": 1e-4})
+    assert older.method_config(kind, run.folder) == kind.smallest()
+    kind = methods.find("articulated-splatting")  # a whole part became one
+    older = replace(settings, config=asdict(kind.smallest()) | {"tidying": asdict(articulated_splatting.TIDYING)})
     assert older.method_config(kind, run.folder) == kind.smallest()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import functools
 import os
 import re
 from collections import Counter
@@ -14,8 +13,8 @@ from typing import Annotated, get_args, get_origin
 
 import pytest
 from budgets import budget
-from shape_checks import PACKAGE, module_name
-from test_house import imported
+from shape_checks import PACKAGE, module_name, nodes, parsed
+from test_house import forget_trees, imported  # noqa: F401
 
 from lumigraph import methods
 from lumigraph.files.ranges import hints
@@ -24,7 +23,6 @@ pytestmark = budget("house", 8)
 
 ROOT = PACKAGE.parent
 Sources = dict[str, str]  # module names, and the text of each
-parsed = functools.cache(ast.parse)
 RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", "how", "whose", "where"}
 # Of the package: who lowers a number lowers its ceiling.
 MAX_LINES = 112_800  # of Python
@@ -97,7 +95,7 @@ def namesakes(sources: Sources) -> list[str]:
     """Public classes of one name in several modules, but for Config of methods and Options of procedural scenes."""
     places: dict[str, list[str]] = {}
     for module, source in sources.items():
-        for node in ast.walk(parsed(source)):
+        for node in nodes(source):
             if isinstance(node, ast.ClassDef) and node.name not in ("Config", "Options") and node.name[0] != "_":
                 places.setdefault(node.name, []).append(module)
     return [f"{name}: {', '.join(modules)}" for name, modules in sorted(places.items()) if len(modules) > 1]
@@ -175,10 +173,10 @@ def test_a_component_of_one_method_is_noticed():
 
 def heirs(sources: Sources) -> list[str]:
     """Configs with a base class."""
-    nodes = [(module, node) for module, source in sources.items() for node in ast.walk(parsed(source))]
     return [
         f"{module}.{node.name}({', '.join(map(ast.unparse, node.bases))})"
-        for module, node in nodes
+        for module, source in sources.items()
+        for node in nodes(source)
         if isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Numbers")) and node.bases
     ]
 
@@ -199,7 +197,7 @@ def long_functions(sources: Sources, lines: int = 60) -> list[str]:
     return [
         f"{module}.{node.name}: {length}"
         for module, source in sources.items()
-        for node in ast.walk(parsed(source))
+        for node in nodes(source)
         if isinstance(node, ast.FunctionDef) and (length := (node.end_lineno or 0) - node.lineno + 1) > lines
     ]
 

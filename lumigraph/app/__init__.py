@@ -1,1 +1,1 @@
-"""The app: photographs in and scene out, in a browser."""
+"""The app: from photographs to a scene in a browser."""

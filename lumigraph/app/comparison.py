@@ -23,7 +23,7 @@ def eval_options(run: Path) -> dict[str, Any]:
 
 
 def comparison(run: Path) -> dict[str, Any] | None:
-    """Views with a rendering: name, PSNR, whether held out. stale: whether the run has learnt more since"""
+    """Views with a rendering: name, PSNR, whether held out. stale: whether the run has been trained further since"""
     return _comparison(run, newest(run)) if run.is_dir() else None
 
 

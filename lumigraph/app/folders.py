@@ -1,4 +1,4 @@
-"""Folders, looked through within bounds of entries and seconds, so that no answer of the app waits for a huge one."""
+"""Folder searches with limits of entries and seconds, so that no response of the app waits for a huge one."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ T = TypeVar("T")
 
 
 class Search:
-    """A search through a folder, within bounds.
+    """A limited search through a folder.
 
-    changed: times of change (content, permissions) of each folder that was read
-    fault:   a sentence on what could not be read; is_cut: whether the search ended at a bound
+    changed: modification times (content, permissions) of each folder that was read
+    fault:   a sentence on what could not be read; is_cut: whether the search ended at a limit
     """
 
     def __init__(self, folder: Path, seconds: float):
@@ -54,13 +54,13 @@ class Search:
 
     @property
     def sentence(self) -> str:
-        """A sentence on what was not found; empty if everything was looked through."""
+        """Sentence on an incomplete search; empty for a complete one."""
         if self.is_cut:
             return f"{self.folder} has more in it than a page shows; name a folder of photographs alone"
         return self.fault
 
     def is_current(self) -> bool:
-        """True until one of the folders changes; for a search that was cut, for a while."""
+        """True until one of the folders changes; for an incomplete search, for a while."""
         if self.is_cut:
             return time.monotonic() - self.begun < CUT_SECONDS
         try:
@@ -69,7 +69,7 @@ class Search:
             return False
 
     def is_settled(self) -> bool:
-        """True if every later change of a folder will be seen by its times of change."""
+        """True if modification times will show every later change of a folder."""
         latest = max((max(times) for times in self.changed.values()), default=0)
         return time.time() - latest / 1e9 > SETTLED_SECONDS
 
@@ -80,9 +80,9 @@ def times_of(folder: Path | str) -> tuple[int, int]:
 
 
 class Finder(Generic[T]):
-    """Finding about a folder that is kept while the folder stays as it is.
+    """Cached result of a folder search, valid while the folder is unchanged.
 
-    find: looks through the folder, for so many seconds
+    find: searches the folder, for at most so many seconds
     """
 
     def __init__(self, find: Callable[[Search], T], seconds: float = CARD_SECONDS):
@@ -90,7 +90,7 @@ class Finder(Generic[T]):
         self._kept: dict[Path, tuple[Search, T]] = {}
 
     def __call__(self, folder: Path, until: float = float("inf")) -> tuple[Search, T] | None:
-        """A search and its finding. until: moment (time.monotonic) after which only an earlier finding is returned"""
+        """Search and result. until: time (time.monotonic) after which only a cached result is returned"""
         known = self._kept.get(folder)
         if time.monotonic() > until or (known and known[0].is_current()):
             return known
@@ -119,7 +119,7 @@ _sizes = Finder(_size)
 
 
 def size_within(path: Path, until: float = float("inf")) -> int | None:
-    """Bytes of a file, or of all files of a folder; None if they have not been counted within the bounds."""
+    """Bytes of a file, or of all files of a folder; None if the limits were exceeded."""
     if path.is_file():
         return path.stat().st_size
     found = _sizes(path, until)

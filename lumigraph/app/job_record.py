@@ -1,7 +1,7 @@
-"""Records of jobs in job.json: as they were asked for, and how far they are.
+"""Job records in job.json: requests and progress.
 
-A record is sealed with a key of this user. A job of another record, as in a folder that was received or moved, does not
-begin by itself: it waits until somebody presses a button.
+A record is authenticated with a key of this user. A job of another record, as in a folder that was received or moved,
+does not start by itself: it waits until a user presses a button.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ Mapper = Literal["incremental", "global"]
 
 @dataclass(frozen=True)
 class Making:
-    """Photographs to a run: as it was asked for, and how far it is.
+    """Job from photographs to a run: request and progress.
 
     quality, seconds, steps: budget of the training, one of them
-    stage:   the command that is next or under way
+    stage:   the next or current command
     run:     name of the run in the project's runs; empty before training
-    fault:   sentence of the command that failed
+    fault:   error sentence of the failed command
     process: number of the running child
     """
 
@@ -65,7 +65,7 @@ class Making:
 
 @dataclass(frozen=True)
 class ShareJob:
-    """A run to a file in the project's shared folder. size: longer side of a film in pixels"""
+    """Job from a run to a file in the project's shared folder. size: longer side of a film in pixels"""
 
     name: PlainName
     kind: ShareName
@@ -90,7 +90,7 @@ _writing = threading.RLock()  # around reading, changing and writing a record
 
 
 def read_job(item: Item) -> JobRecord:
-    """The record of an item's jobs. Jobs that this user's app did not ask for at this place wait."""
+    """Job record of an item. Jobs not requested by this user's app at this path wait."""
     path = item.path / JOB_FILE
     if not path.is_file():
         return JobRecord()
@@ -99,7 +99,7 @@ def read_job(item: Item) -> JobRecord:
 
 
 def waiting(record: JobRecord) -> JobRecord:
-    """A record whose jobs begin when somebody presses a button."""
+    """A record whose jobs wait for a button."""
 
     def held_up(job: Any, state: JobState) -> Any:
         return replace(job, state=state, fault=NOT_SEALED, process=0) if job.state in ("queued", "running") else job
@@ -108,14 +108,14 @@ def waiting(record: JobRecord) -> JobRecord:
 
 
 def seal_of(item: Item, record: JobRecord) -> str:
-    """Seal of a record at its place (HMAC-SHA256)."""
+    """Authentication code of a record at its path (HMAC-SHA256)."""
     text = json.dumps([str(item.path.resolve()), asdict(replace(record, seal=""))], sort_keys=True)
     return hmac.new(user_key(), text.encode(), hashlib.sha256).hexdigest()
 
 
 @functools.cache
 def user_key() -> bytes:
-    """This user's key, made at first use; one of this process alone where it cannot be kept."""
+    """This user's key, made at first use; one of this process alone if it cannot be saved."""
     place, new = cache_folder() / KEY_FILE, secrets.token_bytes(KEY_BYTES)
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def of_this_user(path: str, flags: int) -> int:
 
 
 def change(item: Item, make: Callable[[JobRecord], JobRecord]) -> JobRecord:
-    """Read, change and write a record; nobody else does meanwhile."""
+    """Read, change and write a record under a lock."""
     with _writing:
         after = make(read_job(item))
         after = replace(after, seal=seal_of(item, after))

@@ -1,7 +1,7 @@
-"""Jobs: commands in processes of their own, one after another, each asked for by a typed request.
+"""Jobs: commands in processes of their own, one after another, each by a typed request.
 
-A record changes before its process does. After a kill of the app its child is asked to end (SIGTERM), saves and ends;
-the next app finds the job as running and begins the same command again, which goes on from its stages or checkpoints.
+A record is written before its process changes. After a kill of the app its child gets SIGTERM, saves and ends; the next
+app finds the job as running and starts the same command again, which continues from its stages or checkpoints.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Runner:
         self._thread.start()
 
     def end(self) -> None:
-        """End the running command, whose job goes on when the app starts again."""
+        """End the running command; its job continues when the app starts again."""
         self._ended = True
         self._wake.set()
         if (task := self.current) and task.child:
@@ -100,19 +100,19 @@ class Runner:
         return [task for _, _, task in sorted(tasks, key=lambda one: one[:2])]
 
     def stop(self, task: QueuedJob, state: JobState) -> None:
-        """Pause or stop a job; its command saves and ends. Returns at once."""
+        """Pause or stop a job; its command saves and ends. Returns immediately."""
         task.set(state=state)
         running = self.current
         if running and running.child and (running.item, running.share) == (task.item, task.share):
             running.child.send_signal(signal.SIGINT)
 
     def extend(self, item: Item, **budget: Any) -> None:
-        """Give a training another budget. Its command saves and ends, and is the next one again."""
+        """Give a training another budget. Its command saves, ends, and is started again."""
         change_making(item, **{"quality": None, "seconds": None, "steps": None} | budget)
         self.stop(QueuedJob(item, None), "queued")
 
     def release(self, item: Item) -> None:
-        """Stop the jobs of an item that is about to go, and wait until no command works in it."""
+        """Stop the jobs of an item before its deletion, and wait until no command works in it."""
         for task in self.queue():
             if task.item == item:
                 self.stop(task, "stopped")
@@ -147,7 +147,7 @@ class Runner:
             time.sleep(IDLE_SECONDS)  # the disk is full, or the item has gone
 
     def _await_orphans(self) -> None:
-        """Wait until commands of an app that was killed have saved and ended."""
+        """Wait until commands of a killed app have saved and ended."""
         end = time.monotonic() + PATIENCE_SECONDS
         for task in self.queue():
             while (job := task.job) and job.process and is_alive(job.process) and time.monotonic() < end:
@@ -203,7 +203,7 @@ class Runner:
 
 
 def child_address() -> Address:
-    """Address on this machine for a child's viewer, with a token: only who has it, the app, gets an answer."""
+    """Address on this machine for a child's viewer, with a token that only the app knows."""
     return Address(HOST, free_port(HOST, 0) or 0, new_token())
 
 
@@ -282,7 +282,7 @@ def sentence(item: Item, code: int) -> str:
 
 
 def make(item: Item, **options: Any) -> JobRecord:
-    """Queue the making of a run: photographs to cameras to a new run."""
+    """Queue a job from photographs to cameras to a new run."""
     input_of(item)
     asked = Making("queued", time.time(), **options)
 

@@ -1,4 +1,4 @@
-"""Photographs of a project as the page shows them: thumbnails, their state, and advice while they arrive."""
+"""Photographs of a project for the page: thumbnails, their state, and advice during upload."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ MAX_COMPARED = 100  # photographs; more of them leave no gaps, and take long to 
 
 @dataclass(frozen=True)
 class Advice:
-    """A sentence about photographs that have arrived, and the names of those it is about."""
+    """A sentence of advice on uploaded photographs, and their names."""
 
     text: str
     names: list[str]
@@ -76,8 +76,8 @@ _listings, _firsts = Finder(_listing, PAGE_SECONDS), Finder(_first)
 
 
 def files_of(folder: Path) -> dict[str, Path]:
-    """Photographs and videos of a folder by name, in natural order, as far as the bounds of a `Search`; of a file the
-    file itself."""
+    """Photographs and videos of a folder by name, in natural order, within the limits of a `Search`; of a file the file
+    itself."""
     if is_file(folder):
         return {folder.name: folder}
     found = _listings(folder)
@@ -85,9 +85,9 @@ def files_of(folder: Path) -> dict[str, Path]:
 
 
 def first_of(folder: Path, until: float) -> tuple[Path | None, str]:
-    """A photograph or video of a folder for its card, and a sentence where there is none to be had.
+    """A photograph or video of a folder for its card, and a sentence where none is found.
 
-    until: moment (time.monotonic) after which no folder is looked through
+    until: time (time.monotonic) after which no folder is searched
     """
     if is_file(folder):
         return folder, ""
@@ -96,7 +96,7 @@ def first_of(folder: Path, until: float) -> tuple[Path | None, str]:
 
 
 def listing_fault(item: Item) -> str:
-    """A sentence where the photographs of an item are not all listed; empty otherwise."""
+    """Sentence for an incomplete list of an item's photographs; empty for a complete one."""
     folder = folder_of(item)
     found = None if item.kind == "run" or is_file(folder) else _listings(folder)
     return found[0].sentence if found else ""
@@ -172,7 +172,7 @@ def _thumbnail(path: Path, modified: int, size: int, side: int) -> bytes:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """A photograph to be seen small; of a large one a copy of about REDUCED_SIDE pixels, as it is stored."""
+    """A photograph at small size; for a large one a copy of about REDUCED_SIDE pixels, as stored."""
     if path.suffix.lower() not in PHOTOGRAPHS:
         raise LumigraphError(f"{path.name} is a raw file, which is developed when the scene is made")
     reads_heic()
@@ -189,7 +189,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 
 def is_large(image: Image.Image) -> bool:
-    """True if decoding takes much memory. JPEG is reduced while it is decoded, but for progressive files."""
+    """True if decoding takes much memory. JPEG is reduced during decoding, except for progressive files."""
     is_baseline = image.format in ("JPEG", "MPO") and not image.info.get("progressive")
     return not is_baseline and math.prod(image.size) > LARGE_PIXELS
 
@@ -205,7 +205,7 @@ def is_large_file(path: Path) -> bool:
 
 @lru_cache(MAX_LARGE_KEPT)
 def _reduced(path: Path, modified: int, size: int, pixels: tuple[int, int]) -> bytes:
-    """JPEG of a large photograph, made in a process of its own; the caller holds `_reducing`."""
+    """JPEG of a large photograph, made in a separate process; the caller holds the lock `_reducing`."""
     try:
         check_pixels(pixels, BYTES_PER_PIXEL)
     except ValueError as fault:
@@ -230,7 +230,7 @@ def first_frame(path: Path) -> Image.Image:
 
 
 def version_of(path: Path) -> str:
-    """Short name of a file's present content, for addresses that browsers may keep; empty if the file is gone."""
+    """Short version name of a file's content, for cacheable URLs; empty if the file is gone."""
     try:
         about = path.stat()
     except OSError:
@@ -250,7 +250,7 @@ def _shared(one: tuple[Path, int, int], other: tuple[Path, int, int]) -> int:
 
 
 def too_far(files: Mapping[str, Path]) -> list[str]:
-    """Names of photographs that share too little with every other one; none of too many photographs to compare."""
+    """Names of photographs with too little overlap with every other one; none for too many photographs to compare."""
     if not MIN_VIEWS <= len(files) <= MAX_COMPARED:
         return []
     about = {name: (path, path.stat().st_mtime_ns, path.stat().st_size) for name, path in files.items()}
@@ -275,8 +275,8 @@ def judged(path: Path) -> tuple[Judgement, tuple[int, int]] | None:
 
 
 def advice(files: Mapping[str, Path]) -> list[Advice]:
-    """Advice about photographs before cameras are looked for: too few, blurred, too dark, other exposure, repeated, too
-    far from every other."""
+    """Advice on photographs before reconstruction: too few, blurred, too dark, other exposure, repeated, without
+    overlap."""
     photographs = {name: path for name, path in files.items() if not is_film(path) and MASKS not in Path(name).parts}
     known = {name: found for name, path in photographs.items() if (found := judged(path)) is not None}
     said = [*about_number(len(photographs), len(files) - len(photographs))]

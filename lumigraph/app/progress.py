@@ -67,7 +67,9 @@ class CaptureRecord:
 
 
 def photographs_state(item: Item) -> dict[str, dict[str, Any]]:
-    """State of each photograph by name: features, photographs that match, whether it is placed and why not."""
+    """State of each photograph by name: features, matching photographs, whether it is registered and the reason if
+    not.
+    """
     found: dict[str, dict[str, Any]] = {}
     for name, features, matched in rows_of(item.path / SCENE / DATABASE):
         found[name] = {"features": features, "matched": matched}
@@ -84,7 +86,7 @@ def photographs_state(item: Item) -> dict[str, dict[str, Any]]:
 
 
 def rows_of(database: Path) -> list[tuple[str, int | None, int]]:
-    """Photographs of COLMAP's database: name, number of features, number of photographs that show the same."""
+    """Photographs of COLMAP's database: name, number of features, number of matching photographs."""
     images = query(
         database, "SELECT images.image_id, name, keypoints.rows FROM images LEFT JOIN keypoints USING (image_id)"
     )
@@ -98,8 +100,8 @@ def rows_of(database: Path) -> list[tuple[str, int | None, int]]:
 
 
 def query(database: Path, question: str, *values: Any) -> list[tuple[Any, ...]]:
-    """Rows of COLMAP's database while COLMAP writes it. None where there is no database yet, or it is locked, has other
-    tables or is damaged, and none of a question that takes long."""
+    """Rows of COLMAP's database while COLMAP writes it. None for a missing, locked, foreign or damaged database, and
+    for a slow query."""
     if not database.is_file():
         return []
     end = time.monotonic() + QUERY_SECONDS
@@ -137,12 +139,12 @@ def capture_result(item: Item) -> CaptureRecord | None:
 
 
 def progress_of(item: Item, job: Making) -> dict[str, Any]:
-    """Stage of a making and the share of it that is over, with the figures of its kind."""
+    """Stage of a job, its progress as a share, and the figures of its kind."""
     return capture_progress(item) if job.stage == "capture" else training_progress(item, job)
 
 
 def capture_progress(item: Item) -> dict[str, Any]:
-    """Stage of a capture under way: its name, the share of the whole that is over, seconds that are left if known."""
+    """Stage of a running capture: its name, overall progress as a share, remaining seconds if known."""
     marks = item.path / SCENE / "work" / "stages.json"
     try:
         done = read_json(marks, dict[str, StageMark]) if marks.is_file() else {}
@@ -165,7 +167,7 @@ def capture_progress(item: Item) -> dict[str, Any]:
 
 
 def within_stage(item: Item, stage: str, said: str) -> tuple[int, int]:
-    """Count and total of a stage: of photographs with features, else by the last line of the log."""
+    """Count and total of a stage: of photographs with features, else from the last line of the log."""
     if stage == "features":  # those of an earlier start count too, unlike in the log
         rows = rows_of(item.path / SCENE / DATABASE)
         return sum(features is not None for _, features, _ in rows), len(rows)
@@ -174,7 +176,7 @@ def within_stage(item: Item, stage: str, said: str) -> tuple[int, int]:
 
 
 def model_folder(item: Item) -> Path | None:
-    """The latest model: that of the scene, or a snapshot while cameras are placed."""
+    """The latest model: that of the scene, or a snapshot during mapping."""
     scene = item.path / SCENE
     if (scene / "capture.json").is_file() and (scene / "sparse" / "0" / "images.bin").is_file():
         return scene / "sparse" / "0"
@@ -217,7 +219,7 @@ def _model(place: Path, modified: int) -> dict[str, Any]:
 def framed(
     poses: Float[np.ndarray, "camera 3 4"], points: Float[np.ndarray, "point 3"]
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"], float]:
-    """Rotation that turns the pictures' mean up to +z; middle and half-size of the cameras and most points."""
+    """Rotation of the pictures' mean up to +z; centre and half-size of the cameras and most points."""
     up = -poses[:, :, 1].mean(0)
     up /= np.linalg.norm(up) + 1e-9
     across = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
@@ -266,7 +268,7 @@ def training_progress(item: Item, job: Making) -> dict[str, Any]:
 
 
 def seconds_left(budget: Budget, step: int, seconds: float) -> float | None:
-    """Seconds of training to come, by the mean time of a step so far."""
+    """Remaining seconds of training, by the mean time of a step so far."""
     if budget.steps is None:
         return max(budget.total - seconds, 0.0)
     return max(budget.total - step, 0) * seconds / step if step else None

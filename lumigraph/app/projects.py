@@ -1,13 +1,13 @@
-"""Projects and other items of a folder. All of their state is in files, so the app may end at any moment.
+"""Projects and other items of a folder. All of their state is in files, so the app may end at any time.
 
     NAME/project.json   title, and the path of photographs that were not uploaded
     NAME/photos/        uploaded photographs, or one video
-    NAME/scene/         what `lumigraph capture` makes of them
-    NAME/runs/          runs, and splat files that were saved from them
+    NAME/scene/         results of `lumigraph capture`
+    NAME/runs/          runs, and splat files saved from them
     NAME/shared/        pages, films and files to share
-    NAME/job.json       what was asked for, and how far it is: see `jobs`
+    NAME/job.json       job request and progress: see `jobs`
     NAME/app.log        messages of the last command
-    .lumigraph-app/     lock of the app; trash/, from where deleted items return
+    .lumigraph-app/     lock of the app; trash/ with deleted items, which can be restored
 
 Runs and scenes that the command line made, also in `runs/` and `scenes/`, are items too.
 """
@@ -44,7 +44,7 @@ ItemKind = Literal["project", "run", "scene"]
 
 @dataclass(frozen=True)
 class ProjectRecord:
-    """Contents of project.json. source: photographs on this machine, in place of uploads; place: where the project was
+    """Contents of project.json. source: photographs on this machine, in place of uploads; place: the project's path
     when the paths inside it were written"""
 
     title: str
@@ -64,7 +64,7 @@ class TrashRecord:
 
 @dataclass(frozen=True)
 class Item:
-    """A project, a run or a scene in the folder that the app shows.
+    """A project, a run or a scene in the app's folder.
 
     root: that folder; path: the item's
     """
@@ -126,7 +126,7 @@ def is_splats(path: Path) -> bool:
 
 
 def newest(folder: Path) -> tuple[int, ...]:
-    """By which a run's card is known to be current."""
+    """Cache key of a run's card."""
     names = "metrics.jsonl", "eval.json", "eval-train.json", "config.json", "checkpoints", "blocks.json"
     places = (folder / name for name in names)
     return tuple(place.stat().st_mtime_ns for place in places if place.exists())
@@ -162,7 +162,7 @@ def is_item(path: Path) -> bool:
 
 
 def find_item(root: Path, key: str) -> Item:
-    """The item of a key. Raises LumigraphError for what is none, and for keys that lead out of the folder."""
+    """Item by key. Raises LumigraphError for an unknown one, and for keys that lead out of the folder."""
     parts = key.split(SEPARATOR)
     path = root.joinpath(*parts) if all(map(is_plain_name, parts)) else None
     shelves = {root / shelf for shelf in SHELVES}
@@ -186,12 +186,12 @@ def check_title(title: str) -> str:
 
 
 def readable_title(title: str) -> str:
-    """A title on one line, without letters that are not shown, no longer than allowed."""
+    """A title on one line, without invisible characters, truncated to the limit."""
     return "".join(x for x in " ".join(title.split()) if x.isprintable())[:MAX_TITLE_LENGTH]
 
 
 def free_place(root: Path, title: str) -> Path:
-    """A folder that does not exist yet, called after a title."""
+    """A new folder name from a title."""
     stem = re.sub(r"[^\w.-]+", "-", title).strip(".-_")[:60] or "scene"
     names = itertools.chain([stem], (f"{stem}-{n}" for n in itertools.count(2)))
     return next(root / name for name in names if not os.path.lexists(root / name))
@@ -210,7 +210,7 @@ def new_project(root: Path, title: str, source: Path | None = None) -> Item:
 
 
 def rename(item: Item, title: str) -> Item:
-    """Give an item another title. A project keeps its folder, whose path its runs remember; others are renamed."""
+    """Give an item another title. A project keeps its folder, whose path is stored in its runs; others are renamed."""
     title = check_title(title)
     if item.kind == "project":
         record = item.record
@@ -225,7 +225,7 @@ def rename(item: Item, title: str) -> Item:
 
 
 def duplicate(item: Item) -> Item:
-    """A copy of an item, without the files that were made to share and without its job."""
+    """A copy of an item, without shared files and jobs."""
     record = item.record
     copy = Item(item.root, free_place(item.path.parent, f"{record.title} copy"))
     leave = shutil.ignore_patterns(SHARED, JOB_FILE, LOG_FILE, "lock.json", ".lumigraph-*.partial")
@@ -242,7 +242,7 @@ def duplicate(item: Item) -> Item:
 
 
 def relocate(item: Item, before: str | None = None) -> None:
-    """Correct the paths inside a project that was moved or copied. before: its place at the time of writing"""
+    """Correct the paths inside a project that was moved or copied. before: its path when they were written"""
     if item.kind != "project":
         return
     record, now = item.record, str(item.path.resolve())
@@ -257,7 +257,7 @@ def relocate(item: Item, before: str | None = None) -> None:
 
 
 def moved(value: object, before: str, now: str) -> object:
-    """JSON whose paths below one folder lead below another one."""
+    """JSON with paths below one folder moved to another."""
     match value:
         case dict():
             return {key: moved(one, before, now) for key, one in value.items()}
@@ -276,7 +276,7 @@ def trash_folder(root: Path) -> Path:
 
 
 def delete(item: Item) -> str:
-    """Move an item to the trash. Returns the name by which `restore` brings it back."""
+    """Move an item to the trash. Returns its name for `restore`."""
     record = TrashRecord(item.path.relative_to(item.root).as_posix(), item.record.title, time.time())
     place = free_place(trash_folder(item.root), item.path.name)
     write_json(place.with_name(f"{place.name}.json"), asdict(record), ours=True)
@@ -286,7 +286,7 @@ def delete(item: Item) -> str:
 
 
 def restore(root: Path, name: str) -> Item:
-    """Bring an item back from the trash, to where it was or beside it."""
+    """Restore an item from the trash, to its original path or beside it."""
     place = trash_folder(root) / name
     about = place.with_name(f"{name}.json")
     if not is_plain_name(name) or not about.is_file() or not place.is_dir():

@@ -1,7 +1,7 @@
-"""A photograph of any size as a small one, with little more memory than its pixels take.
+"""Downscaling of a photograph of any size with little more memory than its pixels take.
 
-Run as a script with a file and a number of pixels, it writes a JPEG to standard output. So the memory of a large
-photograph ends with a process of its own. It imports nothing of the package, so it starts in a tenth of a second.
+Run as a script with a file and a number of pixels, it writes a JPEG to standard output, so that the memory of a large
+photograph is freed with the process. It imports nothing of the package, so it starts in a tenth of a second.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ QUALITY = 92
 
 
 def reduced(image: Image.Image, side: int) -> Image.Image:
-    """RGB of 8 bits whose longer side is at most twice as long as asked for, or that of the image if it is shorter.
+    """RGB of 8 bits, reduced to at most twice the requested longer side; smaller images keep their size.
 
-    A JPEG that is not read yet is reduced while it is decoded, and others strip by strip.
+    An unread JPEG is reduced during decoding, other formats strip by strip.
     """
     image.draft("RGB", (side, side))
     factor = max(1, max(image.size) // side)
@@ -33,7 +33,7 @@ def reduced(image: Image.Image, side: int) -> Image.Image:
 
 
 def rgb(image: Image.Image) -> Image.Image:
-    """RGB of 8 bits, of 16 bits of grey or linear floating-point numbers too."""
+    """RGB of 8 bits, also from 16 bits of grey or linear floating-point numbers."""
     if image.mode.startswith("I"):
         return image.convert("I").point(lambda value: value * (1 / 257)).convert("L").convert("RGB")
     if image.mode == "F":

@@ -1,6 +1,6 @@
-"""Scene views: `lumigraph view` in a process of its own, behind the app's own address, so that there is one viewer.
+"""Scene views: `lumigraph view` in separate processes, proxied by the app's own address.
 
-A training shows itself (`--view`), and is reached in the same way. Only the app can be reached from outside.
+A training has its own viewer (`--view`), proxied in the same way. Only the app is reachable from outside.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class SceneViews:
     def open(self, path: Path) -> SceneView:
         """The viewer of a run or a splat file, which may still be starting.
 
-        Raises LumigraphError while others use as many as there may be.
+        Raises LumigraphError if the maximum number of viewers is in use.
         """
         with self._opening:
             return self._open(path)
@@ -91,14 +91,14 @@ class SceneViews:
         return answers(view.address)
 
     def close(self, path: Path) -> None:
-        """End the viewers of a path, or of what lies below it."""
+        """End the viewers of a path and of everything below it."""
         for shown, view in list(self.views.items()):
             if shown == path or path in shown.parents:
                 end(view)
                 del self.views[shown]
 
     def sweep(self) -> None:
-        """End viewers that nobody looks at."""
+        """End unused viewers."""
         for path, view in list(self.views.items()):
             if view.child.poll() is not None or (not view.connections and time.monotonic() - view.used > IDLE_SECONDS):
                 end(view)
@@ -110,7 +110,7 @@ class SceneViews:
         self.views.clear()
 
     def _make_room(self) -> None:
-        """End the viewer that was left longest ago where there are too many."""
+        """End the least recently used viewer if there are too many."""
         most = MAX_VIEWS_IN_MEMORY if free_memory() > FREE_BYTES else MAX_VIEWS
         if len(self.views) < most:
             return
@@ -141,7 +141,7 @@ def answers(address: Address) -> bool:
 
 
 async def forward(request: BrowserRequest, viewer: Address, path: str) -> Response:
-    """A viewer's answer to a GET."""
+    """Forward a GET to a viewer."""
     status, headers, body = await asyncio.to_thread(fetch, viewer, path, request.headers.get("accept-encoding", ""))
     kept = {name: value for name, value in headers if name.lower() not in HOP_HEADERS | {"set-cookie"}}
     return Response(body, status, kept | ISOLATION_HEADERS)
@@ -160,7 +160,7 @@ def fetch(viewer: Address, path: str, encoding: str) -> tuple[int, list[tuple[st
 
 
 async def forward_messages(browser: WebSocket, viewer: Address, view: SceneView | None) -> None:
-    """Connect a browser's websocket with a viewer's, until either ends."""
+    """Connect a browser's websocket to a viewer's, until either closes."""
     from websockets.asyncio.client import connect
     from websockets.exceptions import WebSocketException
 

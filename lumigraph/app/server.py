@@ -84,7 +84,7 @@ class MakeBody(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class MoreBody(msgspec.Struct, forbid_unknown_fields=True):
-    """Body of a request for more training: a quality, or minutes of training in all; neither to go on as before."""
+    """Body of a request for more training: a quality, or total minutes of training; neither to continue as before."""
 
     quality: Quality | None = None
     minutes: Annotated[float, msgspec.Meta(gt=0, le=100_000)] | None = None
@@ -105,8 +105,8 @@ class RunBody(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Answer(JSONResponse):
-    """JSON that any browser reads, also of received files: numbers that are not finite become null, and letters that
-    are no Unicode, as names of files may have, escapes."""
+    """JSON response that any browser reads, also of received files: numbers that are not finite become null, and
+    invalid Unicode, as in file names, escapes."""
 
     def render(self, content: Any) -> bytes:
         try:
@@ -161,14 +161,14 @@ class Gate:
 
 
 def plain(scope: Scope) -> PlainRequest:
-    """A request as the guard reads it."""
+    """A request as input of the guard."""
     path = scope["path"] + ("?" + scope["query_string"].decode("latin-1") if scope["query_string"] else "")
     headers = Headers([(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]])
     return PlainRequest(path, headers)
 
 
 class App:
-    """State of the app: its folder, the jobs, the viewers. Everything that lasts is in files."""
+    """State of the app: its folder, the jobs, the viewers. Everything persistent is in files."""
 
     def __init__(self, root: Path, address: Address, program: Sequence[str] = REQUESTED):
         self.root, self.address = root.resolve(), address
@@ -178,8 +178,8 @@ class App:
         self._large = ThreadPoolExecutor(1, "large")
 
     async def later(self, answer: Callable[..., Any], *arguments: Any, is_large: bool = False) -> Any:
-        """Result of work that takes long, in threads of its own, so that uploads need not wait for it. is_large: it
-        decodes a large photograph, for which others need not wait"""
+        """Result of slow work, in threads of its own, so that uploads need not wait for it. is_large: it decodes a
+        large photograph, for which others need not wait"""
         pool = self._large if is_large else self._slow
         return await asyncio.get_running_loop().run_in_executor(pool, answer, *arguments)
 
@@ -225,7 +225,7 @@ class App:
         return find_item(self.root, key)
 
     def detail(self, item: Item) -> dict[str, Any]:
-        """All that the page of an item shows."""
+        """Contents of an item's page."""
         record, job = item.record, read_job(item)
         files = pictures.photographs_of(item)
         runs = [rows.run_row(path) for path in item.runs]
@@ -354,7 +354,7 @@ class App:
 
 
 def check_source(source: Path) -> None:
-    """Raise LumigraphError unless a path on this machine holds photographs, a video or a scene."""
+    """Raise LumigraphError unless a path on this machine is a photograph folder, a video or a scene."""
     if not source.exists():
         raise LumigraphError(f"{source} does not exist; check the path")
     poses = any((source / name).exists() for name in projects.SCENE_FILES)
@@ -522,7 +522,7 @@ def qr_code(text: str) -> bytes:
 
 
 async def body_of(request: Request, kind: Any) -> Any:
-    """Body of a request as a value of a kind. Raises LumigraphError for anything else."""
+    """Body of a request, parsed as a kind. Raises LumigraphError for anything else."""
     data = b""
     async for piece in request.stream():
         data += piece
@@ -538,7 +538,7 @@ def whole(text: str) -> int:
 
 
 def refused(request: Request, fault: Exception) -> Response:
-    """One sentence for a fault of a request."""
+    """Error response of one sentence."""
     if isinstance(fault, uploads.MisplacedError):
         return Answer({"fault": str(fault), "have": fault.have}, 409)
     if isinstance(fault, uploads.DiskFullError):
@@ -555,7 +555,7 @@ def refused(request: Request, fault: Exception) -> Response:
 
 @contextlib.asynccontextmanager
 async def living(app: App) -> AsyncIterator[None]:
-    """The time that the server runs: jobs and viewers end with it."""
+    """Lifetime of the server: jobs and viewers end with it."""
 
     async def sweep() -> None:
         while True:
@@ -573,7 +573,7 @@ async def living(app: App) -> AsyncIterator[None]:
 
 
 class Announcing(uvicorn.Server):
-    """A server that calls a function once it answers."""
+    """A server with a callback when it is ready."""
 
     def __init__(self, config: uvicorn.Config, opened: Callable[[], object]):
         super().__init__(config)
@@ -585,7 +585,7 @@ class Announcing(uvicorn.Server):
 
 
 def serve(root: Path, address: Address, opened: Callable[[], object]) -> None:
-    """Serve a folder until Ctrl-C. opened: called once the server answers
+    """Serve a folder until Ctrl-C. opened: called when the server is ready
 
     Raises LumigraphError if another app serves the folder.
     """

@@ -1,4 +1,4 @@
-"""Files to share: kinds, with the request that makes each and its size before it is written."""
+"""Files to share: kinds, the request to make each, and its estimated size."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MESH_BYTES, POINTS_BYTES = 6_000_000, 4_000_000
 class ShareKind:
     """One kind of file.
 
-    about: for people; command: that makes it
+    about: for users; command: that makes it
     clouds_only: True for methods of Gaussians alone
     size: estimate in bytes, from the number of Gaussians; None for other methods
     """
@@ -66,7 +66,7 @@ KINDS: dict[ShareName, ShareKind] = {
 
 
 def kinds_for(path: Path) -> list[dict[str, Any]]:
-    """Kinds of files that can be made of a run or a splat file, each with its estimated size."""
+    """Kinds of files for a run or a splat file, each with its estimated size."""
     count = gaussians_of(path)
     return [
         {"kind": name, "title": kind.title, "about": kind.about, "bytes": kind.size(count)}
@@ -76,7 +76,7 @@ def kinds_for(path: Path) -> list[dict[str, Any]]:
 
 
 def gaussians_of(path: Path) -> int | None:
-    """Number of Gaussians of a run or a splat file; None for what is no cloud."""
+    """Number of Gaussians of a run or a splat file; None without Gaussians."""
     from ..large import open_run
     from ..run.records import read_rows
 
@@ -112,7 +112,7 @@ def share_job(item: Item, kind: ShareName, run: Path, now: float, size: int | No
 
 
 def share_request(item: Item, job: ShareJob) -> Request:
-    """The command that makes a file. A file of an earlier version is replaced, as it is one of ours."""
+    """Command that makes a file. It replaces our own file of an earlier version."""
     run, place = item.run(job.run), item.path / SHARED / job.name
     if job.kind == COMPARE:
         return Request("eval", {"run_folder": str(run)} | eval_options(run))

@@ -1,6 +1,6 @@
-"""Uploads: photographs and videos that a browser sends in pieces. Names, types, sizes and room are checked, and a file
-takes its name once it is whole and is what it says. Nothing that was given is replaced: a file of the same name with
-other content gets a number behind its name, and one with the same content is there once."""
+"""Uploads: photographs and videos that a browser sends in chunks. Names, types, sizes and disk space are checked, and a
+file gets its name when it is complete and of its declared type. Nothing is replaced: a file of the same name with other
+content gets a numbered name, and one with the same content is stored once."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ CONTAINERS = (
 
 
 class DiskFullError(LumigraphError):
-    """The disk has no room for an upload."""
+    """The disk has no space for an upload."""
 
 
 class MisplacedError(LumigraphError):
-    """A piece that does not continue the file. have: bytes that are there"""
+    """A chunk at the wrong offset. have: bytes received so far"""
 
     def __init__(self, have: int):
         super().__init__(f"The upload goes on from byte {have}")
@@ -64,7 +64,7 @@ class Album:
         self.refresh()
 
     def refresh(self) -> None:
-        """List the folder, and delete parts of uploads that nobody continues."""
+        """List the folder, and delete parts of abandoned uploads."""
         self._count, self._listed = 0, time.monotonic()
         self._unread: dict[tuple[str, int], list[str]] = defaultdict(list)  # names by wanted name and size
         self._known: dict[tuple[str, int], dict[str, str]] = defaultdict(dict)  # those that were read, by content
@@ -92,7 +92,9 @@ class Album:
         return self._count >= MAX_FILES
 
     def find(self, name: str, size: int, content: str | Path) -> str | None:
-        """Name of the file with this content among those of a wanted name. content: hash, or a file of that content"""
+        """Name of the file with this content among those of a requested name. content: hash, or a file of that
+        content
+        """
         key = name, size
         with self.lock:
             for one in self._unread.pop(key, ()):
@@ -106,7 +108,7 @@ class Album:
         return found if is_of_size(place, size) and hash_of(place) == wanted else None
 
     def add(self, file: Path, name: str) -> str:
-        """Move a whole file to a wanted name, or to one with a number behind it. Returns the name."""
+        """Move a complete file to a requested name, numbered if taken. Returns the name."""
         name = free_name(self.folder, name, self._numbers.get(name, 1) + 1)
         size = file.stat().st_size
         file.rename(self.folder / name)
@@ -114,7 +116,7 @@ class Album:
         return name
 
     def leave_out(self, name: str, folder: Path) -> None:
-        """Move a photograph into another folder, where nothing is replaced either."""
+        """Move a photograph into another folder, without replacing anything there."""
         with self.lock, explained(self.folder / name):
             target = folder / free_name(folder, name)
             refuse_links_above(target, folder)
@@ -139,7 +141,7 @@ def album(folder: Path) -> Album:
 
 @dataclass(frozen=True)
 class Arrived:
-    """State of an upload: bytes that have arrived, and once it is done, the name that the file has."""
+    """State of an upload: received bytes, and when complete, the file's name."""
 
     have: int
     name: str
@@ -148,10 +150,10 @@ class Arrived:
 
 @dataclass(frozen=True)
 class Upload:
-    """A file on its way into an album.
+    """An upload into an album.
 
-    name: wanted, with "/"; size: bytes of the whole file; content: its hash, by which it goes on and is known to be
-    there; empty if the sender has not computed it
+    name: requested, with "/"; size: bytes of the whole file; content: its hash, to resume and to detect duplicates;
+    empty if the sender has not computed it
     """
 
     album: Album
@@ -165,7 +167,7 @@ class Upload:
         return place.with_name(f".{place.name}.{self.size}-{self.content}.part")
 
     def arrived(self) -> Arrived:
-        """State of this upload. Raises LumigraphError if it is new and the project has all the files that it may."""
+        """State of this upload. Raises LumigraphError if it is new and the project has the maximum number of files."""
         have = self.partial.stat().st_size if self.partial.is_file() else 0
         if 0 < have < self.size:
             return Arrived(have, self.name)
@@ -175,9 +177,9 @@ class Upload:
         return Arrived(0, self.name)
 
     async def take(self, offset: int, pieces: AsyncIterator[bytes]) -> Arrived:
-        """Add a piece that begins at an offset: all of it, or nothing.
+        """Add a chunk at an offset, completely or not at all.
 
-        Raises MisplacedError, DiskFullError, or LumigraphError with one sentence for a file that is refused.
+        Raises MisplacedError, DiskFullError, or LumigraphError with one sentence for a refused file.
         """
         data = bytearray()
         async for piece in pieces:
@@ -214,7 +216,9 @@ class Upload:
             raise LumigraphError(f"{self.name} could not be written ({error.strerror}); drop it again") from error
 
     def _finish(self) -> str:
-        """Give a whole file its name. Raises LumigraphError, and deletes it, if it is not what it says."""
+        """Give a complete file its name. Raises LumigraphError, and deletes it, if its content is not of its
+        declared type.
+        """
         try:
             if fault := fault_of(self.partial, self.name):
                 raise LumigraphError(fault)
@@ -234,7 +238,7 @@ class Upload:
 
 
 def upload(folder: Path, name: str, size: int, content: str = "") -> Upload:
-    """An upload into a project's photographs. Raises LumigraphError for names and sizes that are refused."""
+    """An upload into a project's photographs. Raises LumigraphError for refused names and sizes."""
     name = safe_name(name)
     kind = kind_of_file(name)
     if kind is None:
@@ -248,8 +252,8 @@ def upload(folder: Path, name: str, size: int, content: str = "") -> Upload:
 
 
 def safe_name(name: str) -> str:
-    """A file's name that every system takes, below a folder of photographs: without characters that cannot be read or
-    mean something else, and not too long. Raises LumigraphError for one that leads out of the folder."""
+    """A portable file name below a folder of photographs: without invisible or special characters, and not too long.
+    Raises LumigraphError for one that leads out of the folder."""
     if ".." in re.split(r"[\\/]", name) or name.startswith(("/", "\\")):
         raise LumigraphError(f"{visible(name)} leads out of the folder of photographs; rename it and drop it again")
     *above, last = PurePosixPath(name).parts or [""]
@@ -271,12 +275,12 @@ def visible(text: str) -> str:
 
 
 def readable(text: str) -> str:
-    """Visible text, with "-" for characters that mean something else on some system."""
+    """Visible text, with "-" for characters that are special on some system."""
     return FORBIDDEN.sub("-", visible(text))
 
 
 def shortened(text: str, size: int) -> str:
-    """The first letters of a text, as many as fit into so many bytes."""
+    """Text truncated to `size` bytes."""
     return text.encode()[: max(size, 0)].decode(errors="ignore").rstrip(". ")
 
 
@@ -297,14 +301,14 @@ def kind_of_file(name: str) -> str | None:
 
 
 def free_name(folder: Path, name: str, number: int = 2) -> str:
-    """The name itself; where it is taken, one with a number behind it. number: the first to try"""
+    """The name itself; if it is taken, a numbered one. number: the first to try"""
     place = PurePosixPath(name)
     others = (place.with_stem(f"{place.stem}-{n}").as_posix() for n in itertools.count(number))
     return next(one for one in itertools.chain([name], others) if not os.path.lexists(folder / one))
 
 
 def refuse_links_above(place: Path, folder: Path) -> None:
-    """Raise LumigraphError for a link among the folders between a place and the folder that it must be in."""
+    """Raise LumigraphError for a symbolic link among the folders between a path and the folder that must contain it."""
     for above in place.relative_to(folder).parents:
         refuse_link(folder / above)
 
@@ -329,7 +333,7 @@ def hash_of(path: Path) -> str:
 
 
 def check_room(folder: Path, size: int) -> None:
-    """Raise DiskFullError unless so many bytes fit on the disk and some remain."""
+    """Raise DiskFullError unless a file fits on the disk with a reserve."""
     if shutil.disk_usage(folder).free - size < RESERVED_BYTES:
         raise full(folder)
 
@@ -339,7 +343,7 @@ def full(folder: Path) -> DiskFullError:
 
 
 def fault_of(path: Path, name: str) -> str | None:
-    """A sentence for a file whose content is not what its name says; None for a good one."""
+    """Sentence for a file whose content does not match its suffix; None for a valid one."""
     if kind_of_file(name) == "video":
         with open(path, "rb") as file:
             begin = file.read(16)

@@ -15,10 +15,10 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files import explained, open_anew
+from ..files.options import option
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
 from .common import show
-from .options import option
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from .. import methods
 from ..budget import Budget
 from ..errors import LumigraphError
 from ..files import claim
+from ..files.options import DeviceOption, Overwrite, ReaderOption, SeedOption, StepsOption, needed, option
 from ..files.ranges import Count, Downscale, Scales, Seconds, Seed, Share, Steps
 from ..training.options import DEFAULT_SECONDS
 from .capture import posed
 from .common import choose_device, preset_device, say, scene_name, show, show_table
-from .options import DeviceOption, Overwrite, ReaderOption, SeedOption, StepsOption, needed, option
 
 FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
 
@@ -200,15 +200,6 @@ class BenchMethods(Cells):
         return self.conduct(cells, settings)
 
 
-@dataclass(frozen=True)
-class Place:
-    """A scene: its source, its short name, and the name of its collection, if any."""
-
-    source: str
-    scene: str
-    collection: str = ""
-
-
 @dataclass(frozen=True, kw_only=True)
 class BenchViews(Cells):
     """Train methods on fewer and fewer photographs of a scene, and compare the same held-out views.
@@ -278,33 +269,34 @@ class BenchViews(Cells):
                 cells += trained
         return learnt, cells
 
-    def places(self, source: str) -> Iterator[Place]:
-        """The source itself, or held-out members of the collection that it is."""
+    def places(self, source: str) -> Iterator[tuple[str, str, str]]:
+        """Source, short name and collection of the source, or of held-out members of the collection that it is."""
         from ..datasets.collection import Collection
         from ..geometry import evenly
         from ..lab.benchmark.cell import MEMBERS
         from ..opening import kind_of, open_dataset, sources_of
 
         if kind_of(source) is not Collection:
-            yield Place(source, scene_name(source))
+            yield source, scene_name(source), ""
             return
         collection, of_member = open_dataset(source), sources_of(source)
         assert isinstance(collection, Collection)
         held_out = [collection.names[i] for i in collection.splits["test"].tolist()]
         for name in evenly(held_out, self.members):
-            yield Place(of_member[name], scene_name(name), scene_name(source) + MEMBERS)
+            yield of_member[name], scene_name(name), scene_name(source) + MEMBERS
 
     def cells_of(
-        self, place: Place, names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
+        self, place: tuple[str, str, str], names: Sequence[str], budget: Budget, learnt: dict[str, dict[int, Path]]
     ) -> Iterator[Cell]:
         """A place's cells: each number of photographs, each seed, each method."""
         from ..lab.benchmark.cell import Cell
 
-        there = self.there(place.source)
-        for number in self.possible(place.source, there):
+        source, scene, collection = place
+        there = self.there(source)
+        for number in self.possible(source, there):
             for seed in self.seeds:
                 for name in names:
-                    cell = Cell(name, place.scene, place.source, budget, seed, number, place.collection)
+                    cell = Cell(name, scene, source, budget, seed, number, collection)
                     if name in learnt:  # a prior gets all photographs as input
                         cell = replace(cell, views=number or there, prior=str(learnt[name][seed]))
                     yield cell
@@ -375,7 +367,7 @@ class BenchShapes:
             Cell(name, scene_name(place), place, budget, self.seed)
             for place in map(place_of, self.shapes)
             for name in names
-            if not (is_folder(place) and learns_one(name))
+            if not (Path(place).is_dir() and learns_one(name))
         ]
         if code := conduct(cells, settings, self.output, say):
             return code
@@ -384,10 +376,6 @@ class BenchShapes:
         measure(measured, self.members, self.points, self.cells, self.output, say)
         show({"table": str(self.output / "shapes.md"), "figures": str(self.output / "shapes.json")})
         return 0
-
-
-def is_folder(place: str) -> bool:
-    return Path(place).is_dir()
 
 
 def learns_one(name: str) -> bool:

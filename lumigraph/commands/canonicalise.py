@@ -10,9 +10,9 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files import claim_folder
+from ..files.options import needed, option
 from ..files.ranges import Seed, Steps, between
 from .common import choose_device, show, typed
-from .options import needed, option
 
 
 @dataclass(frozen=True)

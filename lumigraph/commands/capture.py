@@ -10,9 +10,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..files.options import needed, option
 from ..sfm.options import MotionOptions
 from .common import finding_rows, lines, say, scene_name, show, typed
-from .options import needed, option
 from .results import Output
 
 MAX_NAMED_GAPS = 2  # gaps around the subject that are named

@@ -9,24 +9,13 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..derive.options import CleanOptions
+from ..files.options import Overwrite, needed, option
 from .common import choose_device
-from .options import Overwrite, needed, option
-from .results import Reports, Result
+from .results import Output, Reports, Result
 
 
-@dataclass(frozen=True)
-class CleanFiles:
-    """Source and output of cleaning."""
-
-    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
-    output: Annotated[Path, needed("NEW")]
-    """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
-    overwrite: Overwrite = False
-
-
-@dataclass(frozen=True)
-class Clean(Reports, CleanOptions, CleanFiles):
+@dataclass(frozen=True, kw_only=True)
+class Clean(Reports, CleanOptions, Output):
     """Remove floaters from a trained cloud of Gaussians, or crop it to a box or a sphere.
 
     The result is a new run, which opens, renders and resumes, or a splat file, if --output ends like one. The source
@@ -34,6 +23,11 @@ class Clean(Reports, CleanOptions, CleanFiles):
     To crop without removing floaters, give --strength 0 with --box or --sphere.
     """
 
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of a run, a splat file, or a composition."""
+    output: Annotated[Path, needed("NEW")]
+    """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
+    overwrite: Overwrite = False
     device: Annotated[str, option("NAME")] = "auto"
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 

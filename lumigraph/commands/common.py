@@ -10,7 +10,7 @@ from contextvars import ContextVar
 from typing import Any
 
 from .. import methods
-from ..budget import Budget, Quality, about_quality
+from ..budget import about_quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
 from ..files.names import next_free as next_free
@@ -71,21 +71,13 @@ def value_of(name: str, arguments: Sequence[str], default: str) -> str:
     return default
 
 
-def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
-    """The steps of --quality for a method on its data."""
-    return Budget(method.steps_for(quality, data), quality=quality)
-
-
 def quality_of(kind: Any) -> str:
     """Help text of --quality, with the epochs and the least steps of a kind of method."""
     from ..method import RayMethod
 
     unit = "pixel" if issubclass(kind, RayMethod) else "photograph"
-    efforts = {
-        name: f": {effort.passes:g} epochs over all {unit}s, at least {effort.at_least:,} steps"
-        for name, effort in kind.efforts.items()
-    }
-    return about_quality(efforts)
+    said = ": {0.passes:g} epochs over all {1}s, at least {0.at_least:,} steps"
+    return about_quality({name: said.format(effort, unit) for name, effort in kind.efforts.items()})
 
 
 def say(text: str) -> None:

@@ -10,9 +10,9 @@ from tyro.conf import Positional, UseAppendAction
 
 from ..errors import LumigraphError
 from ..files import claim
+from ..files.options import Overwrite, needed, option
 from ..files.ranges import Coordinate, Positive, between
 from .common import show, typed
-from .options import Overwrite, needed, option
 
 if TYPE_CHECKING:
     from ..datasets.tracks import TrackEdits

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..derive.options import CompressOptions
+from ..files.options import DeviceOption, needed
 from .common import choose_device, say, show_table, typed
-from .options import DeviceOption, needed
 from .results import Output, Reports, Result
 
 INVISIBLE_LOSS, VISIBLE_LOSS = 0.3, 1.0  # dB

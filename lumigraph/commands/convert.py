@@ -12,17 +12,23 @@ from tyro.conf import Positional
 
 from ..derive.options import ConvertOptions
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, needed
 from .common import choose_device, method_config, say, show_table, typed
 from .compress import size
-from .options import DeviceOption, needed
-from .results import Reports, Result
+from .results import Output, Reports, Result
 
 LIST_WIDTH, INDENT = 80, 12  # letters
 
 
-@dataclass(frozen=True)
-class ConvertFiles:
-    """Source and output of a conversion."""
+@dataclass(frozen=True, kw_only=True)
+class Convert(Reports, ConvertOptions, Output):
+    """Turn a trained run, or a splat file, into a run of another method.
+
+    The new method is initialised from the old one: grids and networks from its density and colour at points, Gaussians
+    on its surfaces. Then it trains on the photographs if they are available, otherwise on renderings of the old one.
+    NEW/convert.json has the PSNR between the two on held-out views, and the size and speed of each. After Ctrl-C the
+    same command continues. `lumigraph convert RUN METHOD --help` adds the method's own options.
+    """
 
     source: Annotated[Positional[Path | None], needed("RUN_OR_FILE")] = None
     """Folder of a run, which does not change, or a splat file."""
@@ -32,20 +38,7 @@ class ConvertFiles:
     """New folder for the run."""
     list: bool = False
     """Print the table of possible conversions, and exit."""
-
-
-@dataclass(frozen=True)
-class Convert(Reports, ConvertOptions, ConvertFiles):
-    """Turn a trained run, or a splat file, into a run of another method.
-
-    The new method is initialised from the old one: grids and networks from its density and colour at points, Gaussians
-    on its surfaces. Then it trains on the photographs if they are available, otherwise on renderings of the old one.
-    NEW/convert.json has the PSNR between the two on held-out views, and the size and speed of each. After Ctrl-C the
-    same command continues. `lumigraph convert RUN METHOD --help` adds the method's own options.
-    """
-
     taught: ClassVar[bool] = True  # the method's defaults are those that follow another method
-
     device: DeviceOption = "auto"
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""

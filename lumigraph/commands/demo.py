@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ..budget import Budget
+from ..files.options import DeviceOption, option
 from ..files.ranges import Count, Seconds
 from ..system.console import bold
+from ..training.options import TrainOptions
 from .common import choose_device, exit_code, next_free, say, show, typed
-from .options import DeviceOption, option
 
 FRAMES = 90
 
@@ -43,18 +43,18 @@ class Demo:
         from ..metrics import scores_of
         from ..opening import open_dataset
         from ..paths import film_cameras
-        from ..run import Run, build, check_new
-        from ..training import fit
+        from ..run import check_new
+        from ..training.beginning import begin_run
+        from ..training.loop import fit
 
-        budget = Budget(seconds=self.seconds)
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free("demo/run")
         check_new(output)
 
         say(f"Photographing {self.scene}")
         data = open_dataset(self.scene, kind.learns_from)
-        method = build(kind, data.frame, kind.preset(device), device, seed=0, learning=True)
-        run = Run.create(output, method, data, budget=budget.to_json())
+        asked = TrainOptions(seconds=self.seconds)
+        run, method, budget = begin_run(methods.check(self.method), data, kind.preset(device), device, asked, output)
         outcome = fit(method, data, run, budget=budget)
         if outcome.signal is not None:
             say(f"Stopped and saved after step {outcome.state.step}; go on with: {typed('resume', run.folder)}")
@@ -64,11 +64,12 @@ class Demo:
         film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit, FilmOptions(depth=True))
         report = write_report(run)
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
-        rows = {
-            f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
-            "film": str(orbit),
-            "report": str(report),
-            "run": str(run.folder),
-        }
-        show(rows)
+        show(
+            {
+                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
+                "film": str(orbit),
+                "report": str(report),
+                "run": str(run.folder),
+            }
+        )
         return 0

@@ -9,8 +9,8 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ..export.options import DepthOptions
+from ..files.options import needed
 from .common import lines, show, typed
-from .options import needed
 from .results import Output
 
 LOW_SURE_SHARE = 0.3

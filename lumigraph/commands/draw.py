@@ -10,9 +10,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, Overwrite, Set, needed, option
 from ..files.ranges import Count, FramesPerSecond, Pixels, between
 from .common import choose_device, show
-from .options import DeviceOption, Overwrite, Set, needed, option
 
 MAX_SEED, MAX_SEEDS = 9999, 256
 FRAMES_PER_SEED = 30

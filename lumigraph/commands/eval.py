@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from ..evaluation.options import EvaluationOptions
+from ..files.options import DeviceOption, Overwrite, RunOption, Set, option
 from ..system.console import bold
 from .common import choose_device
-from .options import DeviceOption, Overwrite, RunOption, Set, option
 from .results import Evaluation, Reports
 
 

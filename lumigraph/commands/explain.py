@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option
 from ..files.ranges import Count, Downscale, Seconds, Steps, between
-from .common import choose_device, say, scene_name, show
-from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option
+from .common import choose_device, scene_name, show
 
 Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 OCTAVES = tuple(2.0**octave for octave in range(8))  # scales of encodings, 1 to 128
@@ -164,7 +164,7 @@ class ExplainLightField:
         folder = self.output or run.folder / "lightfield"
         for file in ("lightfield.png", "lightfield.svg", "lightfield.json"):
             claim(folder / file, "figure", self.overwrite)
-        name, camera = view_of(run, "test", self.view)
+        name, camera = run.find_view("test", self.view)
         method = controlled(run, run.method(choose_device(self.device)), self.settings)
         camera = camera.resized(self.size / int(camera.size.max())).to(method.device)
         focus = focal_distance(method, camera)
@@ -215,7 +215,7 @@ class ExplainRay:
         from ..system.progress import counting
 
         run = Run(self.run_folder)
-        name, camera = view_of(run, self.split, self.view)
+        name, camera = run.find_view(self.split, self.view)
         x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         for file in (output, output.with_suffix(".json")):
@@ -224,7 +224,9 @@ class ExplainRay:
         camera = method.refined(camera)
         with counting("Sampling the ray"):
             sight = along_ray(method, camera, pixel)
-        sight = sight.beside(self._photograph(run, name))
+        scene = run.photographs(self.scene, "The figure does without the photograph")
+        if scene is not None:
+            sight = sight.beside(scene.photograph(scene.names.index(name)).before(run.frame.background))
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
         write_bytes(output, standalone(ray_figure(sight, title)), "figure")
         about: dict[str, Any] = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
@@ -232,18 +234,6 @@ class ExplainRay:
         write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
         return 0
-
-    def _photograph(self, run: Any, name: str) -> Any:
-        """The photograph before the run's background, or None if it was moved and --scene is not given."""
-        try:
-            scene = run.scene(self.scene)
-            photograph = scene.photograph(scene.names.index(name))
-        except LumigraphError as error:
-            if self.scene:
-                raise
-            say(f"The figure does without the photograph: {error}")
-            return None
-        return photograph.before(run.frame.background)
 
 
 @dataclass(frozen=True)
@@ -318,12 +308,6 @@ class ExplainTemplate:
         draw(folder, f"{run.title}: train, move, continue", first, found)
         show({f"{x.method}, {x.stage}": str(x) for x in found} | {"files": str(folder)})
         return 0
-
-
-def view_of(run: Any, split: str, view: str) -> tuple[str, Any]:
-    """Name and Camera of a photograph, by its name or number in a split of a Run."""
-    number = run.find_view(split, view)
-    return run.view_names()[split][number], run.cameras()[split][number]
 
 
 What = (

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
@@ -26,9 +25,9 @@ from ..export.options import (
     SplatsOptions,
 )
 from ..files import claim
+from ..files.options import DeviceOption, Overwrite, Set, SourceOption, needed, option
 from ..files.ranges import between
 from .common import choose_device, say, show
-from .options import DeviceOption, Overwrite, Set, SourceOption, needed, option
 from .results import Exported, Reports
 
 
@@ -39,6 +38,12 @@ class Files:
     source: SourceOption
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
+    endings: ClassVar[tuple[str, ...]] = ()  # of the output, where it needs one
+
+    def check(self) -> None:
+        """Raises LumigraphError for an output with another ending."""
+        if self.endings and self.output.suffix.lower() not in self.endings:
+            raise LumigraphError(f"{self.output} should end in {self.endings[0]}; rename it")
 
 
 @dataclass(frozen=True)
@@ -121,9 +126,10 @@ class ExportMesh(Reports, Loading, MeshOptions, Files):
         return Exported(self.output, counts, tuple(written), rows=rows | place_row(frame, told))
 
     def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other."""
+        """Raises LumigraphError for numbers that contradict each other, and for another ending."""
         from ..export.mesh_file import ending
 
+        super().check()
         if self.extent is not None and self.part.crops:
             raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
         ending(self.output, self.texture)
@@ -166,7 +172,7 @@ class ExportSplats(Reports, SplatsOptions, Files):
 
 
 @dataclass(frozen=True)
-class ExportOctree(Reports):
+class ExportOctree(Reports, Files):
     """Export the octree of a plenoctrees run as one .npz, for volrend and svox.
 
     It is in the frame of the photographs. If that is rotated against the scene's, it is in the scene's frame, because
@@ -177,6 +183,7 @@ class ExportOctree(Reports):
     """Folder of a run."""
     output: Annotated[Positional[Path], needed("FILE.npz")]
     """The new file."""
+    endings = (".npz",)
     depth: Annotated[Annotated[int, between(1, 10)] | None, option("N", "all there are")] = None
     """Largest depth of the octree; deeper levels are averaged, for a smaller file."""
     overwrite: Overwrite = False
@@ -197,11 +204,6 @@ class ExportOctree(Reports):
         }
         return Exported(self.output, {"nodes": len(octree.child)}, rows=rows)
 
-    def check(self) -> None:
-        """Raises LumigraphError for another ending."""
-        if self.output.suffix.lower() != ".npz":
-            raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
-
 
 @dataclass(frozen=True)
 class ExportPoints(Reports, Loading, PointsOptions, Files):
@@ -212,6 +214,7 @@ class ExportPoints(Reports, Loading, PointsOptions, Files):
 
     output: Annotated[Positional[Path], needed("FILE.ply")]
     """The new file."""
+    endings = (".ply",)
 
     def of(self, opened: Any) -> Exported:
         from ..export.points import export_points, write_points
@@ -222,11 +225,6 @@ class ExportPoints(Reports, Loading, PointsOptions, Files):
         count = len(points.positions)
         rows = {"file": str(self.output), "points": f"{count:,}", "size": size_text(self.output)}
         return Exported(self.output, {"points": count}, rows=rows | place_row(opened.frame, self.origin))
-
-    def check(self) -> None:
-        """Raises LumigraphError for another ending."""
-        if self.output.suffix.lower() != ".ply":
-            raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
 
 
 @dataclass(frozen=True)
@@ -361,6 +359,8 @@ class ExportCollision(CollisionOptions, ExportMesh):
     `lumigraph export mesh`.
     """
 
+    endings = (".glb",)
+
     def exported(self, loaded: Any) -> Exported:
         from ..export.collision import convex_pieces
         from ..export.mesh import export_mesh
@@ -371,11 +371,6 @@ class ExportCollision(CollisionOptions, ExportMesh):
         rows = {"pieces": f"{len(found)}, {sum(len(faces) for _, faces in found.values()):,} triangles"}
         made = self.written(loaded.frame, mesh, why, found)
         return replace(made, counts={**made.counts, "pieces": len(found)}, rows={**made.rows, **rows})
-
-    def check(self) -> None:
-        super().check()
-        if self.output.suffix.lower() != ".glb":
-            raise LumigraphError(f"{self.output} should end in .glb, which holds pieces by name; rename it")
 
 
 @dataclass(frozen=True)
@@ -421,36 +416,28 @@ class ExportWeb(Reports, PageOptions, Files):
 
     output: Annotated[Positional[Path], needed("FILE.html")]
     """The page."""
+    endings = ".html", ".htm"
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
     device: DeviceOption = "auto"
 
     def of(self, opened: Any) -> Exported:
+        from ..derive.conversion import becomes_octree, octree_of
         from ..export.page import export_page
 
         claim(self.output, "page", self.overwrite, [self.source])
         loaded, rows = self.loaded(opened), dict[str, str]()
-        holds, counts = export_page(loaded, self.output, self, self.octree(loaded, rows))
-        rows |= {"page": str(self.output), "holds": holds, "size": size_text(self.output)}
-        return Exported(self.output, counts, rows=rows)
 
-    def octree(self, loaded: Any, rows: dict[str, str]) -> Callable[[], Any] | None:
-        """Function that converts what is loaded to an octree and adds a row; None where it cannot become one."""
-        from ..derive.conversion import becomes_octree, octree_of
-
-        def converted() -> Any:
+        def octree() -> Any:
             about = f"to an octree, which then learns on for {self.seconds:.0f} s; --as views is quicker"
             show({"converts": about})
-            method, rows["converted"] = octree_of(loaded.opened, self.seconds, choose_device(self.device))
+            method, rows["converted"] = octree_of(opened, self.seconds, choose_device(self.device))
             return method
 
-        return converted if becomes_octree(loaded.opened, loaded.method) else None
-
-    def check(self) -> None:
-        """Raises LumigraphError for another ending, and for what is no colour."""
-        if self.output.suffix.lower() not in (".html", ".htm"):
-            raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
+        holds, counts = export_page(loaded, self.output, self, octree, becomes_octree(opened, loaded.method))
+        rows |= {"page": str(self.output), "holds": holds, "size": size_text(self.output)}
+        return Exported(self.output, counts, rows=rows)
 
 
 What = (

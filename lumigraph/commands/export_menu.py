@@ -15,15 +15,7 @@ from .export import What
 
 ENDINGS = {"mesh": ".glb", "octree": ".npz", "panorama": ".jpg", "points": ".ply", "snerg": "", "splats": ".spz"}
 ENDINGS |= {"collision": ".glb", "lightfield": "", "probes": "", "stereo": ".jpg", "web": ".html"}
-ELSEWHERE = (
-    "source",
-    "output",
-    "overwrite",
-    "scene",
-    "part",
-    "settings",
-    "device",
-)  # fields that the viewer sets otherwise
+ELSEWHERE = "source", "output", "overwrite", "scene", "part", "settings", "device"  # which the viewer sets otherwise
 PRIVATE = "origin"  # a switch that is off in the viewer, whose files are often passed on; on the command line it is on
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated
 
 from .. import methods
+from ..files.options import option
 from ..files.ranges import Seconds
 from .common import say, show
-from .options import option
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, PhotographsOption, RunOption, needed
 from .common import choose_device, show
-from .options import DeviceOption, PhotographsOption, RunOption, needed
 
 
 @dataclass(frozen=True)

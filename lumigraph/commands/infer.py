@@ -9,9 +9,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, ReaderOption, needed, option
 from ..files.ranges import Count, Downscale, Seed
 from .common import choose_device, next_free, scene_name, show
-from .options import DeviceOption, ReaderOption, needed, option
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,11 @@ class Infer:
         check_kind(f"infer by {name}", Scene, type(scene), self.scene)
         assert isinstance(scene, Scene)
         most = self.views or prior.method.evidence_views
-        if len(scene.cameras) <= (most or HOLD_OUT):
+        if whole := len(scene.cameras) <= (most or HOLD_OUT):
             options["whole"] = True
-            scene = open_dataset(self.scene, Scene, **options)
-        assert isinstance(scene, Scene)
         if most is not None:
-            options["views"] = self.views or min(most, len(scene.splits["train"]))
+            options["views"] = self.views or min(most, len(scene.cameras if whole else scene.splits["train"]))
+        if whole or most is not None:
             scene = open_dataset(self.scene, Scene, **options)
         assert isinstance(scene, Scene)
         run = infer(made_by, prior, scene, output, options)

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
+from ..files.options import ReaderOption, needed, option
 from ..files.ranges import Downscale
 from ..system.console import console
-from .options import ReaderOption, needed, option
 
 TREE_WIDTH = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
 

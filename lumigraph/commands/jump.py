@@ -10,8 +10,8 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ..export.options import JumpOptions
+from ..files.options import Overwrite, needed
 from .common import show
-from .options import Overwrite, needed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,10 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..export.options import Photo3DOptions
+from ..files.options import Overwrite, needed
 from .capture import posed
 from .common import show, typed
 from .export import place_row, size_text
-from .options import Overwrite, needed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..export.options import AUTO, FilmOptions
+from ..files.options import Animate, DeviceOption, Overwrite, Set, needed, option
 from .compress import size as file_size
-from .options import Animate, DeviceOption, Overwrite, Set, needed, option
 from .results import Film, Output, Reports
 
 CHOSEN = {

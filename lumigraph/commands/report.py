@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..files.options import Overwrite, RunOption
 from .common import show
-from .options import Overwrite, RunOption
 
 
 @dataclass(frozen=True)

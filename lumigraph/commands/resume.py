@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..budget import Budget, given_budget
+from ..budget import Budget
 from ..errors import LumigraphError
+from ..files.options import RunOption, ViewerOptions
 from ..training.options import ResumeOptions
-from .common import choose_device, exit_code, quality_budget, typed
-from .options import RunOption, ViewerOptions
+from .common import choose_device, exit_code, typed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Resume(ViewerOptions, ResumeOptions):
 
     def _go_on(self, run: Any) -> int:
         from ..run.derived import Inferred
-        from ..training import fit
+        from ..training.loop import fit
         from .outcome import show_outcome
         from .view import end_training, keep_showing, watching
 
@@ -64,13 +64,12 @@ class Resume(ViewerOptions, ResumeOptions):
                 f"{run.folder} was made by a prior and learns nothing itself; go on with the prior: "
                 + typed("resume", made.prior)
             )
-        given = given_budget(self.steps, self.seconds, self.quality)
         if self.quality is None:
-            budget = budget_from_now(run, given)
+            budget = budget_from_now(run, self.budget)
         device = choose_device(run.settings.device if self.device == "same" else self.device)
         method, data = run.new_method(device), run.dataset(self.scene)
         if self.quality is not None:
-            budget = budget_from_now(run, quality_budget(self.quality, method, data))
+            budget = budget_from_now(run, Budget(method.steps_for(self.quality, data), quality=self.quality))
         if budget.to_json() != run.settings.budget:
             run.set_budget(**budget.to_json())
         with watching(self, method, data, run) as watch:

@@ -10,8 +10,8 @@ from tyro.conf import Positional, UseAppendAction
 
 from ..derive.options import SegmentOptions
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, Overwrite, needed
 from .common import choose_device
-from .options import DeviceOption, Overwrite, needed
 from .results import Reports, Result
 
 

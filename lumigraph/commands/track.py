@@ -13,9 +13,9 @@ from tyro.conf import Positional
 from .. import methods
 from ..budget import Budget
 from ..errors import LumigraphError
+from ..files.options import ViewerOptions, needed, option
 from ..training.options import TRACKED_SIDE, TrackOptions
 from .common import choose_device, exit_code, method_config, next_free, scene_name
-from .options import ViewerOptions, needed, option
 from .results import Output
 
 
@@ -39,7 +39,7 @@ class Track(ViewerOptions, TrackOptions, Output):
     def run(self) -> int:
         from ..opening import confirm, open_scene
         from ..run import Run, build, check_new
-        from ..training import fit
+        from ..training.loop import fit
         from .outcome import show_tracking
         from .view import keep_showing, watching
 

@@ -10,9 +10,10 @@ from typing import Annotated, Any
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress, arg
 
 from .. import methods
-from ..budget import Quality, given_budget
+from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.names import counted
+from ..files.options import ViewerOptions, needed, option
 from ..training.options import BlockOptions, TrainOptions
 from .capture import posed
 from .common import (
@@ -28,7 +29,6 @@ from .common import (
     typed,
 )
 from .main_options import hidden_options, option_names
-from .options import ViewerOptions, needed, option
 from .results import Output
 
 
@@ -55,7 +55,7 @@ def learn_in_blocks(train: Train, blocks: BlockOptions) -> tuple[Path, int] | No
         device = torch.device("cuda" if train.device == "gpu" else train.device)
     config = method_config(train, methods.check(blocks.field or train.method))
     run, plan, workers = begin_blocks(source, places, train.method, config, device, train, blocks, train.output)
-    show_plan(run, plan, given_budget(train.steps, train.seconds, train.quality))
+    show_plan(run, plan, train.budget)
     return run, train_all(run, plan, workers)
 
 
@@ -139,8 +139,8 @@ class Train(ViewerOptions, TrainOptions, Output):
         """
         from ..opening import open_dataset
         from ..run import check_new
-        from ..training import fit
         from ..training.beginning import begin_run, check_source
+        from ..training.loop import fit
         from .outcome import show_outcome
         from .view import end_training, keep_showing, watching
 

@@ -12,9 +12,9 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from ..components.guidance.clip_files import write_clip
 from ..files import claim_folder, replacing_folder
+from ..files.options import needed, option
 from ..training.captions import CaptionNumbers, learn_captions
 from .common import next_free, show, typed
-from .options import needed, option
 
 
 @dataclass(frozen=True)

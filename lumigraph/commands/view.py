@@ -12,10 +12,10 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..files.options import DeviceOption, Set, ViewerToken, needed, option
 from ..files.ranges import Port
 from ..system.signals import until_interrupted
 from .common import choose_device, show
-from .options import DeviceOption, Set, ViewerToken, needed, option
 
 
 @dataclass(frozen=True)
@@ -58,22 +58,15 @@ class ViewCommand:
 
 def page_of(opened: Any, method: Any, cameras: Any) -> Any:
     """A function that makes the page of a baked method; `None` for any other method, and before it is baked."""
-    from ..export.page import browsable, is_baked
+    from ..export.page import browsable, is_baked, volume_bytes
+    from ..paths.opening import opening_of_scene
 
-    if not is_baked(method):
-        return None
     try:
-        volume, _ = browsable(method)
+        volume = browsable(method)[0] if is_baked(method) else None
     except LumigraphError:
         return None
-
-    def page() -> bytes:
-        from ..export.page import volume_bytes
-        from ..paths.opening import opening_of_scene
-
-        return volume_bytes(volume, opening_of_scene(opened.title, cameras["train"], opened.frame))
-
-    return page
+    opening = opening_of_scene(opened.title, cameras["train"], opened.frame)
+    return volume and (lambda: volume_bytes(volume, opening))
 
 
 def behind_of(opened: Any, method: Any, cameras: Any) -> Any:

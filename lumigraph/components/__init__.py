@@ -1,3 +1,3 @@
-"""Building blocks that several methods share: fields, sampling, clouds of Gaussians, training."""
+"""Building blocks shared by several methods: fields, sampling, clouds of Gaussians, training."""
 
 from ..system import kernel_cache as kernel_cache

@@ -1,4 +1,4 @@
-"""Instances: objects of a scene by their labels, and the controls that remove, move or copy one of them."""
+"""Instances: labelled objects of a scene, and the controls that remove, move or copy one of them."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ class Edit:
 
     @property
     def leaves(self) -> bool:
-        """True if the instance is gone from its own place."""
+        """True if the instance is removed from its original place."""
         return self.kind in (REMOVE, MOVE)
 
     @property
     def appears(self) -> bool:
-        """True if the instance is at another place."""
+        """True if the instance is shown at another place."""
         return self.kind in (MOVE, COPY)
 
     def place(self, middle: Float[Tensor, " 3"]) -> Similarity:
-        """From its own place to the other one. middle: about which it turns"""
+        """Similarity from its original place to the other one. middle: centre of its rotation"""
         angle, middle = math.radians(self.turn), middle.double().cpu()
         cosine, sine = math.cos(angle), math.sin(angle)
         rotation = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -58,7 +58,7 @@ class Edit:
 
 
 def edit_controls(learnt: Bool[Tensor, " label"], reach: float) -> tuple[Control, ...]:
-    """Controls of edits; none before instances are learnt."""
+    """Controls of edits; none before instances are trained."""
     names = tuple(str(x) for x in learnt.nonzero()[:, 0].tolist())
     if not names:
         return ()
@@ -82,7 +82,7 @@ def edit_of(method: Configured) -> Edit | None:
 
 
 def check_labels(scene: Scene) -> None:
-    """Raises LumigraphError for photographs without labels, of which alpha is none either."""
+    """Raise LumigraphError for photographs without labels and without alpha."""
     if LABELS not in scene.layers and not scene.images.has_alpha:
         raise LumigraphError(
             f"{scene.source} has no labels of objects; put a picture of whole numbers for each photograph, of its "
@@ -95,8 +95,8 @@ def check_labels(scene: Scene) -> None:
 def labels_of(
     extra: dict[str, Tensor], alpha: Tensor | None, room: int
 ) -> tuple[Int[Tensor, "*pixels"], Bool[Tensor, "*pixels"]]:
-    """Label of each pixel, NOT_AN_INSTANCE where it shows none; and whether that is known. Without labels the opaque
-    pixels of photographs with alpha are instance 0. Raises LumigraphError for labels beyond `room`."""
+    """Label of each pixel, NOT_AN_INSTANCE for none; and a mask of known ones. Without labels the opaque pixels of
+    photographs with alpha are instance 0. Raises LumigraphError for labels beyond `room`."""
     if LABELS not in extra:
         assert alpha is not None
         opaque = alpha > OPAQUE_ALPHA
@@ -112,5 +112,5 @@ def labels_of(
 
 
 def layers_of(scene: Scene) -> tuple[str, ...]:
-    """Names of the layers that instances are learnt from."""
+    """Names of the layers with instance labels."""
     return (LABELS,) if LABELS in scene.layers else ()

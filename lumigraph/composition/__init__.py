@@ -1,4 +1,4 @@
-"""Composition: several methods in one picture with mutual occlusion, and parts of one method."""
+"""Composition: several methods in one picture with mutual occlusion, and crops of one method."""
 
 from ..system import kernel_cache as kernel_cache
 from .composed import Composed as Composed

@@ -1,10 +1,9 @@
-"""Composed: several placed methods as one, which offers what all of them offer; and parts of one method.
+"""Composed: several placed methods as one method with their common capabilities; and crops of one method.
 
-Parts that march give their samples, and `union` puts all samples along a ray in order. Clouds become one cloud, whose
-Gaussians the rasteriser puts in order. Where both meet, and for methods that do neither, a part is rendered first and
-stands in the picture as a thin surface at the depth that it rendered. That is exact in front of, between and behind
-opaque things. Where such a part is see-through, all of it stands at its mean depth: what lies between its near and its
-far side is hidden by all or by none of it.
+Parts that march give their samples, and `union` merges all samples along a ray. Clouds become one cloud, which the
+rasteriser sorts. Where both meet, and for methods that do neither, a part is rendered first and becomes a thin surface
+at its rendered depth. That is exact in front of, between and behind opaque objects. A translucent part of that kind is
+at its mean depth: objects within it are in front of all of it or behind.
 """
 
 from __future__ import annotations
@@ -40,9 +39,9 @@ OPAQUE_THRESHOLD = 1 - 1e-6  # opacity that counts as fully so
 
 
 def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
-    """Several methods in one picture, in a frame of their own. Ready to render, and nothing else.
+    """Several methods in one picture, in a frame of their own. For rendering only.
 
-    It has Gaussians if all parts have, looks if all march, and density if all of these know theirs.
+    It has Gaussians if all parts have, looks if all march, and density if all of these have it.
     """
     methods = [part.method for part in parts]
     if all(can(method, HasGaussians) for method in methods):
@@ -55,14 +54,14 @@ def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
 def cropped(method: Method, crop: Crop) -> Method:
     """Method restricted to a crop in its frame, for rendering only.
 
-    Along rays its samples end where the crop does; Gaussians are picked by their centres; of methods with neither,
-    pixels are by their depth.
+    Samples along rays are clipped to the crop; Gaussians are selected by their centres; for methods with neither,
+    pixels by their depth.
     """
     return compose(method.frame, [Placed(method, Similarity.make(1.0), crop, leads=True)]).to(method.device)
 
 
 class Composed(Method):
-    """Base of compositions: parts at places, not trainable. count: of parts, those of compositions among them"""
+    """Base class of compositions, not trainable. count: number of parts, those of nested compositions included"""
 
     count: int
     rays_per_chunk: int
@@ -86,14 +85,14 @@ class Composed(Method):
         return tuple(found.values())
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same composition, each part told what it has a control for."""
+        """The same composition with each part's values of controls."""
         told = super().given(*evidence, **controls)
         assert isinstance(told, Composed)
         told.pieces = tuple(part.given(controls) for part in self.pieces)
         return told
 
     def refined(self, cameras: Camera) -> Camera:
-        """Cameras as the part that leads sees them, whose they are."""
+        """Cameras refined by the leading part."""
         return next((part.refined(cameras) for part in self.pieces if part.leads), cameras)
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
@@ -101,7 +100,7 @@ class Composed(Method):
 
 
 class ComposedRays(Composed, RayMethod):
-    """Parts that all march."""
+    """Composition of parts that all march."""
 
     def looks(self, rays: Rays) -> list[Look]:
         """The union of every part's last look."""
@@ -109,7 +108,7 @@ class ComposedRays(Composed, RayMethod):
 
 
 class ComposedField(ComposedRays):
-    """Parts that all march and know their density."""
+    """Composition of parts that all march and have density."""
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit, the sum of the parts'."""
@@ -117,7 +116,7 @@ class ComposedField(ComposedRays):
 
 
 class ComposedCloud(Composed):
-    """Parts that are clouds: one cloud."""
+    """Composition of clouds, as one cloud."""
 
     def gaussians(self) -> Gaussians:
         """All parts' Gaussians, in the scene's frame."""
@@ -130,7 +129,7 @@ class ComposedCloud(Composed):
 
 
 class ComposedMixture(Composed):
-    """Parts of several kinds: some march, the rest are rendered first and stand as surfaces."""
+    """Composition of several kinds of parts: some march, the rest are rendered first, as surfaces."""
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
@@ -158,7 +157,7 @@ class ComposedMixture(Composed):
 
 
 def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: Float[Tensor, " ray"]) -> Look:
-    """A rendered part as a thin sample at its depth. rgb: over black."""
+    """A rendered part as a thin sample at its depth. rgb: over black"""
     hit = (opacity > MIN_OPACITY) & depth.isfinite()
     rgb, depth, opacity = rgb[hit], depth[hit], opacity[hit]
     half = 0.5 * THICKNESS_SHARE * depth
@@ -168,7 +167,7 @@ def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: 
 
 
 class PickedCloud(Method):
-    """A cloud as it is: it renders, and does not learn. refined: whether it was learnt with poses"""
+    """A fixed cloud for rendering only. refined: whether it was trained with pose optimisation"""
 
     def __init__(self, frame: Frame, gaussians: Gaussians, refined: bool = False):
         super().__init__(frame, None)
@@ -208,7 +207,7 @@ class PickedCloud(Method):
 
 
 def at_moment_of(method: Any, camera: Camera) -> Any:
-    """The method at the moment of a camera, if both have one and --set does not say another."""
+    """The method at the time of a camera, if both have one and the settings do not set it."""
     control = next((one for one in method.controls if one.name == "time"), None)
     if control is None or control.range is None or camera.time is None or "time" in method.settings:
         return method
@@ -217,10 +216,10 @@ def at_moment_of(method: Any, camera: Camera) -> Any:
 
 
 def union(looks: Sequence[Look]) -> Look:
-    """All that lies along rays: densities add up where samples of several looks overlap, and colours mix by density.
+    """Union of looks along rays: densities add up where samples overlap, and colours are mixed by density.
 
-    Exact: every sample is cut where another look's sample begins or ends, so that density and colour stay constant over
-    each piece, as they were over the samples. Light that one look emits passes through the other's haze.
+    Exact: every sample is split at the ends of the others, so that density and colour are constant over each piece.
+    Light of one look passes through the other's medium.
     """
     if len(looks) == 1:
         return looks[0]
@@ -241,7 +240,7 @@ def kept(look: Look, mask: Tensor) -> Look:
 
 
 def cut(looks: Sequence[Look]) -> Look:
-    """The pieces between all beginnings and ends of samples, where there is anything."""
+    """Split samples at all interval ends; empty pieces are left out."""
     rays = len(looks[0].samples.ray_starts) - 1
     t, ray, begins = edges(looks)
     begin, end, on = t[:-1], t[1:], ray[:-1]
@@ -264,7 +263,7 @@ def cut(looks: Sequence[Look]) -> Look:
 def edges(looks: Sequence[Look]) -> tuple[Float[Tensor, " edge"], Int[Tensor, " edge"], Int[Tensor, " edge"]]:
     """Edges of samples: distance, ray, and the number of the look whose sample begins there, -1 for ends.
 
-    By ray, then by distance.
+    Sorted by ray, then by distance.
     """
     parts = [(look.samples.t_start, look.samples.t_end, look.samples.ray_index) for look in looks]
     t = torch.cat([x for begin, end, _ in parts for x in (begin, end)])

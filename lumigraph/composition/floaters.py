@@ -1,4 +1,4 @@
-"""Floaters: Gaussians in free space, scored by evidence from the cloud, the cameras and the depth that they see."""
+"""Floaters: Gaussians in free space, scored by evidence from the cloud, the cameras and their depth maps."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class FloaterEvidence:
     """Evidence that each Gaussian is a floater, each measure in [0, 1].
 
     isolated: distance to its neighbours in sizes of both, in robust deviations from the median
-    in_front: share of cameras that see a surface clearly behind it, among those that it is not hidden from
-    near:     closeness to a camera, in median depths of what cameras see
+    in_front: share of cameras with a surface clearly behind it, among those that it is not hidden from
+    near:     proximity to a camera, relative to the median depth
     few:      1 if no camera sees it, 0 from four cameras on
     """
 
@@ -50,16 +50,16 @@ class FloaterEvidence:
 
     @property
     def place(self) -> Float[Tensor, " gaussian"]:
-        """Evidence of the place: in front, near a camera, or seen by few, each of which suffices."""
+        """Evidence of position: in front, near a camera, or seen by few, combined as 1 - product of complements."""
         return 1 - (1 - self.in_front) * (1 - self.near) * (1 - FEW_WEIGHT * self.few)
 
     @property
     def score(self) -> Float[Tensor, " gaussian"]:
-        """Weighted geometric mean of isolation and place, so that a floater needs both."""
+        """Weighted geometric mean of isolation and position, so that a floater needs both."""
         return (self.isolated * self.place.square()).pow(2 / 3).clamp(0, 1)
 
     def floaters(self, strength: float) -> Bool[Tensor, " gaussian"]:
-        """Gaussians to remove: a score above 1 - strength. A larger strength removes no fewer."""
+        """Gaussians to remove: a score above 1 - strength. Monotonic in the strength."""
         return self.score > 1 - strength
 
 
@@ -112,9 +112,9 @@ def isolation(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
 
 
 def nearness(gaussians: Gaussians, cameras: Camera, seen: Camera, frame: Frame) -> Float[Tensor, " gaussian"]:
-    """Evidence of being near one of the cameras: 1 at the camera, 0 from half of the median depth on.
+    """Evidence of proximity to a camera: 1 at the camera, 0 from half of the median depth on.
 
-    seen: the cameras whose depth is measured
+    seen: the cameras of the depth measurement
     """
     depths = [x.depth[x.solid].median() for x in depth_maps(gaussians, seen, frame) if x.solid.any()]
     if not depths:

@@ -1,11 +1,11 @@
-"""Meshes in a field, lit by its probes: irradiance at their points, and the light that they keep from what is around.
+"""Meshes in a field, lit by its probes: irradiance at their points, and their shadows on the field.
 
     mesh:    L(x) = albedo / pi  E(x, n)                                                    with E from the probes
     shadow:  S(x) = sum_w L(x, w) (n . w) (1 - O(x, w)) / sum_w L(x, w) (n . w),   n . w > 0     for each channel
 
 w runs over directions spread evenly over the sphere, L(x, w) is the probes' radiance and O(x, w) is 1 where the mesh
-lies between x and the light from w (ambient occlusion weighted by the light of each direction). O comes from a depth
-map of the mesh for each direction. The field's picture is decoded, multiplied by S, and encoded again.
+occludes x in direction w (ambient occlusion weighted by the light of each direction). O comes from a depth map of the
+mesh for each direction. The field's picture is decoded, multiplied by S, and encoded again.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ POINTS_PER_CHUNK = 1 << 15
 
 @dataclass(frozen=True)
 class ShadedMesh:
-    """Triangles whose corners have shading normals; corners are split at creases.
+    """Triangles with shading normals; corners are split at creases.
 
-    vertices: in the frame of its maker
+    vertices: in the frame of its source
     albedo:   diffuse reflectance, linear
     """
 
@@ -93,7 +93,7 @@ class ShadedMesh:
 
 
 class LitMesh(Method):
-    """A mesh in the light of probes. It renders, and does not learn.
+    """A mesh lit by probes, for rendering only.
 
     mesh:    in the frame of the method
     grid:    the probes
@@ -111,7 +111,7 @@ class LitMesh(Method):
 
     @cached_property
     def openness(self) -> Float[Tensor, "vertex 3"]:
-        """Share of the irradiance of each vertex that the mesh itself leaves."""
+        """Share of each vertex's irradiance that is not self-occluded."""
         there = self.mesh.transformed(self.to_grid)
         return self.shadows.shares(there.vertices, there.normals, self.grid)
 
@@ -134,14 +134,14 @@ class LitMesh(Method):
 
 
 def filled(depth: Float[Tensor, "height width"], wanted: Bool[Tensor, "height width"]) -> Tensor:
-    """Depth of pixels whose centre a silhouette misses, from their nearest neighbour; infinity where none has any."""
+    """Depth of pixels whose centre is just outside a silhouette, from their nearest neighbour; infinity without one."""
     around = -torch.nn.functional.max_pool2d(-depth[None], 3, 1, 1)[0]
     return torch.where(wanted & depth.isinf(), around, depth)
 
 
 @dataclass(frozen=True)
 class ShadowMaps:
-    """Distances from lamps far away to a mesh, a map for each direction.
+    """Depth maps of a mesh from distant lamps, one for each direction.
 
     toward: unit directions to the lamps
     depth:  distance from each lamp; infinity beside the mesh
@@ -175,7 +175,7 @@ class ShadowMaps:
     def shares(
         self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"], grid: ProbeGrid
     ) -> Float[Tensor, "point 3"]:
-        """S of each point, by channel: the share of its irradiance that the mesh leaves. 1 far from the mesh."""
+        """S of each point, by channel: the unshadowed share of its irradiance. 1 far from the mesh."""
         found = torch.ones_like(points)
         away = (points - self.centre).norm(dim=-1)
         near = (self.radius / away.clamp_min(self.radius)) ** 2 > MIN_SHADOW
@@ -198,8 +198,8 @@ def sphere_points(count: int) -> Float[Tensor, "point 3"]:
 
 
 class LitComposition(Composed):
-    """A field and meshes in its light, which cast shadows onto it. Meshes are opaque: of a field that is translucent in
-    front of one, all is in front of it or all behind, by its mean depth."""
+    """A field and meshes in its light, which cast shadows onto it. Meshes are opaque: a translucent field is in front
+    of a mesh or behind it as a whole, by its mean depth."""
 
     def __init__(self, frame: Frame, parts: Sequence[Placed]):
         super().__init__(frame, parts)

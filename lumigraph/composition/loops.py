@@ -1,4 +1,4 @@
-"""The loop over points, lamps and a mesh between them (Numba)."""
+"""Loop over points and lamps with occlusion by a mesh (Numba)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from numba import njit, prange
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def unshadowed(points, normals, coefficients, basis, toward, poses, depth, scale, bias, found):
-    """ShadowMaps.shares: the share of each point's irradiance, by channel, that the mesh leaves.
+    """Loop of ShadowMaps.shares: the unshadowed share of each point's irradiance, by channel.
 
     points:       in units of the mesh's radius, from its centre
     coefficients: L_lm at each point;  basis: Y_lm of each lamp's direction
     depth:        of the mesh from each lamp;  scale: pixels of a map for a slope of 1 in its camera
-    bias:         by which the mesh must be nearer to the lamp
+    bias:         shadow bias, towards the lamp
     """
     side = depth.shape[1]
     for i in prange(len(points)):

@@ -1,4 +1,4 @@
-"""Placed: a method at a pose, cropped by a box or a sphere; and the frame that holds several of them."""
+"""Placed: a method at a pose, cropped by a box or a sphere; and the common frame of several."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Placed:
     """One part of a picture.
 
     place:  from the frame of the method to that of the picture
-    crop:   in the method's own frame; nothing outside it is shown. None for all there is
-    leads:  whether the picture's cameras are this part's. They keep its `Frame.near` free, as its own did, and what it
-            learnt for each of its photographs holds for them. Cameras may come as near as they like to any other part
+    crop:   visible part in the method's own frame; None for all
+    leads:  whether the picture's cameras are this part's: then `Frame.near` applies to them, and so do its learnt
+            values of each photograph. Cameras may come arbitrarily close to any other part
     """
 
     method: Method
@@ -40,9 +40,9 @@ class Placed:
     leads: bool = False
 
     def look(self, rays: Rays) -> Look:
-        """The last look of a method that marches: distances and density per unit of the picture, cut by the crop.
+        """The last look of a method that marches: distances and density per unit of the picture, clipped to the crop.
 
-        A ray that does not lead begins `Frame.near` behind the eye, for the method looks at nothing that is nearer.
+        A ray of a part that does not lead begins `Frame.near` behind the eye, since the method samples nothing nearer.
         """
         scale, behind = self.place.scale, 0.0 if self.leads else self.method.frame.near
         local = self._inward(rays, behind)
@@ -67,7 +67,7 @@ class Placed:
         return needs(self.method, HasDensity).density(local) / self.place.scale * self._holds(local)
 
     def gaussians(self) -> Gaussians:
-        """The cloud in the picture's frame, without those Gaussians whose centres the crop leaves out."""
+        """The cloud in the picture's frame, without Gaussians whose centres are outside the crop."""
         return cleaned(needs(self.method, HasGaussians).gaussians(), self.crop).transformed(self.place.matrix)
 
     def rendering(self, camera: Camera) -> Rendering:
@@ -88,18 +88,18 @@ class Placed:
         return replace(seen, depth=seen.depth * self.place.scale)
 
     def given(self, controls: dict[str, Value]) -> Placed:
-        """The same part, told those of the controls that its method has and a composition shows."""
+        """The same part with the values of controls that its method has."""
         mine = {x.name for x in self.method.controls if self.leads or not x.of_photographs} & controls.keys()
         return replace(self, method=self.method.given(**{name: controls[name] for name in mine})) if mine else self
 
     def refined(self, cameras: Camera) -> Camera:
-        """Cameras of the picture as the method has come to see them."""
+        """Cameras of the picture with the method's pose refinement."""
         there = cameras.transformed(self.place.inverse.matrix)
         known = self.method.refined(there)
         return cameras if known is there else known.transformed(self.place.matrix)
 
     def _inward(self, rays: Rays, behind: float) -> Rays:
-        """The same rays in the method's frame, from a distance behind where they began."""
+        """Rays in the method's frame, beginning a distance behind their origins."""
         back = self.place.inverse
         directions = back.directions(rays.directions)
         origins = back.points(rays.origins) - behind * directions
@@ -112,7 +112,7 @@ class Placed:
         return moved if self.leads else replace(moved, image_index=None)
 
     def _holds(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-        """Whether the crop holds points of the method's frame; all, where there is none."""
+        """Mask of points of the method's frame inside the crop; all without one."""
         if self.crop is None:
             return torch.ones(len(points), dtype=torch.bool, device=points.device)
         return self.crop.holds(points)
@@ -121,12 +121,12 @@ class Placed:
 def standing(
     part: Frame, lead: Frame, at: Float[Tensor, " 3"] | None = None, scale: float = 1.0, turn: float = 0.0
 ) -> Similarity:
-    """The place of a part that stands upright in the lead's scene, from the part's source to the lead's.
+    """Similarity of an upright part in the lead's scene, from the part's source to the lead's.
 
-    at:    where the foot of the part goes, the middle of its box of interest's lower side, in the lead's source;
-           None for the lead's own foot
+    at:    position of the part's foot, the centre of its box of interest's lower side, in the lead's source; None for
+           the lead's own foot
     scale: units of the lead's source to one of the part's
-    turn:  degrees about the vertical, counterclockwise as seen from above
+    turn:  degrees about the vertical, counterclockwise seen from above
     """
     here, there = part.to_source, lead.to_source
     angle = math.radians(turn)
@@ -145,7 +145,7 @@ def foot(frame: Frame) -> Float[Tensor, " 3"]:
 
 
 def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, CropBox | None]]) -> Frame:
-    """The lead's frame, with bounds and reach that hold other parts as well: their frames, places in it, and boxes.
+    """The lead's frame, with bounds and reach extended to other parts: their frames, places in it, and boxes.
 
     Its box of interest may then be larger than [-1, 1]^3, unlike that of any single scene.
     """

@@ -1,4 +1,4 @@
-"""PlayedCloud: a moving cloud as a file holds it; FilteredCloud: some of the Gaussians of a method that moves."""
+"""PlayedCloud: a moving cloud from a file; FilteredCloud: some of the Gaussians of a dynamic method."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .composed import NEAR_PLANE_SCALE, at_moment_of
 
 
 class PlayedCloud(Method):
-    """A moving cloud as it is: it renders at any moment, and does not learn. frame: with the times 0 to its duration"""
+    """A fixed moving cloud for rendering only, at any time. frame: with the times 0 to its duration"""
 
     def __init__(self, frame: Frame, moving: MovingGaussians):
         super().__init__(replace(frame, times=(0.0, moving.duration)), None)
@@ -34,7 +34,7 @@ class PlayedCloud(Method):
         return (moment(self.frame.times),)
 
     def moving(self, duration: float) -> MovingGaussians:
-        """The moving cloud, in the scene's frame, played in so many seconds."""
+        """The moving cloud, in the scene's frame, stretched to a duration in seconds."""
         return self._moving.lasting(duration)
 
     def gaussians(self) -> Gaussians:
@@ -52,7 +52,7 @@ class PlayedCloud(Method):
 
 
 class FilteredCloud(Method):
-    """Some Gaussians of a method whose Gaussians move, at any moment. kept: mask over all of them"""
+    """Some Gaussians of a dynamic method, at any time. kept: mask over all of them"""
 
     def __init__(self, method: Any, kept: Bool[Tensor, " gaussian"]):
         super().__init__(method.frame, None)

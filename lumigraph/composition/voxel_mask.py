@@ -1,7 +1,7 @@
-"""VoxelMask: a part of a field by voxels, as `lumigraph segment` cuts it; and its file.
+"""VoxelMask: a part of a field by voxels, as `lumigraph segment` writes it; and its file.
 
 object    (x, y, z), 1 in voxels of the part
-observed  (x, y, z), 1 where photographs saw something; the colour of anything else is a guess and is shown as unknown
+observed  (x, y, z), 1 in voxels that photographs saw; the colour of any other is a guess and is shown as unknown
 lower     lower corner of the grid in the frame of the method's scene
 edge      of a voxel, scene units
 """
@@ -32,7 +32,7 @@ ONE = Similarity.make(1.0)
 
 @dataclass(frozen=True, eq=False)
 class VoxelMask(Crop):
-    """The voxels of a part, or with `outside` everything but them.
+    """The voxels of a part, or with `outside` their complement.
 
     place: similarity from the frame of the grid
     """
@@ -62,7 +62,7 @@ class VoxelMask(Crop):
         return torch.where(known[:, None], rgb, rgb.new_tensor(UNKNOWN_COLOUR))
 
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Distances at which rays enter and leave the box around the part; all of them without end for `outside`."""
+        """Entry and exit distances of rays in the box around the part; unbounded for `outside`."""
         if self.outside:
             return torch.zeros_like(rays.radius), torch.full_like(rays.radius, torch.inf)
         return self.box.through(rays)
@@ -72,7 +72,7 @@ class VoxelMask(Crop):
 
     @property
     def box(self) -> CropBox:
-        """Box around the voxels of the part; around the whole grid where there are none."""
+        """Box around the voxels of the part; around the whole grid if there are none."""
         cells = self.part.nonzero()
         first, last = (
             (cells.amin(0), cells.amax(0) + 1) if len(cells) else (torch.zeros(3), torch.tensor(self.part.shape))
@@ -95,15 +95,15 @@ class VoxelMask(Crop):
 def mask_of(
     chosen: Bool[np.ndarray, "x y z"], seen: Bool[np.ndarray, "x y z"], lower: Vector, edge: float
 ) -> VoxelMask:
-    """The mask of a choice among voxels that photographs saw. Any other voxel, such as the inside of an object, goes
-    with the nearest that they saw."""
+    """Mask of chosen voxels among those that photographs saw. Any other voxel, such as the inside of an object, follows
+    the nearest visible one."""
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
     part = torch.from_numpy(chosen[tuple(nearest)].astype(np.uint8))
     return VoxelMask(part, torch.from_numpy(seen.astype(np.uint8)), lower, edge)
 
 
 def read_mask(path: Path) -> VoxelMask:
-    """Read a mask's file. Raises LumigraphError for a file that is none."""
+    """Read a mask's file. Raises LumigraphError for an invalid one."""
     with reading(path, "is no mask of voxels", "`lumigraph segment` makes one"):
         arrays = safetensors.numpy.load(path.read_bytes())
         part, observed, lower, edge = (arrays[name] for name in ("object", "observed", "lower", "edge"))

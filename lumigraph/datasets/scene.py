@@ -307,9 +307,7 @@ class Scene:
             if names.count(name) == 1:
                 return names.index(name)
         shown = ", ".join([*self.names[:4], "..."] if len(self) > 4 else self.names)
-        raise LumigraphError(
-            f"{self.source} has no photograph {name!r}; there are {shown}, and numbers up to {len(self) - 1}"
-        )
+        raise LumigraphError(f"{self.source} has no photograph {name!r}; there are {shown}, from 0 to {len(self) - 1}")
 
     def __repr__(self) -> str:
         """Five lines: photographs, their sizes, the frame, what else is known, the source."""

@@ -1,8 +1,8 @@
 """Depth maps of methods, sensors and multi-view stereo: back-projection, visibility, TSDF fusion.
 
 A `DepthMap` is one camera and, for each pixel, the distance along its ray to the first surface, in scene units:
-infinity where nothing is, NaN where nothing was measured. `DepthMap.of_rendering` and `render_depth_maps` make them of
-a method, `DepthMap.measured` of a sensor, a depth file or multi-view stereo.
+infinity for empty space, NaN for unmeasured. `DepthMap.of_rendering` and `render_depth_maps` make them from a method,
+`DepthMap.measured` from a sensor, a depth file or multi-view stereo.
 """
 
 from ..system import kernel_cache as kernel_cache

@@ -1,4 +1,4 @@
-"""DepthMap: the distance to the first surface at every pixel of a camera; of several: free space, TSDF, colours."""
+"""DepthMap: distance to the first surface at every pixel of a camera; of several: free space, TSDF, colours."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ DEPTH_EDGE = Tolerance(per_distance=0.1)  # between neighbouring pixels, where o
 
 
 class SurfaceComparison(NamedTuple):
-    """Points compared with the surface that one camera sees.
+    """Points compared with one camera's depth map.
 
-    ahead:    how far the surface lies behind each point along its ray, scene units: negative for hidden points,
-              infinity where the ray meets nothing, NaN for points outside the picture or where nothing was measured
-    smooth:   whether the surface is one there, rather than an edge in front of something else
-    pixels:   where the points lie in the picture (x, y)
+    ahead:    distance of the surface behind each point along its ray, scene units: negative for hidden points, infinity
+              for empty rays, NaN for points outside the picture or unmeasured
+    smooth:   False at a depth edge
+    pixels:   (x, y) of the points
     distance: from the camera, scene units
     """
 
@@ -69,7 +69,7 @@ class SurfaceComparison(NamedTuple):
 def back_project(
     camera: Camera, pixels: Float[Tensor, "point 2"], depth: Float[Tensor, " point"], along_axis: bool = False
 ) -> Float[Tensor, "point 3"]:
-    """Points o + t d in the world, of pixels (x, y) of one camera and their depths t in scene units.
+    """Back-project pixels (x, y) of one camera with depths t in scene units: o + t d.
 
     along_axis: depth is measured along the optical axis (z-depth): t = z / cos, with the angle of ray and axis
     """
@@ -79,11 +79,11 @@ def back_project(
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points of surfaces in the frame of the cameras that saw them.
+    """Surface points in the frame of the cameras.
 
     normals: unit length, towards the camera
     colours: sRGB-encoded, in [0, 1]
-    origins: position of the camera that saw each
+    origins: position of each point's camera
     """
 
     points: Float[Tensor, "point 3"]
@@ -109,8 +109,8 @@ class DepthMap:
     """One camera and the first surface along each pixel's ray. Rows of pixels, on the CPU.
 
     camera:  a batch of one, of this size
-    depth:   distance along the ray, scene units; infinity where nothing is, NaN where nothing was measured
-    opacity: share of light that is stopped, in [0, 1]; a pixel shows a surface above SURFACE_OPACITY
+    depth:   distance along the ray, scene units; infinity for empty space, NaN for unmeasured
+    opacity: accumulated opacity, in [0, 1]; a pixel shows a surface above SURFACE_OPACITY
     rgb:     sRGB-encoded, in [0, 1], without the background
     normals: of the surface, unit length, where known; else they follow from the depth
     """
@@ -123,7 +123,7 @@ class DepthMap:
 
     @staticmethod
     def of_rendering(camera: Camera, rendering: Rendering, background: Vector) -> DepthMap:
-        """Depth map of what a method renders of this camera; the background is taken out of its colours.
+        """Depth map of a method's rendering for this camera; the background is removed from its colours.
 
         c = (C - (1 - a) b) / a    (Porter & Duff 1984, C = a c + (1 - a) b), with a at least CLEAR_OPACITY
         """
@@ -136,15 +136,15 @@ class DepthMap:
     def measured(
         camera: Camera, depth: Float[Tensor, "height width"], rgb: Float[Tensor, "height width 3"]
     ) -> DepthMap:
-        """Depth map of a sensor, a depth file or multi-view stereo. Opacity is 1 where something was measured, else 0.
+        """Depth map of a sensor, a depth file or multi-view stereo. Opacity is 1 for measured pixels, else 0.
 
-        depth: along rays, scene units, as a photograph's layer has it (`Photograph.extra["depth"]`); infinity where
-               nothing is, NaN where nothing was measured
+        depth: along rays, scene units, as in a photograph's layer (`Photograph.extra["depth"]`); infinity for empty
+               space, NaN for unmeasured
         """
         return DepthMap(camera, depth, depth.isfinite().float(), rgb)
 
     def within(self, mask: Bool[Tensor, "rows columns"]) -> DepthMap:
-        """The same with depth only where a mask of the picture, in any size, is true; NaN elsewhere."""
+        """Depth within a mask of the picture, of any size; NaN elsewhere."""
         sized = interpolate(mask[None, None].float(), tuple(self.depth.shape), mode="nearest-exact")[0, 0] > 0
         return replace(self, depth=torch.where(sized, self.depth, torch.nan))
 
@@ -155,7 +155,7 @@ class DepthMap:
 
     @cached_property
     def surface_depth(self) -> Float[Tensor, "height width"]:
-        """Depth of pixels that show a surface; infinity for others, NaN where nothing was measured."""
+        """Depth of pixels that show a surface; infinity for others, NaN for unmeasured."""
         return torch.where(self.solid | self.depth.isnan(), self.depth, torch.inf)
 
     @property
@@ -165,7 +165,7 @@ class DepthMap:
 
     @property
     def facing(self) -> Float[Tensor, "height width"]:
-        """Cosine between the normal and the way back to the camera; 0 where there is no surface."""
+        """Cosine between the normal and the direction to the camera; 0 without a surface."""
         return self._orientation[1]
 
     @cached_property
@@ -178,9 +178,9 @@ class DepthMap:
         return normals * facing.sign()[..., None], facing.abs() * self.solid
 
     def positions(self, chosen: Tensor | None = None) -> Float[Tensor, "point 3"]:
-        """Points in the world where pixels' rays meet the surface (`back_project`).
+        """World positions of pixels' surface points (`back_project`).
 
-        chosen: a mask of pixels or their numbers, row by row; None for those that show a surface
+        chosen: a mask of pixels or their row-major indices; None for those that show a surface
         """
         index = (self.solid if chosen is None else chosen).flatten()
         return back_project(self.camera, self.camera.pixels()[index], self.depth.flatten()[index])
@@ -194,15 +194,15 @@ class DepthMap:
     def project(
         self, points: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"], Float[Tensor, " point"]]:
-        """Pixels (x, y) of points in the world, whether the lens sees them, and how far away they are."""
+        """Pixels (x, y) of points in the world, a mask of valid projections, and their distances."""
         pixels, valid = self.camera.project(points)
         return pixels, valid, (points - self.camera.position).norm(dim=-1)
 
     def compare(self, points: Float[Tensor, "point 3"], edge: Tolerance = DEPTH_EDGE) -> SurfaceComparison:
-        """Points beside the surface that the camera sees, whose depth is interpolated between pixels.
+        """Compare points with the camera's surface, whose depth is interpolated between pixels.
 
-        edge: difference in depth between neighbouring pixels from which on there is an edge. There a point counts as
-              seen only if it lies in front of both sides
+        edge: difference in depth between neighbouring pixels that counts as a depth edge. There a point counts as
+              visible only if it lies in front of both sides
         """
         pixels, valid, away = self.project(points)
         ahead, smooth = torch.empty_like(away), torch.empty_like(valid)
@@ -217,9 +217,9 @@ class DepthMap:
         tolerance: Tolerance = VISIBLE_TOLERANCE,
         edge: Tolerance | None = DEPTH_EDGE,
     ) -> Bool[Tensor, " point"]:
-        """Mask of visible points: inside the picture, and no farther than the tolerance behind its surface.
+        """Mask of visible points: inside the picture, and at most the tolerance behind its surface.
 
-        edge: as for `compare`; None takes the depth of the nearest pixel whatever its opacity, for translucent fields
+        edge: as for `compare`; None takes the depth of the nearest pixel of any opacity, for translucent fields
         """
         if edge is None:
             pixels, valid, away = self.project(points)
@@ -231,24 +231,24 @@ class DepthMap:
     def sees_past(
         self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE_TOLERANCE
     ) -> Bool[Tensor, " point"]:
-        """Mask of points in front of all that the pixels around them show, by more than the tolerance. Pixels that are
-        neither clear nor solid count as surfaces here."""
+        """Mask of points in free space: in front of all surfaces of the pixels around, by more than the tolerance.
+        Translucent pixels count as surfaces here."""
         pixels, valid, away = self.project(points)
         return self.inside(pixels, valid) & (away + tolerance(away) < self.at_pixels(self._nearest, pixels))
 
     def inside(self, pixels: Float[Tensor, "point 2"], valid: Bool[Tensor, " point"]) -> Bool[Tensor, " point"]:
-        """Mask of projected points that lie in the picture."""
+        """Mask of projected points inside the picture."""
         return valid & ((pixels >= 0) & (pixels < self.camera.size)).all(-1)
 
     def at_pixels(self, values: Float[Tensor, "height width *channels"], pixels: Float[Tensor, "point 2"]) -> Tensor:
-        """Values of the pixels that places (x, y) in the picture lie in; those outside take the nearest."""
+        """Values of the pixels at coordinates (x, y), clamped to the picture."""
         height, width = values.shape[:2]
         x, y = pixels.nan_to_num().floor().long().unbind(-1)
         return values[y.clamp(0, height - 1), x.clamp(0, width - 1)]
 
     @cached_property
     def _nearest(self) -> Float[Tensor, "height width"]:
-        """Depth of the nearest of the pixels around each that are not clear; NaN where one of them is NaN."""
+        """Least depth of the non-transparent pixels around each; NaN if one of them is NaN."""
         there = torch.where((self.opacity > CLEAR_OPACITY) | self.depth.isnan(), self.depth, torch.inf)
         return -max_pool2d(-there[None], FREE_SPACE_WINDOW, 1, FREE_SPACE_WINDOW // 2)[0]
 
@@ -256,9 +256,9 @@ class DepthMap:
 class SignedDistance(NamedTuple):
     """Fused distances at points.
 
-    distance:   over the truncation, in [-1, 1]: positive in front of the surface, NaN where no camera knows
-    truncation: weighted mean of the cameras', scene units; NaN where no camera knows
-    pictured:   whether any map measured along the ray through the point, be it hidden or not
+    distance:   over the truncation, in [-1, 1]: positive in front of the surface, NaN if unknown to all cameras
+    truncation: weighted mean of the cameras', scene units; NaN if unknown to all cameras
+    pictured:   whether any map has a measurement along the ray through the point, hidden or not
     """
 
     distance: Float[Tensor, " point"]
@@ -272,10 +272,10 @@ class TSDF:
 
         D(x) = sum w d / sum w,    d = min((depth - |x - o|) / t, 1),    w = cos / |x - o|^2
 
-    over cameras at o, each with the depth that it sees in the direction of x and the truncation t. Its weight is the
-    cosine at which it sees the surface over the area of its pixel there (section 4). A camera with d < -1 is left out:
-    what lies deeper behind its surface is unknown to it. Distances are along rays, in scene units.
-    edge: difference in depth between neighbouring pixels from which on they show two surfaces; None for the truncation
+    over cameras at o, each with its depth in the direction of x and the truncation t. Its weight is the cosine of its
+    viewing angle on the surface over the area of its pixel there (section 4). A camera with d < -1 is left out: points
+    deeper behind its surface are unknown to it. Distances are along rays, in scene units.
+    edge: difference in depth between neighbouring pixels that counts as a depth edge; None for the truncation
     """
 
     depth_maps: Sequence[DepthMap]
@@ -308,11 +308,11 @@ def fused_colours(
     depth_maps: Sequence[DepthMap],
     tolerance: Tolerance,
 ) -> Float[Tensor, "point 3"]:
-    """Colours of points of a surface, sRGB-encoded: the mean over cameras that see them.
+    """Colours of surface points, sRGB-encoded: the mean over cameras that see them.
 
-    A camera counts with the square of the cosine at which it looks, over the area that its pixel covers there. A point
-    that no camera sees takes the colour of the nearest one that some camera does.
-    tolerance: how far from a camera's own surface a point may lie to be seen by it
+    A camera is weighted by its squared viewing cosine over the area of its pixel there. A point that no camera sees
+    takes the colour of the nearest visible one.
+    tolerance: largest distance of a visible point from a camera's own surface
     """
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
     for depth_map in track(depth_maps, "Colouring", len(depth_maps)):
@@ -336,12 +336,12 @@ def fused_colours(
 def render_depth_maps(
     render: Callable[[Camera], Rendering], cameras: Camera, background: Vector, views: int = 64, size: int = 400
 ) -> list[DepthMap]:
-    """Depth maps of evenly chosen cameras. Raises LumigraphError where none of them shows a surface.
+    """Depth maps of evenly chosen cameras. Raises LumigraphError if none of them shows a surface.
 
-    render:     what one camera sees, such as `Method.render`
-    background: sRGB-encoded colour behind the renderings
-    views:      cameras at most
-    size:       longer side of the maps at most, pixels
+    render:     renders one camera, such as `Method.render`
+    background: sRGB-encoded background colour of the renderings
+    views:      largest number of cameras
+    size:       largest longer side of the maps, pixels
     """
     chosen = evenly(range(len(cameras)), views)
     maps = []
@@ -355,13 +355,13 @@ def render_depth_maps(
 
 
 def surface_points(depth_maps: Sequence[DepthMap]) -> SurfacePoints:
-    """Points of all pixels that show a surface, less those that other cameras see past; maybe none."""
+    """Points of all pixels that show a surface, without those in other cameras' free space; maybe none."""
     every = SurfacePoints.cat([seen.points() for seen in depth_maps])
     return every[~free(every.points, depth_maps)]
 
 
 def free(points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap]) -> Bool[Tensor, " point"]:
-    """Mask of points in free space: at least two cameras (or the only one) see past them."""
+    """Mask of points in free space of at least two cameras (or the only one)."""
     needed = min(MIN_FREE_VIEWS, len(depth_maps))
     return _confirmed(points, depth_maps, needed, lambda seen, some: seen.sees_past(some))
 
@@ -369,9 +369,9 @@ def free(points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap]) -> Bo
 def hidden(
     points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap], tolerance: Tolerance
 ) -> Bool[Tensor, " point"]:
-    """Mask of points that are hidden from all cameras but a few, or lie outside all pictures.
+    """Mask of points that are hidden from all but a few cameras, or outside all pictures.
 
-    tolerance: how far behind a surface a point still counts as seen
+    tolerance: largest distance behind a surface of a visible point
     """
     needed = 1 + len(depth_maps) // CAMERAS_PER_VIEW
     tracked = track(depth_maps, "Looking for what no camera sees", len(depth_maps))
@@ -381,7 +381,7 @@ def hidden(
 def measurements(
     points: Float[Tensor, "point 3"], depth_maps: Iterable[DepthMap]
 ) -> tuple[Int[Tensor, " point"], Int[Tensor, " point"]]:
-    """Number of cameras that measured in a point's direction, be it hidden or not, and of those with NaN there."""
+    """Number of cameras with a measurement in a point's direction, hidden or not, and of those with NaN there."""
     measured, left_out = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
     for seen in depth_maps:
         pixels, valid, _ = seen.project(points)
@@ -394,9 +394,9 @@ def measurements(
 def agreed(
     points: Float[Tensor, "point 3"], depth_maps: Sequence[DepthMap], tolerance: Tolerance
 ) -> Bool[Tensor, " point"]:
-    """Mask of points on a surface that two cameras see at the same place, or the only one.
+    """Mask of points on which two cameras' surfaces agree, or the only one's.
 
-    tolerance: distance along the ray from a camera's own surface up to which it agrees
+    tolerance: largest distance along the ray from a camera's own surface
     """
 
     def agrees(seen: DepthMap, some: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
@@ -413,7 +413,7 @@ def _confirmed(
     needed: int,
     test: Callable[[DepthMap, Tensor], Tensor],
 ) -> Bool[Tensor, " point"]:
-    """Mask of points that pass a test in so many maps; each is tested no further than that."""
+    """Mask of points that pass a test in `needed` maps; each is tested no further than that."""
     left, count = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.int64)
     for depth_map in depth_maps:
         count[left] += test(depth_map, points[left])

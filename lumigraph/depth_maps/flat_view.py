@@ -1,4 +1,4 @@
-"""Photographs as small flat pictures: through an ideal pinhole, whatever lens took them."""
+"""Photographs of any lens resampled to small ideal pinhole pictures."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class FlatView:
 
     pose:       camera-to-world; +x right, +y down, +z forward
     intrinsics: K, from the camera's frame to pixels
-    rgb:        sRGB-encoded, not multiplied by trust
-    trust:      from 0 to 1: opacity, where the photograph is to be trusted at all
+    rgb:        sRGB-encoded, not premultiplied
+    trust:      from 0 to 1: opacity within the mask of trusted pixels
     """
 
     pose: Float[Tensor, "3 4"]
@@ -39,18 +39,18 @@ class FlatView:
 
     @cached_property
     def local_rays(self) -> Float[Tensor, "height width 3"]:
-        """From the camera towards each pixel in its own frame, one unit along the axis: K^-1 (x, y, 1)."""
+        """Rays of the pixels in the camera's frame, with z = 1: K^-1 (x, y, 1)."""
         height, width = self.trust.shape
         y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
         return torch.stack([x, y, torch.ones_like(x)], -1) @ self.intrinsics.inverse().T
 
     @cached_property
     def rays(self) -> Float[Tensor, "height width 3"]:
-        """The same in the world's frame."""
+        """Rays of the pixels in the world's frame, with depth 1."""
         return self.local_rays @ self.pose[:, :3].T
 
     def project(self, points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 2"], Float[Tensor, " point"]]:
-        """Pixels of points, and how far along the axis they lie; pixels of what lies behind mean nothing."""
+        """Pixels of points, and their depths along the axis; pixels of points behind are meaningless."""
         homogeneous = (points - self.pose[:, 3]) @ self.pose[:, :3] @ self.intrinsics.T
         depth = homogeneous[:, 2]
         return homogeneous[:, :2] / depth.clamp_min(1e-9)[:, None], depth
@@ -71,9 +71,10 @@ class FlatView:
 
 
 def flat_view(photograph: Photograph, longest: int) -> FlatView:
-    """A photograph reduced a whole number of times, to about `longest` pixels along its longer side, and made flat.
+    """A photograph reduced by an integer factor, to about `longest` pixels along its longer side, resampled to a
+    pinhole.
 
-    Only what lies within 50 degrees to the sides of the axis is kept.
+    Only the part within 50 degrees to the sides of the axis is kept.
     """
     small = photograph.reduced(max(1, round(max(photograph.rgb.shape[:2]) / longest)))
     height, width = small.rgb.shape[:2]

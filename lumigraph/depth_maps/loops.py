@@ -1,8 +1,8 @@
-"""The loops over points and the depth that a camera sees in their direction (Numba).
+"""Loops over points and depth maps (Numba).
 
-pixels, valid: where points lie in the picture (x, y), and whether the lens sees them
+pixels, valid: (x, y) of points, and a mask of valid projections
 away:          distances of the points from the camera
-depth:         distances of the surface along the pixels' rays; infinity where nothing is, NaN where not measured
+depth:         distances of the surface along the pixels' rays; infinity for empty space, NaN for unmeasured
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numba import njit, prange
 
 @njit(inline="always")
 def depth_at(depth, x, y, edge):
-    """Depth between pixels' centres, bilinear, and True; at an edge, where the four differ by `edge`, the nearest of
-    them and False. NaN and False where one of them is NaN."""
+    """Bilinear depth between pixels' centres, and True; at a depth edge, where the four differ by `edge`, the nearest
+    pixel's and False. NaN and False where one of them is NaN."""
     height, width = depth.shape
     u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
     left, top = int(u), int(v)
@@ -35,7 +35,9 @@ def depth_at(depth, x, y, edge):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def compare(pixels, valid, away, depth, edge, edge_per_distance, ahead, smooth):
-    """DepthMap.compare: how far the surface lies behind each point; NaN outside the picture and where it is unknown."""
+    """Loop of DepthMap.compare: distance of the surface behind each point; NaN outside the picture and for
+    unmeasured.
+    """
     height, width = depth.shape
     for i in prange(len(away)):
         x, y = pixels[i, 0], pixels[i, 1]
@@ -47,8 +49,7 @@ def compare(pixels, valid, away, depth, edge, edge_per_distance, ahead, smooth):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def fuse(pixels, valid, away, depth, facing, least, edges, truncations, total, weight, truncated, pictured):
-    """TSDF: one camera's distances, added to those of the others. edges and truncations are
-    tolerances (constant, per distance)."""
+    """Loop of TSDF: add one camera's distances. edges and truncations are tolerances (constant, per distance)"""
     height, width = depth.shape
     for i in range(len(away)):
         x, y = pixels[i, 0], pixels[i, 1]
@@ -68,8 +69,8 @@ def fuse(pixels, valid, away, depth, facing, least, edges, truncations, total, w
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def incidence(depth, directions, out):
-    """Cosine between each pixel's ray and the normal of its surface, from differences to the nearer of two neighbours
-    along each axis; 0 where the depth is not known, or that of both neighbours.
+    """Cosine between each pixel's ray and its surface normal, from differences to the nearer of two neighbours along
+    each axis; 0 for unknown depth of the pixel or of both neighbours.
 
     directions: (height, width, 3), unit length
     """
@@ -104,10 +105,10 @@ def incidence(depth, directions, out):
 
 @njit(cache=True, error_model="numpy")
 def fill_disparity(found, its, state, rgb, directions, per_direction, reach, colour, distance, out):
-    """stereo.filled: disparities of pixels that the other picture does not show, from known pixels around them.
+    """Loop of stereo.filled: disparities of occluded pixels from known pixels around them.
 
     found, its: disparity of this picture and of the other, whose pixel is at x - found; state: 0 for known, 1 for
-    hidden, 2 for outside the other picture; rgb: bytes; out: at first `found`
+    occluded, 2 for outside the other picture; rgb: bytes; out: initially `found`
     """
     height, width = found.shape
     values = np.empty(len(directions) * per_direction, np.float32)

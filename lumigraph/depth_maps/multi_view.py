@@ -1,4 +1,4 @@
-"""Multi-view stereo: a depth map of each photograph, by PatchMatch from coarse to fine, kept where neighbours agree."""
+"""Multi-view stereo: a depth map of each photograph, by coarse-to-fine PatchMatch, with a consistency check."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ MAX_SURE_COST = 0.9  # of a plane that is sure, whatever neighbours find
 
 @dataclass(frozen=True)
 class MatchingLevel:
-    """Work at one size of the pictures: rounds of iterations, the later ones compare the neighbours' planes too.
+    """One pyramid level of matching: rounds of iterations, the later ones with geometric consistency.
 
     reduction: from the finest size
-    first:     whether it begins with random planes; else with those of the level before, which only near planes change
+    first:     whether it begins with random planes; else with those of the previous level, with only local changes
     """
 
     reduction: int
@@ -49,7 +49,7 @@ class MatchingLevel:
 
     @property
     def work(self) -> float:
-        """Comparisons of a plane at a pixel, per pixel of the finest size."""
+        """Number of plane evaluations per pixel of the finest size."""
         planes = len(NEAR_AREAS) + 3 + self.first * (len(FAR_AREAS) + 2)
         return (HYPOTHESES * self.first + (self.photometric + self.geometric) * planes) / self.reduction**2
 
@@ -64,10 +64,10 @@ def multi_view_depth(
     """Depth maps of training photographs, through ideal pinholes; NaN where neighbours do not agree.
 
     size:    pixels along the longer side of the maps, about
-    seconds: that matching may take, about; maps are smaller, and of fewer photographs, where it would take longer
-    views:   photographs at most, spread evenly
-    Depths are searched around the scene's sparse points; where there are none, around those of the coarsest level. The
-    cameras' `image_index` names the photographs.
+    seconds: time for matching, about; maps are smaller, and of fewer photographs, if it would take longer
+    views:   largest number of photographs, spread evenly
+    Depths are searched around the scene's sparse points, or without any around those of the coarsest level. The
+    cameras' `image_index` is the photograph's number.
     """
     begin = time.perf_counter()
     chosen = evenly(scene.splits["train"].tolist(), views)
@@ -94,13 +94,13 @@ def pair_depth(scene: Scene, first: int, second: int, size: int) -> tuple[Rectif
 
 
 def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:
-    """From where the scene begins before a view to where it ends."""
+    """Depth range of the whole scene in a view."""
     away, radius = float(view.pose[:, 3].norm()), math.sqrt(3) * scene.frame.reach
     return max(scene.frame.near, away - radius), away + radius
 
 
 def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, float] | None:
-    """Range of depths of the known points before a view, with some room; None if they are few."""
+    """Depth range of the known points in a view, with a margin; None for too few."""
     seen, _, _, depth = view.sees(known)
     if int(seen.sum()) < MIN_POINTS:
         return None
@@ -115,9 +115,10 @@ def match(
     what: str,
     seconds: float,
 ) -> list[DepthMap]:
-    """Depth maps of views from coarse to fine; of as many views and levels as so many seconds allow.
+    """Coarse-to-fine depth maps of views; of as many views and levels as the time allows.
 
-    photographs: number of each view's; pyramids: its picture at each of the first levels; spans: of its depths
+    photographs: number of each view's photograph; pyramids: its picture at each of the first levels; spans: of its
+                 depths
     """
     chance, begin, taken = torch.Generator().manual_seed(0), time.perf_counter(), 0.0
     if seconds < math.inf:
@@ -153,7 +154,7 @@ def improve(
     iterations: int,
     chance: torch.Generator,
 ) -> None:
-    """One view's round at a level."""
+    """Run one view's iterations at a level."""
     matching = PatchMatch(maps[i], [maps[j] for j in neighbours], chance, geometric)
     if level.first and not geometric:
         matching.begin()
@@ -164,7 +165,7 @@ def improve(
 
 
 def affordable(views: Sequence[FlatView], spans: Sequence[tuple[float, float]], seconds: float) -> int:
-    """Number of views whose coarsest level takes so many seconds, by the time that one's random planes take."""
+    """Number of views for which the coarsest level fits into the time, measured by one view's random planes."""
     begin, middle = time.perf_counter(), len(views) // 2
     positions = torch.stack([view.pose[:, 3] for view in views])
     others = best_neighbours(middle, views, positions, spans[middle])
@@ -176,7 +177,7 @@ def affordable(views: Sequence[FlatView], spans: Sequence[tuple[float, float]], 
 
 
 def agreed(maps: Sequence[PlaneMap], i: int, neighbours: Sequence[int]) -> Bool[Tensor, "height width"]:
-    """Mask of pixels whose place lies on the planes of those neighbours' pixels that see it, of two at least."""
+    """Mask of consistent pixels: their point lies on the planes of at least two neighbours that see it."""
     own = maps[i]
     depth = 1 / own.inverse_depth.flatten().clamp_min(1e-9)
     places = own.view.pose[:, 3] + depth[:, None] * own.view.rays.view(-1, 3)
@@ -195,7 +196,7 @@ def agreed(maps: Sequence[PlaneMap], i: int, neighbours: Sequence[int]) -> Bool[
 
 
 def depth_map(found: PlaneMap, sure: Bool[Tensor, "height width"], number: int) -> DepthMap:
-    """Depth map of a view, NaN where it is not sure."""
+    """Depth map of a view, NaN for inconsistent pixels."""
     view = found.view
     height, width = view.trust.shape
     lens = Pinhole(view.intrinsics.diagonal()[None, :2], view.intrinsics[None, :2, 2])
@@ -208,7 +209,7 @@ def depth_map(found: PlaneMap, sure: Bool[Tensor, "height width"], number: int) 
 def choose_neighbours(
     views: Sequence[FlatView], spans: Sequence[tuple[float, float]], count: int = NEIGHBOURS
 ) -> list[list[int]]:
-    """For each view those others that see most of what it sees, from neither too near nor too far aside."""
+    """Neighbours of each view: those with most overlap, at a suitable baseline."""
     positions = torch.stack([view.pose[:, 3] for view in views])
     return [best_neighbours(i, views, positions, spans[i], count) for i in range(len(views))]
 
@@ -220,7 +221,7 @@ def best_neighbours(
     span: tuple[float, float],
     count: int = NEIGHBOURS,
 ) -> list[int]:
-    """Neighbours of a view by how they see places on a coarse grid of pixels at some depths."""
+    """Neighbours of a view by their visibility of points on a coarse grid of pixels at some depths."""
     view = views[i]
     height, width = view.trust.shape
     grid = view.rays[height // 10 :: height // 5 + 1, width // 10 :: width // 5 + 1].reshape(-1, 3)

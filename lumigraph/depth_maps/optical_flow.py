@@ -1,4 +1,4 @@
-"""Optical flow by OpenCV's DIS: patches by inverse search from coarse to fine, refined variationally (Kroeger 2016)."""
+"""Optical flow by OpenCV's DIS: coarse-to-fine inverse search of patches, refined variationally (Kroeger 2016)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def optical_flow(
 ) -> Float[Tensor, "height width 2"]:
     """Displacement (right, down) in pixels from each pixel of the first picture to the second one.
 
-    start: displacement from which the search begins
+    start: initial displacement
     """
     import cv2
 
@@ -34,7 +34,7 @@ def optical_flow(
 def sampled(
     picture: Float[Tensor, "height width channel"], places: Float[Tensor, "*point 2"]
 ) -> Float[Tensor, "*point channel"]:
-    """Values of a picture at places (x, y), between its pixels; beyond its border those of the border."""
+    """Bilinear interpolation of a picture at (x, y), clamped at its border."""
     height, width = picture.shape[:2]
     at = 2 * places / torch.tensor([width, height], device=places.device) - 1
     at = at.reshape(1, 1, -1, 2)
@@ -45,5 +45,5 @@ def sampled(
 def round_trip_error(
     pixels: Float[Tensor, "*pixel 2"], flow: Float[Tensor, "*pixel 2"], back: Float[Tensor, "height width 2"]
 ) -> Float[Tensor, "*pixel"]:
-    """Distance in pixels between pixels and where flow to another picture, and the flow back from there, leads."""
+    """Forward-backward error in pixels: distance between pixels and their image under flow there and back."""
     return (flow + sampled(back, pixels + flow)).norm(dim=-1)

@@ -1,10 +1,10 @@
 """PatchMatch stereo: a slanted plane at every pixel of a picture (Galliani 2015; Schönberger 2016; Xu & Tao 2019).
 
 A plane is the vector n = normal / distance in the camera's frame, so that a ray r = K^-1 (x, y, 1) meets it at the
-inverse depth 1 / z = n · r. In turn red and black pixels, as on a chessboard, try the planes of pixels of the other
-colour and random changes of their own. A pixel keeps the plane with the least cost: the mean of the best BEST_VIEWS of
-its neighbours', each one less the correlation of the windows plus, once the neighbours have depth, the reprojection
-error between both.
+inverse depth 1 / z = n · r. Alternately red and black pixels of a checkerboard try the planes of pixels of the other
+colour and random perturbations of their own. A pixel keeps the plane with the least cost: the mean of the best
+BEST_VIEWS of its neighbours, each one less the correlation of the windows plus, once the neighbours have depth, the
+reprojection error between both.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ EPSILON = 1e-6
 
 
 def turned(offsets: Sequence[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Offsets in all four directions."""
+    """Offsets rotated into all four directions."""
     return [[(a * x + b * y, a * y + b * x) for x, y in offsets] for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
 
 
@@ -48,7 +48,7 @@ FAR_AREAS = turned([(0, k) for k in (3, 5, 7, 9, 11, 15)])
 class PlaneMap:
     """Planes of a view's pixels, and their costs.
 
-    span: nearest and farthest depth along the axis that is searched
+    span: near and far limit of the depth search along the axis
     """
 
     view: FlatView
@@ -62,11 +62,11 @@ class PlaneMap:
 
     @property
     def inverse_depth(self) -> Float[Tensor, "height width"]:
-        """Along the axis."""
+        """Inverse depth along the axis."""
         return (self.planes * self.view.local_rays).sum(-1)
 
     def enlarged(self, view: FlatView) -> PlaneMap:
-        """The planes at the pixels of a larger picture from the same place."""
+        """The planes at the pixels of a larger picture with the same pose."""
         pixels = view.local_rays @ self.view.intrinsics.T
         height, width = self.cost.shape
         column, row = pixels[..., 0].long().clamp(0, width - 1), pixels[..., 1].long().clamp(0, height - 1)
@@ -102,7 +102,7 @@ class PatchMatch:
     def costs(
         self, pixels: Int[Tensor, " pixel"], planes: Float[Tensor, "pixel plane 3"], views: Int[Tensor, "pixel view"]
     ) -> Float[Tensor, "pixel plane view"]:
-        """Costs of planes at pixels in some of the neighbours each."""
+        """Costs of planes at pixels in each pixel's chosen neighbours."""
         inverse = (planes * self.rays[pixels, None]).sum(-1)
         placed = torch.cat([inverse[..., None], planes[..., :2] / self.focal], -1)
         pictures = self.view.grey, self.view.trust, self.pictures, self.trust
@@ -115,8 +115,8 @@ class PatchMatch:
     def reprojection_error(
         self, pixels: Int[Tensor, " pixel"], inverse: Float[Tensor, "pixel plane"], views: Int[Tensor, "pixel view"]
     ) -> Float[Tensor, "pixel plane view"]:
-        """Pixels from a place to where a neighbour's plane, at the pixel that sees the place, is seen from here
-        (Schönberger 2016, eq. 9)."""
+        """Forward-backward reprojection error in pixels, through a neighbour's plane at the projection (Schönberger
+        2016, eq. 9)."""
         width = self.view.trust.shape[1]
         x, y = (pixels % width + 0.5)[:, None, None], (pixels // width + 0.5)[:, None, None]
         u, v, there = warped(self.warps[views][:, None], x, y, inverse[..., None])
@@ -137,14 +137,14 @@ class PatchMatch:
     # Iterations
 
     def begin(self) -> None:
-        """Keep the best of random planes at each pixel."""
+        """Initialise with the best of random planes at each pixel."""
         count = len(self.rays)
         share = (torch.arange(HYPOTHESES) + torch.rand(count, HYPOTHESES, generator=self.chance)) / HYPOTHESES
         inverse = self.far + share * (self.near - self.far)
         self.keep(torch.arange(count), self.random(self.rays[:, None].expand(-1, HYPOTHESES, -1), inverse))
 
     def choose(self, all_views: bool) -> None:
-        """Compute the costs of the planes; unless all views are to count, choose those of least cost at each pixel."""
+        """Compute the costs of the planes; unless all_views, choose the views of least cost at each pixel."""
         pixels = torch.arange(len(self.rays))
         costs = self.costs(pixels, self.own.planes.view(-1, 1, 3), self.all_views.expand(len(pixels), -1))
         self.own.cost = self.joined(costs).view(self.own.cost.shape)
@@ -153,10 +153,10 @@ class PatchMatch:
             self.chosen = costs[:, 0].topk(count, 1, largest=False).indices
 
     def iterate(self, number: int, wide: bool) -> None:
-        """Propagation and random changes, red pixels before black ones.
+        """Run propagation and random perturbation, red pixels before black ones.
 
-        number: of the iteration; each changes half as much as the one before
-        wide:   whether to try planes from afar and wholly new ones too
+        number: of the iteration; each halves the perturbations
+        wide:   also try distant and wholly new planes
         """
         height, width = self.own.cost.shape
         odd = (torch.arange(height)[:, None] + torch.arange(width)) % 2
@@ -168,7 +168,7 @@ class PatchMatch:
             self.keep(pixels, self.changed(pixels, 0.5**number, wide))
 
     def best_in(self, area: Sequence[tuple[int, int]], pixels: Int[Tensor, " pixel"]) -> Int[Tensor, " pixel"]:
-        """Pixel of least cost in an area beside each pixel."""
+        """Pixel of least cost in a propagation region of each pixel."""
         height, width = self.own.cost.shape
         dx, dy = torch.tensor(area).T
         row, column = (pixels // width)[:, None] + dy, (pixels % width)[:, None] + dx
@@ -178,7 +178,7 @@ class PatchMatch:
         return index.gather(1, least)[:, 0]
 
     def changed(self, pixels: Int[Tensor, " pixel"], amount: float, wide: bool) -> Float[Tensor, "pixel plane 3"]:
-        """Random changes of pixels' own planes: of the depth, of the normal, and of both."""
+        """Random perturbations of pixels' own planes: of the depth, of the normal, and of both."""
         rays, own = self.rays[pixels], self.own.planes.view(-1, 3)[pixels]
         inverse, normals = (own * rays).sum(-1), -normalize(own, dim=-1)
         slightly = inverse * (1 + DEPTH_CHANGE * amount * self.uniform(len(pixels)))
@@ -191,7 +191,7 @@ class PatchMatch:
         return torch.stack(planes, 1)
 
     def keep(self, pixels: Int[Tensor, " pixel"], planes: Float[Tensor, "pixel plane 3"]) -> None:
-        """Take the planes that cost less than those that there are."""
+        """Keep planes of lower cost than the current ones."""
         views = self.all_views.expand(len(pixels), -1) if self.chosen is None else self.chosen[pixels]
         cost, index = self.joined(self.costs(pixels, planes, views.contiguous())).min(1)
         better = cost < self.own.cost.view(-1)[pixels]
@@ -199,7 +199,7 @@ class PatchMatch:
         self.own.cost.view(-1)[pixels[better]] = cost[better]
 
     def random(self, rays: Float[Tensor, "*pixel 3"], inverse: Float[Tensor, "*pixel"]) -> Float[Tensor, "*pixel 3"]:
-        """Planes at inverse depths, with random normals around the way to the camera."""
+        """Planes at inverse depths, with random normals around the direction to the camera."""
         aside = INITIAL_TILT * torch.randn(rays.shape, generator=self.chance)
         return facing(normalize(aside - normalize(rays, dim=-1), dim=-1), rays, inverse)
 
@@ -211,7 +211,7 @@ class PatchMatch:
 def facing(
     normals: Float[Tensor, "*pixel 3"], rays: Float[Tensor, "*pixel 3"], inverse: Float[Tensor, "*pixel"]
 ) -> Float[Tensor, "*pixel 3"]:
-    """Planes through pixels at inverse depths; normals are first turned towards the camera, to MIN_FACING."""
+    """Planes through pixels at inverse depths; normals are first rotated towards the camera, to MIN_FACING."""
     back = -normalize(rays, dim=-1)
     cosine = (normals * back).sum(-1, keepdim=True)
     normals = normals + ((MIN_FACING - cosine) / (1 - MIN_FACING)).clamp_min(0) * back
@@ -219,7 +219,7 @@ def facing(
 
 
 def warped(warp: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (u, v) of places (x, y) at inverse depths (`kernels.patch_cost`), and whether they lie in front."""
+    """Warped pixels (u, v) of (x, y) at inverse depths (`kernels.patch_cost`), and a mask of those in front."""
     u, v, s = (
         warp[..., k, 0] * x + warp[..., k, 1] * y + warp[..., k, 2] + inverse * warp[..., k, 3] for k in range(3)
     )
@@ -229,7 +229,7 @@ def warped(warp: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Tensor,
 
 
 def padded(maps: Sequence[Shaped[Tensor, "_ _ *channels"]]) -> Shaped[Tensor, "map height width *channels"]:
-    """Maps of any sizes as one tensor, zero beyond each."""
+    """Maps of any sizes stacked in one tensor, padded with zeros."""
     height, width = (max(one.shape[k] for one in maps) for k in (0, 1))
     out = maps[0].new_zeros(len(maps), height, width, *maps[0].shape[2:])
     for place, one in zip(out, maps, strict=True):

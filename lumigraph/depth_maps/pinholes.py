@@ -25,7 +25,7 @@ FACES = ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))  # of a cube: t
 class PinholeMap:
     """A depth map through a pinhole.
 
-    depth: along rays, NaN or infinity where there is none; rgb: sRGB-encoded; trust: at least 0
+    depth: along rays, NaN or infinity without a surface; rgb: sRGB-encoded; trust: at least 0
     pose:  camera-to-world; lens: (fx, fy, cx, cy) in pixels
     """
 
@@ -38,10 +38,10 @@ class PinholeMap:
 
 @dataclass(frozen=True)
 class PinholeFace:
-    """One pinhole that stands for a part of a lens.
+    """One pinhole that covers a part of a lens.
 
     rotation: from its frame to the camera's
-    pixels:   of the lens, in the direction of each of its own; `valid` where the lens sees that
+    pixels:   of the lens, in the direction of each of its own; `valid` for valid projections
     """
 
     rotation: Float[Tensor, "3 3"]
@@ -52,8 +52,8 @@ class PinholeFace:
 
 
 def pinhole_maps(seen: DepthMap, trust: Float[Tensor, "height width"]) -> Iterator[PinholeMap]:
-    """The depth map as it is, or resampled. Depth is interpolated, and at edges that of the nearest pixel, as are trust
-    and colour. Raises LumigraphError for lenses whose rays do not begin at one place."""
+    """The depth map unchanged, or resampled. Depth is interpolated, at depth edges the nearest pixel's; trust and
+    colour likewise. Raises LumigraphError for lenses whose rays do not share an origin."""
     lens, pose = seen.camera.lens, seen.camera.pose[0]
     if isinstance(lens, Pinhole):
         yield PinholeMap(seen.depth, seen.rgb, trust, pose, torch.cat([lens.focal[0], lens.centre[0]]))
@@ -76,7 +76,7 @@ def pinhole_maps(seen: DepthMap, trust: Float[Tensor, "height width"]) -> Iterat
 
 @lru_cache(maxsize=8)
 def faces(kind: str, width: int, height: int) -> tuple[PinholeFace, ...]:
-    """Pinholes that see together what a lens of a picture sees, with its resolution in the middle.
+    """Pinholes that together cover a lens's picture, at its central resolution.
 
     kind: the lens as JSON
     """

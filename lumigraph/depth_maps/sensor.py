@@ -1,4 +1,4 @@
-"""Depth of sensors: how far each pixel is to be trusted, and faults of a capture that its numbers show."""
+"""Sensor depth: weight of each pixel, and checks of a capture's depth."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ MAX_RATIO = 3.0  # between measured depth and that of sparse points, either way
 
 
 def trust_of(seen: DepthMap, trusted: float, farthest: float) -> Float[Tensor, "height width"]:
-    """Weight of each pixel: the cosine at which the surface is seen, times (trusted / depth)^4 beyond `trusted`.
+    """Weight of each pixel: the cosine of the viewing angle, times (trusted / depth)^4 beyond `trusted`.
 
-    The error of triangulated depth grows with its square (Khoshelham and Elberink 2012), its inverse variance falls
-    with the fourth power. 0 where nothing is measured, at grazing angles and beyond `farthest`.
-    trusted: 0 for everywhere
+    The error of triangulated depth grows with its square (Khoshelham and Elberink 2012), so its inverse variance falls
+    with the fourth power. 0 for unmeasured pixels, at grazing angles and beyond `farthest`.
+    trusted: 0 for no falloff
     """
     depth, facing = seen.depth.contiguous(), torch.empty_like(seen.depth)
     width, height = seen.camera.size[0].tolist()
@@ -49,9 +49,9 @@ def directions(lens: str, width: int, height: int) -> Float[Tensor, "height widt
 
 
 def sensor_faults(scene: Scene) -> list[str]:
-    """Sentences about depth whose unit is wrong, by the scene's sparse points or by what sensors can measure.
+    """Warnings of depth in a wrong unit, by the scene's sparse points or the range of sensors.
 
-    Raises LumigraphError where a scene has no depth.
+    Raises LumigraphError for a scene without depth.
     """
     layer = scene.layer("depth")
     known = [i for i in scene.splits["train"].tolist() if layer.planes[i] is not None]

@@ -1,4 +1,4 @@
-"""Stereo: disparity of a rectified pair, by semi-global matching or by blocks from coarse to fine.
+"""Stereo: disparity of a rectified pair, by semi-global matching or by coarse-to-fine block matching.
 
 A point at the left pixel (x, y) is at (x - d, y) on the right. With the baseline b, the focal length f and the offset
 d0 between the columns of both principal points, its distance along the axis is z = b f / (d + d0).
@@ -46,7 +46,7 @@ MIN_OVERLAP = 0.1  # share of the left picture's rows and columns that both pict
 class Disparity:
     """Disparity of every pixel of a left picture.
 
-    sure: where both pictures agree and no other disparity is nearly as good
+    sure: left-right consistent and unambiguous
     """
 
     values: Float[Tensor, "height width"]
@@ -55,11 +55,11 @@ class Disparity:
 
 @dataclass(frozen=True)
 class RectifiedPair:
-    """Two pictures of one size whose rows see the same planes of space.
+    """Rectified pair: two pictures of one size whose rows are epipolar lines.
 
     baseline: from the left camera to the right one, scene units
     offset:   d0, pixels
-    span:     nearest and farthest z that is searched
+    span:     near and far limit of the z search
     """
 
     left: FlatView
@@ -70,18 +70,18 @@ class RectifiedPair:
 
     @property
     def disparities(self) -> tuple[int, int]:
-        """First disparity that is searched, and their number."""
+        """Smallest disparity of the search range, and their number."""
         focal = float(self.left.intrinsics[0, 0])
         first, last = (math.floor(self.baseline * focal / z - self.offset) for z in reversed(self.span))
         return first - 1, last - first + 3
 
     def z(self, disparity: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-        """Distance along the axis: b f / (d + d0); infinity where that is not in front."""
+        """Distance along the axis: b f / (d + d0); infinity for points not in front."""
         shift = disparity + self.offset
         return torch.where(shift > 0, self.baseline * self.left.intrinsics[0, 0] / shift, torch.inf)
 
     def depth_map(self, found: Disparity, image: int) -> DepthMap:
-        """Depth of the left picture, NaN where it is not sure. image: number of the photograph"""
+        """Depth of the left picture, NaN for unreliable pixels. image: number of the photograph"""
         view = self.left
         height, width = view.trust.shape
         lens = Pinhole(view.intrinsics.diagonal()[None, :2], view.intrinsics[None, :2, 2])
@@ -110,10 +110,11 @@ def semi_global(
     right_valid: Bool[Tensor, "height width"] | None = None,
     costs: UInt8[Tensor, "height width disparity"] | None = None,
 ) -> Disparity:
-    """Semi-global matching (Hirschmüller 2008): census cost, eight paths, sub-pixel, check of both sides, filling.
+    """Semi-global matching (Hirschmüller 2008): census cost, eight paths, subpixel interpolation, left-right check,
+    filling.
 
-    first, count: smallest disparity that is searched, and their number
-    costs:        to take in place of those of `kernels.census_cost`
+    first, count: smallest disparity of the search range, and their number
+    costs:        instead of those of `kernels.census_cost`
     """
     guide, other = grey(left), grey(right)
     everywhere = torch.ones(guide.shape, dtype=torch.bool)
@@ -129,7 +130,7 @@ def semi_global(
 
 
 def contrast(guide: UInt8[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Levels between the darkest and the brightest pixel of the window around each."""
+    """Local contrast: grey levels between the darkest and the brightest pixel of the window around each."""
     both = torch.stack([guide, 255 - guide]).float()[None]
     for sides in ((TEXTURE_WINDOW, 1), (1, TEXTURE_WINDOW)):
         both = max_pool2d(both, sides, 1, tuple(side // 2 for side in sides))
@@ -139,7 +140,7 @@ def contrast(guide: UInt8[Tensor, "height width"]) -> Float[Tensor, "height widt
 def sharpened(
     found: Float[Tensor, "height width"], left: UInt8[Tensor, "height width 3"], right: UInt8[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width"]:
-    """Disparity with finer parts of pixels, by optical flow that starts from it.
+    """Subpixel refinement of disparity, by optical flow that starts from it.
 
     Pixels that move farther than MAX_FINE_MOVE keep their disparity.
     """
@@ -150,14 +151,16 @@ def sharpened(
 
 
 def jump_penalties() -> UInt8[Tensor, 256]:
-    """P2 for each difference of grey levels: less at edges, where depth may jump (Hirschmüller 2008, eq. 14)."""
+    """P2 for each difference of grey levels: less at edges, where depth discontinuities are likely (Hirschmüller
+    2008, eq. 14).
+    """
     return (JUMP_PENALTY * torch.exp(-torch.arange(256) / JUMP_EDGE)).clamp_min(MIN_JUMP_PENALTY).to(torch.uint8)
 
 
 def agreement(
     found: Float[Tensor, "height width"], its: Float[Tensor, "height width"]
 ) -> UInt8[Tensor, "height width"]:
-    """0 where the other picture has the same disparity, 1 where it has another, 2 outside it."""
+    """Left-right check: 0 for equal disparities, 1 for different ones, 2 for pixels outside the other picture."""
     width = found.shape[1]
     there = torch.arange(width) - found.round().long()
     outside = (there < 0) | (there >= width)
@@ -171,11 +174,11 @@ def filled(
     state: UInt8[Tensor, "height width"],
     rgb: UInt8[Tensor, "height width 3"],
 ) -> Float[Tensor, "height width"]:
-    """Disparity with what the other picture does not show filled: the median of the next known pixels in 16 directions,
-    weighted by likeness of colour and nearness (Hirschmüller 2008, section 2.7, with weights).
+    """Fill disparity of occluded pixels: the median of the next known pixels in 16 directions, weighted by similarity
+    of colour and proximity (Hirschmüller 2008, section 2.7, with weights).
 
-    Values that would lie in front of what the other picture shows are left out. Beyond its border the next known pixel
-    of the row counts.
+    Values in front of the other picture's surface are excluded. Beyond its border the next known pixel of the row
+    counts.
     """
     out = found.clone()
     given = found.numpy(), its.numpy(), state.numpy(), rgb.contiguous().numpy(), FILL_DIRECTIONS
@@ -186,8 +189,8 @@ def filled(
 def by_blocks(
     left: UInt8[Tensor, "height width 3"], right: UInt8[Tensor, "height width 3"], first: int, count: int
 ) -> Float[Tensor, "height width"]:
-    """Disparity by blocks from coarse to fine: large ones choose among all, smaller ones near those that held them and
-    their neighbours, at last each pixel with its window. The cost is the mean absolute difference of colour."""
+    """Coarse-to-fine block matching: large blocks search all disparities, smaller ones near those of their parent
+    blocks and neighbours, finally each pixel with its window. The cost is the mean absolute difference of colour."""
     a, b = (x.float().mean(-1) for x in (left, right))
     height, width = a.shape
     side = BLOCKS[0]
@@ -235,11 +238,12 @@ def grey(rgb: UInt8[Tensor, "height width 3"]) -> UInt8[Tensor, "height width"]:
 
 
 def rectify(first: FlatView, second: FlatView, span: tuple[float, float], names: str) -> RectifiedPair:
-    """Turn two pictures about their centres until the baseline runs along their rows (Fusiello 2000).
+    """Rectify two pictures: rotate them about their centres until the baseline is parallel to their rows (Fusiello
+                          2000).
 
-    span: nearest and farthest distance of what they show; names: both, for messages
-    Raises LumigraphError for pictures from one place, for those that look along the baseline, and for those that show
-    too little in common.
+    span: near and far limit of the depth; names: both, for messages
+    Raises LumigraphError for pictures from one position, for those that look along the baseline, and for too little
+    overlap.
     """
     apart = second.pose[:, 3] - first.pose[:, 3]
     gaze = normalize(first.pose[:, 2] + second.pose[:, 2], dim=0)
@@ -283,7 +287,7 @@ def rectify(first: FlatView, second: FlatView, span: tuple[float, float], names:
 
 
 def turned_bounds(view: FlatView, rotation: Float[Tensor, "3 3"], focal: float) -> list[float]:
-    """Left, top, right and bottom of a picture after turning, with its principal point at the origin."""
+    """Left, top, right and bottom of a picture after rotation, with its principal point at the origin."""
     height, width = view.trust.shape
     corners = torch.tensor([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]).float()
     rays = corners @ view.intrinsics.inverse().T @ view.pose[:, :3].T @ rotation
@@ -296,7 +300,7 @@ def turned_bounds(view: FlatView, rotation: Float[Tensor, "3 3"], focal: float) 
 def turned(
     view: FlatView, rotation: Float[Tensor, "3 3"], focal: float, centre: tuple[float, float], size: tuple[int, int]
 ) -> FlatView:
-    """The picture of a camera turned about its centre. rotation: camera-to-world; size: rows and columns"""
+    """The picture of a camera rotated about its centre. rotation: camera-to-world; size: rows and columns"""
     intrinsics = torch.tensor([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
     pose = torch.cat([rotation, view.pose[:, 3:]], 1)
     flat = FlatView(pose, intrinsics, torch.empty(*size, 3), torch.empty(size))

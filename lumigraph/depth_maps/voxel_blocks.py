@@ -1,4 +1,4 @@
-"""Voxel hashing (Nießner et al. 2013): depth maps fused into blocks of 8³ voxels, which exist near surfaces alone."""
+"""Voxel hashing (Nießner et al. 2013): depth maps fused into blocks of 8³ voxels, allocated near surfaces alone."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ BYTES_PER_BLOCK = VOXELS * CHANNELS * 4 + 12
 
 
 class VoxelBlocks(nn.Module):
-    """A truncated signed distance with colours, as large as the surfaces that depth maps showed.
+    """Sparse truncated signed distance field with colours.
 
     blocks: coordinates of the blocks: voxel (i, j, k) of block b lies at edge (8 b + (i, j, k))
     voxels: distance over truncation (positive in front of surfaces), weight, sRGB-encoded colour of each block's voxels
-    table:  the hash table, which follows from the blocks
+    table:  the hash table of the blocks
     """
 
     grows: ClassVar[tuple[str, ...]] = ("blocks", "voxels")
@@ -39,7 +39,9 @@ class VoxelBlocks(nn.Module):
     table: Int32[Tensor, " slot"]
 
     def __init__(self, edge: float, truncation: float, max_weight: float = math.inf, max_blocks: int = 1 << 24):
-        """edge: of a voxel, scene units; truncation: in voxels; max_blocks: beyond it none are added"""
+        """Create an empty field. edge: of a voxel, scene units; truncation: in voxels; max_blocks: limit of
+        allocation
+        """
         super().__init__()
         self.edge, self.truncation, self.max_weight, self.max_blocks = edge, truncation * edge, max_weight, max_blocks
         self.register_buffer("blocks", torch.empty(0, 3, dtype=torch.int32))
@@ -60,7 +62,7 @@ class VoxelBlocks(nn.Module):
 
     @torch.no_grad()
     def fuse(self, seen: DepthMap, trust: Float[Tensor, "height width"]) -> bool:
-        """Add one depth map; a pixel counts as much as it is trusted. False if no memory is left for new blocks."""
+        """Integrate one depth map with weights `trust`. False if no memory is left for new blocks."""
         room = True
         for part in pinhole_maps(seen, trust):
             given = (x.to(self.voxels.device) for x in (part.depth, part.rgb, part.trust, part.pose, part.lens))
@@ -74,8 +76,8 @@ class VoxelBlocks(nn.Module):
     def _new_blocks(
         self, depth: Float[Tensor, "height width"], pose: Float[Tensor, "3 4"], lens: Float[Tensor, " 4"]
     ) -> Int32[Tensor, "new 3"]:
-        """Blocks around surfaces that are not there yet: by rays of pixels, PIXELS_PER_SIDE to the side of a block at
-        the median depth."""
+        """Missing blocks around surfaces: by rays of pixels, PIXELS_PER_SIDE to the side of a block at the median
+        depth."""
         side, known = SIDE * self.edge, depth[::8, ::8].nan_to_num(0.0, 0.0)
         measured = known[known > 0]
         typical = float(measured.median()) if measured.numel() else 0.0
@@ -86,7 +88,7 @@ class VoxelBlocks(nn.Module):
         return kernels.band_blocks(some, pose, numbers, self.blocks, self.table, side, self.truncation)
 
     def _add(self, new: Int32[Tensor, "new 3"]) -> bool:
-        """Append blocks that nothing is known of; False if there is no room for them."""
+        """Append blocks without observations; False if there is no memory for them."""
         first, count = len(self), len(self) + len(new)
         if count > self.max_blocks:
             return False
@@ -101,7 +103,7 @@ class VoxelBlocks(nn.Module):
 
     @torch.no_grad()
     def prune(self) -> int:
-        """Remove blocks without a voxel near a surface (Nießner 2013, sec. 4.3); returns how many they were."""
+        """Remove blocks without a voxel near a surface (Nießner 2013, sec. 4.3); returns their number."""
         near = (self.voxels[..., 1] > 0) & (self.voxels[..., 0].abs() < EMPTY_DISTANCE)
         kept = near.any(-1)
         removed = len(self) - int(kept.sum())
@@ -121,7 +123,7 @@ class VoxelBlocks(nn.Module):
     ) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
         """Distance, normal and colour of the first surface along each ray; infinity without one.
 
-        step: between places on a ray where the distance is asked for, in voxels
+        step: step length along a ray, in voxels
         """
         near = torch.zeros_like(rays.radius)
         far = near.clone()
@@ -137,16 +139,16 @@ class VoxelBlocks(nn.Module):
     ) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
         """Vertices in the scene's frame, their colours, and triangles, anticlockwise seen from in front.
 
-        min_weight: of a voxel that counts; above what one depth map gives, surfaces that were seen once are lost
+        min_weight: of a valid voxel; above the weight of one depth map, surfaces seen once are lost
         """
         places, rgb, faces = kernels.block_surface(self.voxels, self.blocks, self.table, min_weight)
         return self.edge * places, rgb, faces
 
 
 def _extended(rows: Tensor, count: int, new: Tensor) -> Tensor:
-    """Rows and new ones behind them up to a count, in the same memory as long as there is room in it.
+    """Rows resized to `count`, within the same memory while its capacity lasts.
 
-    new: what the new ones hold, of any shape that expands to theirs
+    new: value of the new rows, broadcast to their shape
     """
     held, size = len(rows), math.prod(rows.shape[1:]) * rows.element_size()
     if rows.untyped_storage().nbytes() < count * size or rows.storage_offset():

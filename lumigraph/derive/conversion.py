@@ -34,7 +34,7 @@ from ..run.derived import ConversionStart, Converted, LearntFrom, MeasuredModel,
 from ..system.progress import NumberedStages, clock, track
 from ..system.signals import go_on_unless
 from ..system.work import at_work
-from ..training import fit
+from ..training.loop import fit
 from .compression.compress import bytes_of
 from .options import ConvertOptions
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from ..budget import Quality, about_quality, given_budget
+from ..budget import Limited, Quality, about_quality
 from ..errors import LumigraphError
 from ..export.options import Cropping
 from ..files.options import PhotographsOption, SeedOption, StepsOption, option
@@ -26,7 +26,7 @@ ABOUT_STEPS = about_quality() + " A conversion from a field trains for half of t
 
 
 @dataclass(frozen=True)
-class ConvertOptions:
+class ConvertOptions(Limited):
     """Options of a conversion, which ends after steps, seconds or the steps of a quality."""
 
     seconds: Annotated[Seconds | None, option("S", f"{CONVERSION_SECONDS:.0f}, or the steps of the method")] = None
@@ -39,10 +39,6 @@ class ConvertOptions:
     views: Annotated[Count, option("N")] = 8
     """Compare at most this number of held-out views, evenly spread."""
     seed: SeedOption = 0
-
-    def check(self) -> None:
-        """Raises LumigraphError for more than one way to say how long."""
-        given_budget(self.steps, self.seconds, self.quality)
 
     def limited(self, steps: int | None) -> ConvertOptions:
         """The same with a limit in time. steps: default number of the method; None for the default seconds"""

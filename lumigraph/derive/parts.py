@@ -151,7 +151,7 @@ def write_cloud(
         if action == "move":
             place = motion(points.positions[chosen], options.shift, options.turn)
             made = joined([pieces.rest, pieces.part.transformed(place.matrix)])
-    write_gaussians(output, made.transformed(opened.frame.to_source.matrix))
+    write_gaussians(output, made.transformed(opened.frame.to_source.matrix, far=True))
 
 
 def write_field(

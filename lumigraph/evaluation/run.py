@@ -87,8 +87,7 @@ def evaluate_run(
         if options.save_images:
             save_picture(image_of(run, name), rendering.rgb, "rendering")
 
-    found = evaluate_on(method, data, options, keep, load_lpips(weights) if weights else None)
-    state = run.state
+    found, state = evaluate_on(method, data, options, keep, load_lpips(weights) if weights else None), run.state
     result = found.to_json() | {
         "training_seconds": state.seconds,
         "compile_seconds": state.compile_seconds,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,19 +22,21 @@ from ..gaussians.cloud import as_precise_as_needed
 from ..gaussians.moving import MovingGaussians
 from ..system.memory import free_memory
 from ..system.progress import counting
-from . import compressed_ply, fourdgs, glb, moving_ply, ply, sog, splat, spz, streamed_sog
+from . import compressed_ply, fourdgs, glb, moving_ply, ply, sog, splat, spz, streamed_sog, usd
 from .checks import checked, without_unsound
 
-WRITERS = {
+WRITERS: dict[str, Callable[..., None]] = {
     ".compressed.ply": compressed_ply.write,
     ".ply": ply.write,
     ".splat": splat.write,
     ".spz": spz.write,
     ".sog": sog.write,
     ".glb": glb.write,
+    **dict.fromkeys(usd.SUFFIXES, usd.write),
 }
 READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
-SUFFIXES = tuple(WRITERS)
+SUFFIXES = tuple(name for name in WRITERS if name not in usd.SUFFIXES)  # that are read as well
+PLACED = (".glb", *usd.SUFFIXES)  # formats with a place of their own for an offset
 FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
 OFFSET = "offset.json"  # beside a file, or in a folder
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
@@ -51,6 +53,8 @@ def read_gaussians(path: Path | str) -> Gaussians:
     path = place_of(expanded(path))
     layout = layout_of(path)
     suffix = "" if layout else check_ending(path)
+    if suffix in usd.SUFFIXES:
+        raise LumigraphError(f"{path} is OpenUSD, which is written and not read; read what it was made of")
     with reading(path, "is truncated or damaged", "copy or download it again"):
         if not layout:
             _check_file(path)
@@ -105,11 +109,11 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog
     with counting(f"Writing {path.name}"):
         if path.name == streamed_sog.META:
             streamed_sog.write(path, sound, detail)
-        elif ending == ".glb":
-            glb.write(path, sound, None if offset is None else offset.numpy())
+        elif ending in PLACED and offset is not None:
+            WRITERS[ending](path, sound, offset.numpy())
         else:
             WRITERS[ending](path, sound)
-    write_offset(path, None if offset is None or ending == ".glb" else offset.tolist())
+    write_offset(path, None if offset is None or ending in PLACED else offset.tolist())
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,7 @@ def is_splat_file(path: Path | str) -> bool:
 def names_splats(path: Path | str) -> bool:
     """True if `write_gaussians` accepts a name, independent of existing files."""
     path = expanded(path)
-    return path.name in FOLDERS or (path.name.lower().endswith(SUFFIXES) and not path.is_dir())
+    return path.name in FOLDERS or (path.name.lower().endswith(tuple(WRITERS)) and not path.is_dir())
 
 
 def place_of(path: Path) -> Path:
@@ -191,7 +195,7 @@ def check_ending(path: Path) -> str:
     """Suffix of a name, one of SUFFIXES. Raises LumigraphError for any other."""
     if path.name in FOLDERS:
         return ".sog"
-    for suffix in SUFFIXES:
+    for suffix in WRITERS:
         if path.name.lower().endswith(suffix):
             return suffix
     raise LumigraphError(f"{path} does not end like a file of Gaussians; name one that ends in {', '.join(SUFFIXES)}")

@@ -59,6 +59,7 @@ def is_moving_file(path: Path | str) -> bool:
 # Writing
 
 
+@torch.no_grad()
 def write_moving(path: Path | str, moving: MovingGaussians) -> None:
     """Write a moving cloud, atomically. Raises LumigraphError for numbers that are not finite."""
     path = expanded(path)

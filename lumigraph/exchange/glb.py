@@ -160,7 +160,7 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
         place = torch.from_numpy(matrix)
         if not is_similarity(place):
             raise LumigraphError(f"{file.path} stretches or mirrors its Gaussians by a node; apply its place to them")
-        found = found.transformed(place)
+        found = found.transformed(place, far=True)
     return cloud(
         found.means.numpy() * TURN_MEAN,
         array(found.quaternions) * TURN_ROTATION,

@@ -94,17 +94,16 @@ class Loaded:
 
     def camera(self, view: str | None) -> Camera:
         """Camera of a training photograph by name or number; None for the one in the middle of all."""
-        train = self.cameras["train"]
-        middle = view is None
-        return train[Surroundings(train, self.frame).middle if middle else self.opened.find_view("train", view or "")]
+        if view is None:
+            return self.cameras["train"][Surroundings(self.cameras["train"], self.frame).middle]
+        return self.method.refined(self.opened.find_view("train", view)[1])
 
     def unwanted(self, gaussians: Gaussians, crop: Crop | None) -> dict[str, Bool[Tensor, " gaussian"]]:
         """Masks of the Gaussians to remove, by reason. Raises LumigraphError if none is left."""
         part = self.part
         strength = (STRENGTH if part.clean else 0.0) if part.strength is None else part.strength
-        reasons = unwanted(
-            gaussians, crop, part.max_scale, floaters(gaussians, self.photographers, self.frame, strength)
-        )
+        floating = floaters(gaussians, self.photographers, self.frame, strength)
+        reasons = unwanted(gaussians, crop, part.max_scale, floating)
         if len(gaussians) and gone(reasons).all():
             raise LumigraphError(
                 "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
@@ -123,7 +122,10 @@ class Loaded:
 
     def moving(self, duration: float) -> MovingGaussians:
         """Moving Gaussians to keep, in the scene's frame. duration: seconds of the whole capture when it is played"""
-        moving = needs(self.method, HasMovingGaussians).moving(duration)
+        if can(self.method, HasMovingGaussians):
+            moving = needs(self.method, HasMovingGaussians).moving(duration)
+        else:
+            moving = MovingGaussians.still(needs(self.method, HasGaussians).gaussians(), duration)
         return moving[self.kept(moving.cloud, self.crop)]
 
     def kept_method(self) -> Method:
@@ -149,10 +151,7 @@ def export_splats(
     part: Keeping = Keeping(),
     scaling: Scaling = Scaling(),
 ) -> Gaussians:
-    """Write a cloud as it is at one moment, and return it. A splat file's own numbers stay as they are.
-
-    settings: controls, NAME=VALUE
-    """
+    """Write a cloud as it is at one moment, and return it; a splat file's numbers stay. settings: NAME=VALUE"""
     if isinstance(opened, SplatFile):
         if settings:
             raise LumigraphError(f"{opened.path} is a file of Gaussians, which has no controls; leave out --set")
@@ -163,7 +162,7 @@ def export_splats(
             cloud = cloud[loaded.kept(cloud, loaded.crop and loaded.crop.moved(opened.frame.to_source))]
     else:
         loaded = Loaded.of(opened, "cpu", settings, part, scaling)
-        cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix)
+        cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix, far=True)
     write_gaussians(path, cloud, Detail(**options.detail.given))
     return cloud
 
@@ -175,5 +174,5 @@ def export_moving(loaded: Loaded, path: Path, options: SplatsOptions = SplatsOpt
     if "time" in loaded.method.settings:
         raise LumigraphError("A .4dgs holds every moment; leave out --set time, or name a .spz for one of them")
     moving = loaded.moving(options.duration)
-    write_moving(path, moving.transformed(loaded.frame.to_export.matrix))
+    write_moving(path, moving.transformed(loaded.frame.to_export.matrix, far=True))
     return moving

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from ..datasets.scene import GeographicOrigin
 from ..errors import LumigraphError
 from ..exchange import gltf
 from ..files import write_bytes
-from ..geometry import to_quaternion, turning
+from ..files.ply import NAMES
+from ..geometry import is_far, to_quaternion, turning
 from ..system.progress import counting
 from .surface import Triangles, tangents, vertex_normals
 from .usdz import png, usdz
@@ -47,6 +49,15 @@ class MeshFile:
     lit: bool = False
     origin: GeographicOrigin | None = None
     pieces: Mapping[str, Triangles] = field(default_factory=dict)
+
+    @cached_property
+    def offset(self) -> Float[np.ndarray, " 3"] | None:
+        """Place near the vertices, where they are too far from the origin for float32; None near it."""
+        vertices, faces = self.mesh.vertices, self.mesh.faces
+        if not len(faces):
+            return None
+        edge = float(np.median(np.linalg.norm(vertices[faces[:, 1]] - vertices[faces[:, 0]], axis=1)))
+        return np.median(vertices, 0).round() if is_far(vertices, edge) else None
 
     @property
     def normals(self) -> Float[np.ndarray, "vertex 3"]:
@@ -76,6 +87,7 @@ def write_mesh(
     origin: of the mesh's frame on Earth, in comments (.ply) or extras (.glb)
     pieces: further triangles by name, in a .glb alone
     .ply: binary, float32, sRGB-encoded bytes at each vertex
+    Far from the origin .ply and .obj have places in double precision, .glb nodes with a translation
     .obj: sRGB-encoded colours from 0 to 1 after each vertex, as MeshLab, Blender and others read them; with a texture
           its places, and beside it .mtl, .png and -normals.png
     .glb: linear colours, float32, or a texture inside the file
@@ -114,10 +126,27 @@ MATERIAL, PICTURE, NORMALS = ".mtl", ".png", "-normals.png"
 
 
 def ply(file: MeshFile) -> Parts:
-    data = bytes(as_trimesh(file).export(file_type="ply", vertex_normal=True))
-    first, rest = data.split(b"\n", 2)[:2], data.split(b"\n", 2)[2]
+    data = exact_ply(file) if file.offset is not None else as_trimesh(file).export(file_type="ply", vertex_normal=True)
+    *first, rest = bytes(data).split(b"\n", 2)
     comments = ["written by Lumigraph", *([] if file.origin is None else [file.origin.sentence])]
     return {"": b"\n".join([*first, *(f"comment {text}".encode() for text in comments), rest])}
+
+
+def exact_ply(file: MeshFile) -> bytes:
+    """The same layout with places in double precision."""
+    mesh = file.mesh
+    kinds = {"x": "f8", "y": "f8", "z": "f8", "nx": "f4", "ny": "f4", "nz": "f4"} | dict.fromkeys(
+        ("red", "green", "blue"), "u1"
+    )
+    rows = np.empty(len(mesh.vertices), [(name, f"<{kind}") for name, kind in kinds.items()])
+    for name, column in zip(kinds, [*mesh.vertices.T, *file.normals.T, *mesh.colours[:, :3].T], strict=True):
+        rows[name] = column
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {NAMES[kind][0]} {name}" for name, kind in kinds.items()]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    return "\n".join(lines).encode() + rows.tobytes() + faces.tobytes()
 
 
 def obj(file: MeshFile) -> Parts:
@@ -131,7 +160,7 @@ def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
     """Text of an OBJ file, of its material, and the pictures that this names. OBJ's v points upwards."""
     held, numbers = io.StringIO(), np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9)
     held.write(f"# written by Lumigraph\nmtllib {file.name}{MATERIAL}\nusemtl surface\n")
-    np.savetxt(held, file.mesh.vertices, "v %.9g %.9g %.9g")
+    np.savetxt(held, file.mesh.vertices, "v %.9g %.9g %.9g" if file.offset is None else "v %.14g %.14g %.14g")
     np.savetxt(held, texture.uv * [1, -1] + [0, 1], "vt %.7g %.7g")
     np.savetxt(held, file.normals, "vn %.5g %.5g %.5g")
     np.savetxt(held, numbers, "f " + " ".join(["%d/%d/%d"] * 3))
@@ -147,8 +176,10 @@ def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
 def glb(file: MeshFile) -> Parts:
     """A binary glTF 2.0 of one mesh in its own frame, below a node that turns it upright."""
     mesh, texture = file.mesh, file.mesh.texture
+    base = np.zeros(3) if file.offset is None else file.offset
+    place = {} if file.offset is None else {"translation": base.tolist()}
     columns = {
-        "POSITION": gltf.Column(mesh.vertices.astype("<f4"), bounded=True),
+        "POSITION": gltf.Column((mesh.vertices - base).astype("<f4"), bounded=True),
         "NORMAL": gltf.Column(file.normals.astype("<f4")),
     }
     material: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
@@ -175,7 +206,7 @@ def glb(file: MeshFile) -> Parts:
                 "extras": {"source_from_upright": file.upright.T.tolist()},
                 "children": [1],
             },
-            {"name": "source", "mesh": 0},
+            {"name": "source", "mesh": 0, **place},
         ],
         "meshes": [
             {
@@ -201,10 +232,10 @@ def glb(file: MeshFile) -> Parts:
     every = [*columns.values(), gltf.Column(mesh.faces.astype("<u4").reshape(-1), target=gltf.INDICES)]
     for name, (vertices, faces) in file.pieces.items():
         about["nodes"][0]["children"].append(len(about["nodes"]))
-        about["nodes"].append({"name": name, "mesh": len(about["meshes"])})
+        about["nodes"].append({"name": name, "mesh": len(about["meshes"]), **place})
         primitive = {"attributes": {"POSITION": len(every)}, "indices": len(every) + 1}
         about["meshes"].append({"name": name, "primitives": [primitive]})
-        every.append(gltf.Column(vertices.astype("<f4"), bounded=True))
+        every.append(gltf.Column((vertices - base).astype("<f4"), bounded=True))
         every.append(gltf.Column(faces.astype("<u4").reshape(-1), target=gltf.INDICES))
     return {"": gltf.encoded(about, every, pictures)}
 

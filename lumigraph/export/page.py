@@ -258,16 +258,21 @@ MAX_FACES = 300_000  # triangles of a mesh in a page, about 4 MB
 
 
 def export_page(
-    loaded: Loaded, path: Path, options: PageOptions = PageOptions(), octree: Callable[[], Method] | None = None
+    loaded: Loaded, path: Path, options: PageOptions, octree: Callable[[], Method] | None = None, bakes: bool = False
 ) -> tuple[str, dict[str, int]]:
     """Write what is loaded as one HTML file. Returns its contents in words and in numbers.
 
     octree: makes an octree of it for a volume; None where it has none
+    bakes:  whether it becomes an octree where the options leave the kind open
     Raises LumigraphError for options that it cannot have.
     """
-    background, cameras, kind = background_of(options), loaded.cameras["train"], kind_of(loaded, options, octree)
-    if kind == "volume":
-        loaded = replace(loaded, method=baked(loaded, octree))
+    background, cameras, kind = background_of(options), loaded.cameras["train"], kind_of(loaded, options, bakes)
+    if kind == "volume" and loaded.part.crops:
+        raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
+    if kind == "volume" and octree is not None and not is_baked(loaded.method):
+        if loaded.method.settings:
+            raise LumigraphError("A conversion has no controls; leave out --set, or give --as views")
+        loaded = replace(loaded, method=octree())
     still = loaded.still
     behind = backdrop(still.method, cameras) if kind != "views" and not loaded.part.crops else None
     opening = opening_of_scene(options.title or loaded.opened.title, cameras, loaded.frame, background, behind)
@@ -293,7 +298,7 @@ def export_page(
     return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}", {"gaussians": len(gaussians)}
 
 
-def kind_of(loaded: Loaded, options: PageOptions, octree: object) -> str:
+def kind_of(loaded: Loaded, options: PageOptions, bakes: bool) -> str:
     """Kind of page: that of the options, or the first that what is loaded can have."""
     if options.kind != "auto":
         return options.kind
@@ -301,20 +306,7 @@ def kind_of(loaded: Loaded, options: PageOptions, octree: object) -> str:
         return "splats"
     if loaded.part.crops:
         return "views"
-    return "volume" if is_baked(loaded.method) or (not loaded.method.settings and octree) else "views"
-
-
-def baked(loaded: Loaded, octree: Callable[[], Method] | None) -> Method:
-    """Method whose volume browsers show. Raises LumigraphError where there is none."""
-    if loaded.part.crops:
-        raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
-    if is_baked(loaded.method):
-        return loaded.method
-    if loaded.method.settings:
-        raise LumigraphError("A conversion has no controls; leave out --set, or give --as views")
-    if octree is None:
-        raise LumigraphError(f"{loaded.opened.path} cannot become an octree; give --as views")
-    return octree()
+    return "volume" if is_baked(loaded.method) or (not loaded.method.settings and bakes) else "views"
 
 
 def background_of(options: PageOptions) -> Vector | None:

@@ -16,6 +16,7 @@ from ..datasets.scene import Frame, GeographicOrigin
 from ..depth_maps import DepthMap, SurfacePoints, Tolerance, render_depth_maps
 from ..errors import LumigraphError
 from ..files.ply import write_rows
+from ..geometry import is_far
 from ..method import Method
 from ..system.progress import counting, track
 from ..system.work import at_work
@@ -131,12 +132,15 @@ def cells(
 
 
 def write_points(path: Path, points: PointCloud, origin: GeographicOrigin | None = None) -> None:
-    """A binary PLY file: x y z, nx ny nz (float32), red green blue (bytes). Raises LumigraphError where it cannot.
+    """A binary PLY file: x y z (float32, or float64 far from the origin), nx ny nz (float32), red green blue (bytes).
 
     origin: of the points' frame on Earth, for a comment
     """
     floats, bytes_ = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
-    rows = np.empty(len(points.positions), [*((name, "<f4") for name in floats), *((name, "u1") for name in bytes_)])
+    spacing = float(np.ptp(points.positions, axis=0).max()) / max(len(points.positions), 1) ** 0.5
+    exact = "<f8" if is_far(points.positions, spacing) else "<f4"
+    kinds = [*((name, exact) for name in floats[:3]), *((name, "<f4") for name in floats[3:])]
+    rows = np.empty(len(points.positions), [*kinds, *((name, "u1") for name in bytes_)])
     values = np.concatenate([points.positions, points.normals, points.colours], -1)
     for name, column in zip((*floats, *bytes_), values.T, strict=True):
         rows[name] = column

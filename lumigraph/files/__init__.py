@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, read as typed values."""
+"""Files: atomic writing, typed reading."""
 
 from .atomic import Kind as Kind
 from .atomic import check_room as check_room

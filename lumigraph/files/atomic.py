@@ -1,7 +1,7 @@
-"""Files that are written whole or not at all, and never over foreign files.
+"""Atomic writing of files, without replacing foreign files.
 
 A file is replaced only if Lumigraph wrote it, as the same kind, and it is unchanged since (`marks`), or if the user
-gave --overwrite for it. A folder is replaced only if Lumigraph wrote it as one, with all that is in it. Commands call
+gave --overwrite for it. A folder is replaced only if Lumigraph wrote it as one, with all its contents. Commands call
 `claim` before any work; writers call it again.
 """
 
@@ -45,11 +45,11 @@ _granted: dict[Path, Seen | None] = {}  # what lay there when this process was a
 
 
 def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """Raise LumigraphError unless a file may be written there. Commands call it before their work.
+    """Raise LumigraphError unless a file may be written. Commands call it before their work.
 
-    kind:      what it will be; in the place of anything else it does not go
-    overwrite: whether the user wants whatever file lies there replaced; None where there is no option to say so
-    reads:     what the work begins with, which stays in any case
+    kind:      of the new file; it replaces only files of its kind
+    overwrite: whether the user allows replacing any file; None where no option asks
+    reads:     inputs of the work, which are never replaced
     """
     place = Path(os.path.abspath(path))
     with explained(path):
@@ -77,8 +77,8 @@ def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable
 
 
 def claim_folder(path: Path, kind: Kind | None = None) -> None:
-    """Raise LumigraphError unless a folder may be written there, as a whole: in the place of nothing, of an empty
-    folder, or of one of the same kind."""
+    """Raise LumigraphError unless a whole folder may be written: the path must be free, empty, or a folder of the
+    same kind."""
     with explained(path):
         check_room(Path(os.path.abspath(path)))
         if seen(path) is None:
@@ -100,12 +100,10 @@ def claim_folder(path: Path, kind: Kind | None = None) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[Path]:
-    """An empty file to fill, in the folder of `path`; it takes that place once the block ends well.
+    """An empty file to fill, in the folder of `path`; it replaces `path` after the block succeeds.
 
-    ours: this is a part of a folder that was recognised by its own mark, such as a run's config.json: what may lie
-          there is ours
-    After a fault or a kill the place holds what it held before. Raises LumigraphError as `claim` does, or if the disk
-    refuses.
+    ours: the file is part of a folder of ours, such as a run's with config.json, so that an existing one is ours
+    After an error or a kill `path` is unchanged. Raises LumigraphError as `claim` does, or if the disk refuses.
     """
     if not ours:
         claim(path, kind)
@@ -146,7 +144,7 @@ def replacing_folder(path: Path, kind: Kind | None = None, ours: bool = False) -
 
 
 def exchange(new: Path, place: Path) -> None:
-    """Put a folder into a place. What was there has the folder's name afterwards, and is deleted with it."""
+    """Rename a folder to `place`. An existing one gets the folder's name, and is deleted with it."""
     if seen(place) is None:
         os.replace(new, place)
     elif not swapped(new, place):  # no such call: a kill between these two costs what was there, and was to go
@@ -162,7 +160,7 @@ def exchange(new: Path, place: Path) -> None:
 
 
 def swapped(one: Path, other: Path) -> bool:
-    """Let two paths change places in one step; False where the system has no such call (Linux has `renameat2`)."""
+    """Swap two paths atomically; False on systems without such a call (Linux has `renameat2`)."""
     call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
     return call is not None and call(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0
 
@@ -192,15 +190,15 @@ def seen(path: Path) -> Seen | None:
 
 
 def refuse_link(path: str | Path) -> None:
-    """Raise LumigraphError for a link at a place that is about to be written to: it would lead elsewhere."""
+    """Raise LumigraphError for a symbolic link at a path to be written: it would write elsewhere."""
     if os.path.islink(path):
         raise LumigraphError(f"{path} is a link, which may lead our files elsewhere; put a copy in its place")
 
 
 def refuse_links(folder: Path, read_only: Container[str] = ()) -> None:
-    """Raise LumigraphError for a link below a folder that is about to be written into.
+    """Raise LumigraphError for a symbolic link below a folder to be written.
 
-    read_only: names of folders in it that nothing is written into
+    read_only: names of folders in it without writes
     """
     for place, folders, names in os.walk(folder):
         for name in (*folders, *names):
@@ -210,14 +208,16 @@ def refuse_links(folder: Path, read_only: Container[str] = ()) -> None:
 
 
 def open_anew(path: Path) -> BinaryIO:
-    """A new and empty file of this user alone, open for writing. What lay there goes; a link's target stays."""
+    """Create a file readable by this user alone, open for writing. An existing one is deleted; a link's target
+    stays.
+    """
     with explained(path):
         path.unlink(missing_ok=True)
         return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
 
 
 def check_room(place: Path) -> None:
-    """Raise OSError unless something may be written there, as far as that can be told beforehand."""
+    """Raise OSError unless the place is writable, as far as that can be checked beforehand."""
     above = next(folder for folder in [*place.parents, Path(place.anchor)] if os.path.lexists(folder))
     if not above.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(above))
@@ -231,7 +231,7 @@ def write_bytes(path: Path, data: bytes, kind: Kind = "file", ours: bool = False
 
 
 def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) -> None:
-    """JSON for programs and people: indented, but rows of numbers stay rows."""
+    """Write JSON, indented, with rows of numbers on single lines."""
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
     text = NUMBER_LIST.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
     write_bytes(path, text.encode() + b"\n", kind, ours)
@@ -240,16 +240,16 @@ def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) 
 def read_json(path: Path, kind: Any = Any) -> Any:
     """Read JSON as a value of a type (see `ranges.typed`), or unchecked if no type is given.
 
-    Raises LumigraphError, naming the file, if it is missing, is no JSON (NaN, infinity and numbers of hundreds of
-    digits are none either), nests deeper than anything sound does, or does not hold what the kind says.
+    Raises LumigraphError, naming the file, if it is missing, is not JSON (NaN, infinity and numbers of hundreds of
+    digits included), nests too deep, or does not match the type.
     """
     return typed(kind, from_json(read_bytes(path), path), path)
 
 
 def read_bytes(path: Path, most: int = MAX_TEXT_BYTES) -> bytes:
-    """Contents of an ordinary file of so many bytes at most.
+    """Contents of a regular file of at most `most` bytes.
 
-    Raises LumigraphError, naming the file, if it is missing, too large, or a device or pipe that would never end.
+    Raises LumigraphError, naming the file, if it is missing, too large, or a device or pipe.
     """
     with explained(path), open(path, "rb", opener=without_waiting) as file:
         about = os.fstat(file.fileno())
@@ -263,7 +263,7 @@ def read_bytes(path: Path, most: int = MAX_TEXT_BYTES) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Text of an ordinary file, as `read_bytes`; what is no UTF-8 becomes a replacement character."""
+    """Text of a regular file, as `read_bytes`; invalid UTF-8 becomes a replacement character."""
     return without_mark(read_bytes(path)).decode("utf-8", errors="replace")
 
 
@@ -275,12 +275,12 @@ def without_mark(data: bytes) -> bytes:
 
 
 def without_waiting(path: str, flags: int) -> int:
-    """Descriptor of a file, without waiting for whoever writes to a pipe."""
+    """Descriptor of a file, opened without blocking on a pipe."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def from_json(data: bytes, where: Path | str) -> Any:
-    """Plain values of JSON. where: what to name in a LumigraphError; see `read_json`."""
+    """Parse JSON. where: named in a LumigraphError; see `read_json`"""
     data = without_mark(data)
     nesting = accumulate(1 if bracket in b"[{" else -1 for bracket in data.translate(None, BUT_BRACKETS))
     if max(nesting, default=0) > MAX_JSON_DEPTH:
@@ -300,7 +300,7 @@ def expanded(name: Path | str) -> Path:
 
 
 def sync(path: Path) -> None:
-    """Make sure that what was written survives a loss of power."""
+    """Flush a file or folder to disk, against loss of power."""
     if path.is_dir():
         for file in path.rglob("*"):
             if file.is_file():
@@ -323,7 +323,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn the operating system's refusals into one sentence about `path`."""
+    """Context that turns operating system errors into one sentence about `path`."""
     try:
         yield
     except OSError as error:
@@ -345,7 +345,7 @@ def refusal(path: Path, error: OSError) -> str:
 
 
 def scene_name(source: str) -> str:
-    """A short name for files: the last part of a path, without a file's suffix, or what is behind "procedural:" or
+    """Short name for files: the last part of a path, without a file's suffix, or the part after "procedural:" or
     "words:"."""
     path = Path(source).resolve()
     own = path.stem if path.is_file() else path.name

@@ -1,4 +1,4 @@
-"""One at a time: who works in a folder holds a lock on it, which the system drops when the process ends, even killed.
+"""Folder locks, which the system releases when the process ends, even killed.
 
 So the lock file of a killed process is no lock and need not be deleted.
 """
@@ -38,10 +38,10 @@ class Holder:
 
 @contextlib.contextmanager
 def held(folder: Path, doing: str) -> Iterator[None]:
-    """Hold an existing folder inside this block; a process that holds it already keeps it.
+    """Lock an existing folder inside this block; reentrant within a process.
 
-    doing: what is done with the folder meanwhile, as in "trained"
-    Raises LumigraphError, which says who it is, if another process holds it.
+    doing: activity of the lock, such as "trained"
+    Raises LumigraphError, naming the holder, if another process has the lock.
     """
     place = folder.resolve() / LOCK_FILE
     if place in _ours:
@@ -63,7 +63,9 @@ def held(folder: Path, doing: str) -> Iterator[None]:
 
 
 def check_place(folder: Path) -> None:
-    """Raise LumigraphError if a foreign file lies where a folder's lock would: it would be replaced, and deleted."""
+    """Raise LumigraphError for a foreign file at the path of a folder's lock, since it would be replaced and
+    deleted.
+    """
     with explained(folder / LOCK_FILE):
         if not is_lock(folder / LOCK_FILE):
             raise LumigraphError(f"{folder / LOCK_FILE} is no lock of Lumigraph's; rename it, or choose another folder")
@@ -82,7 +84,7 @@ def is_lock(place: Path) -> bool:
 
 
 def taken(place: Path) -> TextIO | None:
-    """The lock's file, open and locked; None if another process has it."""
+    """The lock's file, open and locked; None if another process has the lock."""
     while True:
         file = open(place, "a+", encoding="utf-8")
         if not lock(file):
@@ -121,7 +123,7 @@ def lock(file: TextIO) -> bool:
 
 
 def holder(place: Path) -> str:
-    """Who holds a lock, in words."""
+    """Description of a lock's holder."""
     try:
         said = read_json(place, Holder)
     except LumigraphError:  # it is being written just now

@@ -1,12 +1,12 @@
 """Records of files that Lumigraph wrote into a folder: lines of JSON in a file `.lumigraph` there.
 
 Each line is a file: its name, its kind, its bytes and their SHA-256. A file is ours if a line matches its present
-content. A mark inside each file would not do: some formats have no room (.splat), and it would outlive an edit or come
-from another user's Lumigraph. Nor would a record in the user's home: folders are moved, copied, mounted in containers.
+content. A mark inside each file would fail: some formats have no room (.splat), and it would survive an edit or come
+from another user's Lumigraph. So would a record in the user's home: folders are moved, copied, mounted in containers.
 
-Lines are only added, in one write: processes that share a folder lose nothing of each other's, and a kill leaves half a
-line at most, which is skipped. A line precedes its file; one whose file was never written matches no other. A
-`.lumigraph` of another program is kept, and files beside it are not recognised later.
+Lines are only appended, in one write: concurrent processes lose nothing, and a kill leaves half a line at most, which
+is skipped. A line precedes its file; one whose file was never written matches no other. A `.lumigraph` of another
+program is kept, and files beside it are not recognised later.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ Kind = Literal[
 
 
 def note(path: Path, kind: Kind, written: Path) -> None:
-    """Remember that a file, which still has another name, will be ours at `path`. OSError if the disk is full."""
+    """Record a file, still under another name, as ours at `path`. OSError if the disk is full."""
     add(path.parent, kind, {path.name: sum_of(written)})
 
 
 def note_folder(folder: Path, kind: Kind) -> None:
-    """Remember that a folder and all that is in it are ours, of one kind. OSError if the disk is full."""
+    """Record a folder with all its contents as ours, of one kind. OSError if the disk is full."""
     for place, _, names in os.walk(folder):
         whole: dict[str, Sum] = {WHOLE_FOLDER: (0, "")} if Path(place) == folder else {}
         add(Path(place), kind, whole | {name: sum_of(Path(place, name)) for name in names if name != MARKS_FILE})
@@ -56,7 +56,7 @@ def is_whole(folder: Path, kind: Kind) -> bool:
 
 
 def foreign_in(folder: Path, kind: Kind) -> Path | None:
-    """Something in a folder, however deep, that Lumigraph did not write or that has been changed since; or None."""
+    """A file in a folder or its subfolders that Lumigraph did not write or that has changed since; or None."""
     for place, folders, names in os.walk(folder):
         here, sums = Path(place), known(Path(place), kind)
         own = {MARKS_FILE} if is_record(here / MARKS_FILE) else set()
@@ -103,7 +103,7 @@ def is_record(path: Path) -> bool:
 
 
 def add(folder: Path, kind: Kind, sums: dict[str, Sum]) -> None:
-    """Add lines to a folder's record, and begin it if there is none."""
+    """Append lines to a folder's record; create it if missing."""
     path = folder / MARKS_FILE
     is_new = not os.path.lexists(path)
     if not (sums and (is_new or is_record(path))):

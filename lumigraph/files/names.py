@@ -1,4 +1,4 @@
-"""Names as people read them: in which order, how many, and which one was meant."""
+"""Names for users: natural order, counts, suggestions for misspelt ones."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def next_free(prefix: str) -> Path:
 
 
 def counted(number: int, noun: str) -> str:
-    """So many of them: "3 photographs", "1 photograph", "no photographs"."""
+    """Count with a noun: "3 photographs", "1 photograph", "no photographs"."""
     return f"{number or 'no'} {noun}{'' if number == 1 else 's'}"
 
 
 def meant(name: str, known: Sequence[str]) -> str | None:
-    """The known name that a user most likely meant by another; None where none is close.
+    """Best suggestion for a misspelt name; None without a close one.
 
-    Letters alone count: the same ones ("instantngp"), a part of a name ("splat"), its words' initials ("3dgs", "ff"),
-    and last what differs least from the name or a word of it. Of several, one of fewest words comes first.
+    Compares letters only: equal ones ("instantngp"), a part of a name ("splat"), its words' initials ("3dgs", "ff"),
+    and last the least edit distance to the name or a word of it. Among several, one of fewest words comes first.
     """
     said = letters(name)
     if not said:

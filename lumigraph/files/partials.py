@@ -1,8 +1,8 @@
 """Partial files: unique names in the destination folder, and removal of leftovers of killed processes.
 
-A process holds a lock on whatever it is writing, and the system drops the lock when the process ends, even killed. So
-what has such a name and no lock is a leftover of ours, deleted at the next write into the folder. Where the
-file system knows no locks it stays.
+A process locks a partial file while writing, and the system releases the lock when the process ends, even killed. So a
+file with such a name and without a lock is a leftover of ours, deleted at the next write into the folder. On file
+systems without locks it stays.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _swept: set[tuple[int, Path]] = set()  # processes and folders
 
 @contextlib.contextmanager
 def partial(folder: Path, is_folder: bool = False) -> Iterator[Path]:
-    """An empty file or folder to fill; what still has this name when the block ends is deleted."""
+    """A new empty file or folder to fill; deleted after the block unless renamed."""
     sweep(folder)
     while True:
         path, lock = folder / f".lumigraph-{os.urandom(8).hex()}.partial", None
@@ -39,7 +39,7 @@ def partial(folder: Path, is_folder: bool = False) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Delete what processes that were killed have left behind, once for each folder."""
+    """Delete leftovers of killed processes, once for each folder."""
     if (os.getpid(), folder.absolute()) in _swept:
         return
     _swept.add((os.getpid(), folder.absolute()))
@@ -51,7 +51,7 @@ def sweep(folder: Path) -> None:
 
 
 def locked(path: Path) -> int | None:
-    """A descriptor that holds a file's or folder's lock; None if another process does, or if there are no locks."""
+    """Descriptor that locks a file or folder; None if another process has the lock, or without locks."""
     if sys.platform == "win32":
         return None  # and files that are open could not be renamed
     import fcntl
@@ -68,7 +68,7 @@ def locked(path: Path) -> int | None:
 
 
 def remove(path: Path) -> None:
-    """Delete a file or a folder, if it is there. A link goes, and what it leads to stays."""
+    """Delete a file or a folder, if it exists. Of a link only the link."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -1,4 +1,4 @@
-"""Values as plain JSON and named tensors, and back. Never pickle: a file that is read must not run."""
+"""Serialisation of values to plain JSON and named tensors, without pickle: reading a file must not execute it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .reading import reading
 
 
 def flatten(value: Any, tensors: dict[str, Tensor], name: str = "optimizers") -> Any:
-    """The value as JSON, its tensors put into `tensors` under the path that leads to them."""
+    """The value as JSON; its tensors are added to `tensors` under their paths."""
     match value:
         case Tensor():
             tensors[name] = value
@@ -42,7 +42,7 @@ def unflatten(value: Any, tensors: dict[str, Tensor]) -> Any:
 
 
 def understood(path: Path) -> AbstractContextManager[None]:
-    """`reading` of a file that Lumigraph wrote."""
+    """`reading` for files that Lumigraph wrote."""
     return reading(path, "does not hold what it should", "it was edited, or written by another version")
 
 

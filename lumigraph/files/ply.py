@@ -61,7 +61,7 @@ class Element:
         return any(p.length is not None for p in self.properties)
 
     def min_bytes(self, text: bool) -> int:
-        """Least size of all rows; in text two characters a number, the last of which may be missing."""
+        """Least size of all rows; in text two characters per number, the last of which may be missing."""
         row = sum(2 if text else (p.length or p.dtype).itemsize for p in self.properties)
         return max(0, self.count * row - text)
 
@@ -85,7 +85,7 @@ class Header:
 
 @reads("is no PLY file that can be read", COPY_AGAIN)
 def read_header(path: Path) -> Header:
-    """Raises LumigraphError if the file is no PLY file, or is shorter than its header declares."""
+    """Read a header. Raises LumigraphError for a file that is no PLY file, or is shorter than its header declares."""
     with open(path, "rb", opener=without_waiting) as file:
         data = file.read(MAX_HEADER_BYTES)
         size = file.seek(0, 2)
@@ -108,7 +108,7 @@ def read_header(path: Path) -> Header:
 
 
 def parsed(head: bytes) -> Header:
-    """Raises ValueError for lines that no header has."""
+    """Parse a header. Raises ValueError for invalid lines."""
     order, elements, comments = "", dict[str, Element](), list[str]()
     for line in re.split(r"\r\n?|\n", head.decode("utf-8", "replace"))[1:]:
         match line.split():
@@ -131,7 +131,9 @@ def parsed(head: bytes) -> Header:
 
 
 def add_property(known: list[Property], kinds: list[str], name: str, order: str) -> None:
-    """kinds: the type of a number; or `list`, the type of a list's length and that of its numbers"""
+    """Add a property to an element. kinds: the type of a number; or `list`, the types of a list's length and of its
+    numbers
+    """
     match [TYPES.get(kind, kind) for kind in kinds]:
         case [code] if code in NAMES:
             length = None
@@ -146,10 +148,10 @@ def add_property(known: list[Property], kinds: list[str], name: str, order: str)
 
 @reads("cannot be read as a PLY file", COPY_AGAIN)
 def read_rows(path: Path, wanted: Collection[str], header: Header | None = None) -> dict[str, np.ndarray]:
-    """Rows of elements by name, as structured arrays; those that the file lacks are left out.
+    """Rows of elements by name, as structured arrays; missing ones are left out.
 
-    Binary rows are a view of the file. A list is a field of its numbers, or of type object where the lists of the rows
-    have different lengths; those take memory. Raises LumigraphError if the rows cannot be read.
+    Binary rows are a view of the file. A list is a field of its numbers, or of type object if the rows' lists have
+    different lengths, which takes memory. Raises LumigraphError if the rows cannot be read.
     """
     header = header or read_header(path)
     names = [*header.elements]
@@ -165,7 +167,7 @@ def rows_of(element: Element, read: Callable[[Element], np.ndarray]) -> np.ndarr
 
 
 def text_reader(file: io.BufferedReader, header: Header, path: Path) -> Callable[[Element], np.ndarray]:
-    """Function that reads the next element: as many lines, empty ones left out."""
+    """Function that reads the next element's lines, skipping empty ones."""
     file.seek(header.size)
     lines = filter(str.strip, io.TextIOWrapper(file, "ascii"))
 
@@ -195,14 +197,14 @@ def text_row(words: list[str], element: Element) -> Iterator[np.ndarray]:
 
 
 class BinaryReader:
-    """The bytes behind the header, read one element after another."""
+    """Reader of the bytes after the header, one element after another."""
 
     def __init__(self, file: io.BufferedReader, header: Header, path: Path):
         self.data, self.at, self.path = np.asarray(np.memmap(file, np.uint8, "r")), header.size, path
 
     def rows(self, element: Element) -> np.ndarray:
-        """The next element: a view if all lists are as long as those of the first row. Raises ValueError where there
-        are too few bytes."""
+        """The next element: a view if all lists are as long as those of the first row. Raises ValueError for too few
+        bytes."""
         begin = self.at
         dtype, lengths = layout(element, [len(values) for values in self.row(element)] if element.has_lists else [])
         end = begin + element.count * dtype.itemsize
@@ -228,7 +230,7 @@ class BinaryReader:
 
 
 def in_columns(element: Element, rows: Iterable[Iterable[np.ndarray]], path: Path) -> np.ndarray:
-    """Structured array of rows that are read one by one."""
+    """Structured array of rows read one by one."""
     what = f"{path} has {element.count:,} rows with lists, which"
     ask_for(LIST_BYTES * element.count, torch.device("cpu"), what, "make all faces triangles in a mesh editor")
     columns: list[list[np.ndarray]] = [[] for _ in element.properties]
@@ -249,7 +251,7 @@ def in_columns(element: Element, rows: Iterable[Iterable[np.ndarray]], path: Pat
 
 
 def layout(element: Element, list_lengths: list[int]) -> tuple[np.dtype, np.dtype]:
-    """Types of rows whose lists have the same lengths: of their numbers, and of the lengths before the lists."""
+    """Types of rows with lists of equal lengths: of their numbers, and of the lengths before the lists."""
     numbers, lengths, at = [], [], 0
     for i, p in enumerate(element.properties):
         shape: tuple[int, ...] = ()
@@ -269,7 +271,7 @@ def record(fields: list[tuple[str, np.dtype, int]], size: int) -> np.dtype:
 
 
 def columns(rows: np.ndarray, names: Sequence[str], dtype: type = np.float32) -> np.ndarray:
-    """Plain numbers of rows side by side: [row, name]; a view of the rows where nothing is to be converted."""
+    """Plain numbers of rows side by side: [row, name]; a view if nothing needs conversion."""
     if not names:
         return np.empty((len(rows), 0), dtype)
     with np.errstate(over="ignore", invalid="ignore"):  # what does not fit becomes infinite, and is found later
@@ -283,7 +285,7 @@ def plain_names(rows: np.ndarray) -> list[str]:
 
 
 def write_rows(path: Path, kind: Kind, elements: Mapping[str, np.ndarray], comments: Iterable[str] = ()) -> None:
-    """Write structured arrays of plain numbers as a binary, little-endian file, whole or not at all."""
+    """Write structured arrays of plain numbers as a binary, little-endian file, atomically."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     for name, rows in elements.items():
         types = [(NAMES[rows.dtype[field].str[1:]][0], field) for field in rows.dtype.names or ()]

@@ -1,10 +1,10 @@
-"""Numbers with their ranges: declared once, in a field's annotation, and checked for flags and files alike.
+"""Number ranges: declared in a field's annotation, and checked for flags and files alike.
 
     levels: Annotated[int, between(1, 32)] = 16         of a Config, or of a command
     frames: Annotated[Count | None, option("N")] = None
 
-`check` asks a dataclass whether it keeps to its ranges, `typed` makes one of plain JSON, `domain` says a range. What
-must agree beyond that, such as the coarsest level and the finest, a dataclass says in a method `check`.
+`check` validates a dataclass, `typed` parses one from plain JSON, `domain` describes a range. Constraints between
+numbers, such as the coarsest level and the finest, are in a dataclass's method `check`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..errors import LumigraphError
 
 
 def between(least: float, most: float) -> msgspec.Meta:
-    """The range of a number, both ends included: `levels: Annotated[int, between(1, 32)] = 16`. NaN is in no range."""
+    """Range of a number, both ends included: `levels: Annotated[int, between(1, 32)] = 16`. NaN is in no range."""
     return msgspec.Meta(ge=least, le=most)
 
 
@@ -69,7 +69,7 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # of a matrix
 
 
 def numbers(kind: Any) -> Iterator[tuple[type, Any]]:
-    """Every number within an annotation, as (int or float, its range, None where it has none)."""
+    """Every number within an annotation, as (int or float, its range or None)."""
     if get_origin(kind) is Annotated:
         inner, *about = get_args(kind)
         ranges = [x for x in about if isinstance(x, msgspec.Meta)]
@@ -82,30 +82,30 @@ def numbers(kind: Any) -> Iterator[tuple[type, Any]]:
 
 
 def domain(kind: Any) -> str:
-    """The range of an annotation's numbers in words, "1 to 32"; "" where it has none."""
+    """Range of an annotation's numbers in words, "1 to 32"; "" without one."""
     ranges = {(kind, x.ge, x.le): x for kind, x in numbers(kind) if x is not None}
     return " or ".join(f"{said(x.ge)} to {said(x.le)}" for x in ranges.values())
 
 
 def is_surprising(kind: Any) -> bool:
-    """True if an annotation refuses numbers that a user may give: not if it takes any positive number or count."""
+    """True if a range is worth mentioning: not for any positive number or count."""
     return any(x.ge > MAX_LEAST or x.le < UNSURPRISING for _, x in numbers(kind) if x is not None)
 
 
 def said(number: Any) -> str:
-    """A number as people write it: 0.001, 1e8, 100,000,000."""
+    """Number as text: 0.001, 1e8, 100,000,000."""
     return f"{number:,}" if isinstance(number, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{number:g}")
 
 
 @cache
 def hints(kind: Any) -> dict[str, Any]:
-    """The fields of a dataclass with what their annotations say."""
+    """Fields of a dataclass with their full annotations."""
     said = typing.get_type_hints(kind, include_extras=True)
     return {field.name: said[field.name] for field in fields(kind)}
 
 
 def changed(value: Any, **numbers: Any) -> Any:
-    """A dataclass with some numbers replaced, by their names in it or in dataclasses that it holds."""
+    """A dataclass with some numbers replaced, by their names in it or in nested dataclasses."""
     own = {field.name for field in fields(value)}
     for name in own:
         if is_dataclass(inner := getattr(value, name)):
@@ -134,8 +134,7 @@ def groups_of(value: Any) -> Iterator[Any]:
 
 
 def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
-    """The fields of a dataclass, and of dataclasses in it, whose numbers are none or beyond their ranges, as
-    (name, annotation, value)."""
+    """Fields of a dataclass and nested ones with values of wrong type or out of range, as (name, annotation, value)."""
     for name, kind in hints(value.__class__).items():
         found = getattr(value, name)
         if is_dataclass(found):
@@ -148,8 +147,7 @@ def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def coherent(value: Any) -> None:
-    """Ask a dataclass, and dataclasses in it, whether their numbers agree: the `check` of those that have one raises
-    LumigraphError."""
+    """Call `check` of a dataclass and nested ones, which raises LumigraphError for inconsistent numbers."""
     for name in hints(value.__class__):
         if is_dataclass(inner := getattr(value, name)):
             coherent(inner)
@@ -158,7 +156,7 @@ def coherent(value: Any) -> None:
 
 
 def check(value: Any, where: Path | str) -> None:
-    """Raise LumigraphError for numbers of a dataclass beyond their ranges, or that disagree. where: what to name."""
+    """Raise LumigraphError for out-of-range or inconsistent numbers of a dataclass. where: named in the error"""
     for name, kind, found in outside(value):
         raise LumigraphError(f"{where}: {name} cannot be {shown(found)}; it is from {domain(kind)}")
     coherent(value)
@@ -169,12 +167,12 @@ _converting = threading.RLock()
 
 
 def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any:
-    """Plain JSON as a value of a kind: a dataclass, a tuple, a dictionary, a union; ranges and types are checked.
+    """Parse plain JSON as a type: a dataclass, a tuple, a dictionary, a union; ranges and types are checked.
 
-    where:  the file or option to name
-    closed: refuse keys that no dataclass has, where a misspelt one would go unnoticed; else they are passed over
-    No union in a kind may have both a range and a tuple of fixed length: msgspec 0.22 crashes on those.
-    Raises LumigraphError that says which value is wrong, and what it should be.
+    where:  the file or option, named in errors
+    closed: refuse unknown keys, which may be misspelt; else they are ignored
+    No union in a type may have both a range and a tuple of fixed length: msgspec 0.22 crashes on those.
+    Raises LumigraphError with the wrong value and its allowed ones.
     """
     try:
         with _converting:
@@ -204,14 +202,14 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
 
 
 def path_of(kind: type, value: Any) -> Any:
-    """A text of JSON as a path, for msgspec. Raises ValueError for text that is none."""
+    """JSON text as a path, for msgspec. Raises ValueError for other text."""
     if kind is not Path or not isinstance(value, str) or not value or "\0" in value:
         raise ValueError(f"Expected `{kind.__name__}`")
     return Path(value)
 
 
 def surplus(said: Any, known: Any) -> str | None:
-    """A key of plain JSON that its typed value, made plain again, has not; None if there is none."""
+    """A key of plain JSON that is missing in its parsed value; None if there is none."""
     if isinstance(said, dict) and isinstance(known, dict):
         new = [key for key in said if key not in known]
         return new[0] if new else first_of(surplus(value, known[key]) for key, value in said.items())
@@ -221,13 +219,12 @@ def surplus(said: Any, known: Any) -> str | None:
 
 
 def first_of(found: Iterable[str | None]) -> str | None:
-    """The first that is not None; None if all are."""
+    """First item that is not None, or None."""
     return next((key for key in found if key is not None), None)
 
 
 def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:
-    """The value that a path of msgspec's leads to, "grids.channels[1]", and its annotation; None where that is beyond
-    what is known here."""
+    """Value at a path of msgspec's, "grids.channels[1]", and its annotation; None if unknown."""
     for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
         kind = next((x for x in members(kind) if is_dataclass(x) or get_origin(x) is tuple), None)
         try:
@@ -243,7 +240,7 @@ def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:
 
 
 def members(kind: Any) -> Iterator[Any]:
-    """The members of a union, or the annotation itself, without what is said about them."""
+    """Members of a union, or the annotation itself, without metadata."""
     if get_origin(kind) is Annotated:
         yield from members(get_args(kind)[0])
     elif get_origin(kind) in (typing.Union, types.UnionType):
@@ -254,7 +251,7 @@ def members(kind: Any) -> Iterator[Any]:
 
 
 def shown(value: Any) -> str:
-    """A value in a sentence, and no more than a line of it."""
+    """A value for a sentence, shortened to a line."""
     if isinstance(value, int) and abs(value) > 10**60:  # Python writes out no integer of thousands of digits
         return "an integer of more than 60 digits"
     text = repr(value) if isinstance(value, str) else str(value)

@@ -1,7 +1,7 @@
-"""The layouts that are read, by the names of their files in `capture/`; help texts know them without loading PyTorch.
+"""Layouts of captures, by their file names in `capture/`, for help texts without loading PyTorch.
 
-Asked in this order what a folder holds. A transforms.json comes first because someone made it on purpose, often beside
-the model that it came from; COLMAP's lenses know more than LLFF's. `--reader` overrides the order.
+Folders are tested in this order. A transforms.json comes first because someone made it on purpose, often beside the
+model that it came from; COLMAP's lenses know more than LLFF's. `--reader` overrides the order.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Reading of what others wrote: one place turns every fault of parsing into one sentence."""
+"""Reading of foreign files: every parsing error becomes one sentence."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ R = TypeVar("R")
 def reading(path: Path | str, fault: str = "cannot be read", remedy: str = "restore it from a copy") -> Iterator[None]:
     """Context in which any exception becomes a LumigraphError: "PATH FAULT (reason); REMEDY".
 
-    A LumigraphError passes as it is, and so do warnings and Ctrl-C. The exception is the error's cause, which
+    A LumigraphError passes unchanged, and so do warnings and Ctrl-C. The exception is the error's cause, which
     LUMIGRAPH_DEBUG=1 shows.
     """
     try:
@@ -38,7 +38,7 @@ def reading(path: Path | str, fault: str = "cannot be read", remedy: str = "rest
 def reads(
     fault: str = "cannot be read", remedy: str = "restore it from a copy"
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of a function whose first path among its arguments is what it reads: its body is inside `reading`."""
+    """Decorator that runs a function inside `reading` of its first path argument."""
 
     def behind_door(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)

@@ -61,8 +61,11 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 3."""
         return math.isqrt(self.harmonics.shape[1]) - 1
 
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> Gaussians:
-        """The same cloud in another frame, x' = M x, with rotated spherical harmonics."""
+    def transformed(self, similarity: Float[Tensor, "4 4"], far: bool = False) -> Gaussians:
+        """The same cloud in another frame, x' = M x, with rotated spherical harmonics.
+
+        far: whether centres may be in double precision, see `as_precise_as_needed`; a scene's own frame needs none
+        """
         similarity = similarity.double().cpu()
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
         rotation = similarity[:3, :3] / scale
@@ -71,7 +74,7 @@ class Gaussians:
         turn = to_quaternion(rotation).to(self.quaternions)
         return replace(
             self,
-            means=as_precise_as_needed(means, self.log_scales + float(scale.log())),
+            means=as_precise_as_needed(means, self.log_scales + float(scale.log())) if far else means.float(),
             quaternions=multiply(turn[None], self.quaternions),
             log_scales=self.log_scales + float(scale.log()),
             harmonics=turned(self.harmonics, rotation),

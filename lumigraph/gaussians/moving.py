@@ -39,6 +39,13 @@ class MovingGaussians:
     ends: Float[Tensor, " gaussian"]
     fades: Float[Tensor, " gaussian"]
 
+    @classmethod
+    def still(cls, cloud: Gaussians, duration: float) -> MovingGaussians:
+        """Gaussians that stand still all the time."""
+        begins = torch.zeros(len(cloud), device=cloud.means.device)
+        times = begins, begins, begins + duration, begins + torch.inf
+        return cls(cloud, duration, torch.zeros_like(cloud.means, dtype=torch.float32), *times)
+
     def __len__(self) -> int:
         return len(self.cloud)
 
@@ -47,10 +54,10 @@ class MovingGaussians:
         tensors = self.velocities, self.middles, self.begins, self.ends, self.fades
         return MovingGaussians(self.cloud[index], self.duration, *(x[index] for x in tensors))
 
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> MovingGaussians:
+    def transformed(self, similarity: Float[Tensor, "4 4"], far: bool = False) -> MovingGaussians:
         """The same in another frame, x' = M x."""
         turn = similarity[:3, :3].to(self.velocities)
-        return replace(self, cloud=self.cloud.transformed(similarity), velocities=self.velocities @ turn.T)
+        return replace(self, cloud=self.cloud.transformed(similarity, far), velocities=self.velocities @ turn.T)
 
     def lasting(self, duration: float) -> MovingGaussians:
         """The same motion stretched to another duration in seconds."""

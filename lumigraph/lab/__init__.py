@@ -1,1 +1,1 @@
-"""The laboratory: methods side by side, and equations of papers measured on the user's data."""
+"""Laboratory: comparisons of methods, and measured equations of papers on the user's data."""

@@ -23,7 +23,6 @@ import numpy as np
 import torch
 
 from .. import files, methods
-from ..budget import given_budget
 from ..components.fields.appearance import Appearance
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
@@ -146,7 +145,7 @@ def update(run: Path, source: str, train: TrainOptions, blocks: BlockOptions, sh
 
 def again(block: Block, source: str, train: TrainOptions) -> Block:
     """The block as it will learn from other photographs, by the budget of the options, or the one that it had."""
-    places, budget = survey(source, train.reader), given_budget(train.steps, train.seconds, train.quality)
+    places = survey(source, train.reader)
     options = {name: getattr(train, name) for name in SCENE_OPTIONS}
     chosen = members(places, Disc(block.centre, block.radius))
     learnt = np.array([split == "train" for split in places.splits])
@@ -156,7 +155,7 @@ def again(block: Block, source: str, train: TrainOptions) -> Block:
             "the frame of the run's own photographs, so capture them together with some of those"
         )
     names = [places.names[i] for i in np.flatnonzero(chosen)]
-    told = budget.to_json() if budget else block.budget
+    told = train.budget.to_json() if train.budget else block.budget
     return replace(block, photographs=names, scene=source_of(source, options), budget=told)
 
 

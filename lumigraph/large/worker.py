@@ -33,7 +33,7 @@ from ..opening import open_dataset
 from ..readers import Before
 from ..run import Run, build
 from ..run.records import warn_of_changes
-from ..training import fit
+from ..training.loop import fit
 from .plan import DONE_FILE, Done, Task
 
 LOCK_TIMEOUT = 60.0  # seconds to wait for a stopped process that still holds the folder

@@ -1,9 +1,9 @@
 """Environment light: radiance from all directions as an equirectangular map, and suns at infinity.
 
-Orientation of the map, in the scene's frame, where +z points up. It is what an upright camera that looks along +y sees,
-so it is not mirrored: the middle column looks along +y, a quarter of the width further right along +x, the edges along
--y; the top row looks along +z. An azimuth is the longitude on the map: 0 is +y, 90 degrees +x.
-All values are linear sRGB. 1 is the radiance of a white matt surface that is fully lit.
+Orientation of the map, in the scene's frame, where +z points up. It is the view of an upright camera that looks along
++y, so it is not mirrored: the middle column looks along +y, a quarter of the width further right along +x, the edges
+along -y; the top row looks along +z. An azimuth is the longitude on the map: 0 is +y, 90 degrees +x.
+All values are linear sRGB. 1 is the radiance of a fully lit white diffuse surface.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class EnvironmentLight:
     def open(path: Path | str) -> EnvironmentLight:
         """Read a map from Radiance HDR, OpenEXR, NumPy (all linear) or PNG (sRGB-encoded).
 
-        Raises LumigraphError for a file that is no map.
+        Raises LumigraphError for an invalid file.
         """
         path = files.expanded(path)
         if not files.is_file(path):
@@ -64,7 +64,7 @@ class EnvironmentLight:
 
     @staticmethod
     def checked(values: np.ndarray, source: str) -> EnvironmentLight:
-        """A map of numbers (row, column, channel). Raises LumigraphError unless they are radiance of all directions."""
+        """A map of numbers (row, column, channel). Raises LumigraphError for invalid radiance."""
         rows, columns = values.shape[:2] if values.ndim == 3 else (0, 0)
         if rows < MIN_ROWS or columns < MIN_COLUMNS or columns != 2 * rows:
             raise LumigraphError(
@@ -91,7 +91,8 @@ class EnvironmentLight:
         """A clear sky with a sun.
 
         azimuth, elevation: of the sun, degrees
-        sun: radiance of a white matt surface that faces the sun, from it alone; sky: the same of level ground and sky
+        sun: radiance of a white diffuse surface that faces the sun, from it alone; sky: the same of level ground and
+             sky
         width: half of the sun's, degrees; above 0 it is seven suns, one in the middle of six
         """
         height = math.sin(math.radians(elevation))
@@ -115,7 +116,7 @@ class EnvironmentLight:
 
     @cached_property
     def directions(self) -> Float[Tensor, "row column 3"]:
-        """Unit direction from which the middle of each pixel sends light."""
+        """Unit direction of each pixel's centre."""
         return directions(*self.shape)
 
     @cached_property
@@ -124,7 +125,7 @@ class EnvironmentLight:
         return solid_angles(*self.shape)
 
     def at(self, directions: Float[Tensor, "direction 3"]) -> Float[Tensor, "direction 3"]:
-        """Radiance of the map from directions, bilinear between pixels; suns are left out."""
+        """Radiance of the map in directions, bilinear between pixels; without suns."""
         rows, columns = self.shape
         x, y, z = directions.unbind(-1)
         column = (torch.atan2(x, y) / (2 * math.pi) + 0.5) * columns - 0.5
@@ -139,13 +140,13 @@ class EnvironmentLight:
         return total
 
     def resized(self, rows: int, columns: int) -> EnvironmentLight:
-        """The map in other pixels, each with the mean radiance over its solid angle."""
+        """The map at another resolution, each pixel with the mean radiance over its solid angle."""
         across = _overlap(torch.linspace(0, 1, self.shape[1] + 1), torch.linspace(0, 1, columns + 1))
         edges = [0.5 * (1 - torch.cos(math.pi * torch.linspace(0, 1, n + 1))) for n in (self.shape[0], rows)]
         return replace(self, radiance=torch.einsum("rs,stk,ct->rck", _overlap(*edges), self.radiance, across))
 
     def turned(self, degrees: float) -> EnvironmentLight:
-        """The light turned about the vertical axis: azimuths grow by so many degrees."""
+        """The light rotated about the vertical axis: azimuths grow by `degrees`."""
         angle = math.radians(degrees)
         c, s = math.cos(angle), math.sin(angle)
         back = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])  # anticlockwise from above: azimuths shrink
@@ -156,14 +157,14 @@ class EnvironmentLight:
         return replace(self, radiance=radiance, toward=self.toward @ back)
 
     def scaled(self, factor: float) -> EnvironmentLight:
-        """So many times brighter."""
+        """The light scaled by a factor."""
         return replace(self, radiance=factor * self.radiance, irradiance=factor * self.irradiance)
 
     # Light on surfaces
 
     @property
     def lamps(self) -> tuple[Float[Tensor, "lamp 3"], Float[Tensor, "lamp 3"]]:
-        """The light as distant lamps: directions of pixels and suns, and irradiance of each on what faces it."""
+        """The light as distant lamps: directions of pixels and suns, and irradiance of each on a surface facing it."""
         power = (self.radiance * self.solid_angles[..., None]).reshape(-1, 3)
         return torch.cat([self.directions.reshape(-1, 3), self.toward]), torch.cat([power, self.irradiance])
 
@@ -174,7 +175,7 @@ class EnvironmentLight:
         return spherical_harmonics(directions, bands).T @ power
 
     def irradiance_on(self, normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Irradiance of surfaces with nothing around them."""
+        """Irradiance of unoccluded surfaces."""
         directions, power = self.lamps
         return (normals @ directions.T).clamp_min(0) @ power
 
@@ -186,7 +187,7 @@ def direction(azimuth: float, elevation: float) -> Float[Tensor, " 3"]:
 
 
 def disc(azimuth: float, elevation: float, width: float) -> Float[Tensor, "place 3"]:
-    """Directions to the middle of a disc and, if it has a width (degrees), to six places at two thirds of it."""
+    """Directions to the centre of a disc and, if it has a width (degrees), to six points at two thirds of it."""
     middle = direction(azimuth, elevation)
     if width == 0:
         return middle[None]

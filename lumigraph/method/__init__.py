@@ -1,4 +1,4 @@
-"""Method, and the interfaces that methods are made of: a Field, a Sampler, Parts."""
+"""Method, and its interfaces: Field, Sampler, Parts."""
 
 from .contexts import frozen as frozen
 from .contexts import seeded as seeded

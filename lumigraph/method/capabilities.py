@@ -22,45 +22,45 @@ from .field import Colours, Densities, Directions, Points
 
 
 class HasDensity(Protocol):
-    """Knows how dense space is."""
+    """Has density."""
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit at points of the scene."""
 
 
 class HasField(Protocol):
-    """Knows density and colour at points, as baking, conversion and composition ask for them."""
+    """Has density and colour at points, for baking, conversion and composition."""
 
     def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
 
 
 class FromField(Protocol):
-    """Can begin as what another method holds, instead of from photographs."""
+    """Can be initialised from another method, instead of from photographs."""
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Take over what a teacher holds, which has the same frame, as far as cameras see it: its `field` where it has
-        one, else what it renders and its Gaussians. Stands in place of `begin`, ahead of the first step; what is learnt
-        from then on continues there. Raises LumigraphError, in one sentence, where it cannot be taken over."""
+        """Initialise from a teacher in the same frame, as far as cameras see it: from its `field` if it has one, else
+        from its renderings and its Gaussians. Called instead of `begin`, before the first step. Raises LumigraphError,
+        in one sentence, if that is impossible."""
 
 
 class HasOctree(Protocol):
-    """Is an octree of density and harmonics, for browsers and files."""
+    """Can be exported as an octree of density and harmonics, for browsers and files."""
 
     def octree(self, depth: int | None = None) -> Octree:
-        """The scene as an octree, in the scene's frame, of so many levels at most. Raises LumigraphError while there is
-        none yet, and where it does not fit into memory, with the depth that does."""
+        """The scene as an octree, in the scene's frame, of at most `depth` levels. Raises LumigraphError while there is
+        none yet, and for one that exceeds memory, with the depth that fits."""
 
 
 class HasAtlas(Protocol):
-    """Is an atlas of diffuse colours and features, for browsers and files."""
+    """Can be exported as an atlas of diffuse colours and features, for browsers and files."""
 
     def atlas(self) -> Atlas:
         """The scene as an atlas, in the scene's frame. Raises LumigraphError while there is none yet."""
 
 
 class HasDistance(Protocol):
-    """Knows how far surfaces are."""
+    """Has a signed distance."""
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Signed distance to the nearest surface in scene units, negative inside."""
@@ -88,56 +88,56 @@ ColourPairs = Callable[[Any, torch.Generator], tuple[Float[Tensor, "pixel 3"], F
 
 
 class RefinesPoses(Protocol):
-    """Can learn where photographs were taken from, besides the scene."""
+    """Can optimise poses of photographs besides the scene."""
 
     poses: nn.Module | bool | None  # a `PoseRefinement`; True where the parts have them; None where none was asked for
 
     def colour_pairs(self, photograph: Photograph) -> ColourPairs:
-        """Colours as a function of a photograph's pose, beside the photograph's. RayMethods have it."""
+        """Rendered colours as a function of a photograph's pose, with the photograph's colours. RayMethods have it."""
 
 
 class HasMotion(Protocol):
-    """Knows how the things of a moving scene move."""
+    """Has the motion of a dynamic scene."""
 
     def follow(self, points: Points, start: float, end: float) -> Points:
-        """Positions at one moment of surface points of another, moments in the unit of `Frame.times`."""
+        """Positions at one time of surface points of another, times in the unit of `Frame.times`."""
 
 
 class HasMovingGaussians(Protocol):
-    """Is a cloud of Gaussians that moves."""
+    """Is a moving cloud of Gaussians."""
 
     def moving(self, duration: float) -> MovingGaussians:
-        """The scene as a moving cloud, in the scene's frame, played in so many seconds."""
+        """The scene as a moving cloud, in the scene's frame, stretched to a duration in seconds."""
 
 
 class HasVisibility(Protocol):
-    """Knows which places its photographs saw."""
+    """Has the visibility of points in its training photographs."""
 
     def visibility(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
-        """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
+        """Visibility of each point in training photographs along a unit direction, in [0, 1]."""
 
 
 class HasExposure(Protocol):
-    """Knows the exposures of its photographs."""
+    """Has exposures of its training photographs."""
 
     usual_exposure: float | None  # log2 of their median; None where it is not known
 
 
 class HasAppearance(Protocol):
-    """Renders in the light of one appearance code, which it accepts as evidence."""
+    """Renders with an appearance code, which it accepts as evidence."""
 
     shown_in: Any  # the `Appearance`; of no numbers where none was learnt
 
 
 class CanPrune(Protocol):
-    """Is a cloud of Gaussians that can lose some and go on learning."""
+    """Is a cloud of Gaussians that can be pruned during training."""
 
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
-        """Leave those of `gaussians()` that a mask picks, and of the optimizers' states what belongs to them."""
+        """Keep those of `gaussians()` in a mask, with their optimizer states."""
 
 
 class HasMesh(Protocol):
-    """Is a mesh, or makes one better than `export mesh` would."""
+    """Is a mesh, or extracts one better than `export mesh` would."""
 
     def mesh(self) -> Mesh:
         """The scene as triangles, in the scene's frame."""
@@ -147,40 +147,40 @@ class HasLooks(Protocol):
     """Marches along rays."""
 
     def looks(self, rays: Rays) -> list[Look]:
-        """Density and colour along rays, one entry for each pass, the one that is composited last."""
+        """Density and colour along rays, one entry for each pass, the composited one last."""
 
 
 class RendersRays(Protocol):
     """Renders one ray at a time."""
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """Rendering of each ray before a background colour."""
+        """Rendering of each ray over a background colour."""
 
 
 class CanCompress(Protocol):
-    """Says how it may be stored in fewer bytes."""
+    """Can be compressed."""
 
     def storage(self) -> dict[str, Stored]:
-        """Storage of tensors of `state_dict`, by name; those that are not named are stored to the bit."""
+        """Storage of tensors of `state_dict`, by name; others are stored losslessly."""
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """Share of each row of tensors, by name, in one picture (Li 2023, eq. 4): the sum over pixels of the
+        """Importance of each row of tensors, by name, in one picture (Li 2023, eq. 4): the sum over pixels of the
         compositing weights that it contributes to."""
 
     def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
-        """Take out the rows that matter least, which together have a share of all importance; gives the importance of
-        the rows that there are now."""
+        """Remove the least important rows, which together have a share of all importance. Returns the importance of the
+        remaining rows."""
 
 
 class CanDraw(Protocol):
-    """Knows what objects of a category are like, so that it can make one up."""
+    """Can generate objects of a category."""
 
     def drawn(self, seed: int) -> Any:
-        """The method as it shows an object that nobody has photographed, drawn at random by a seed."""
+        """The method with a generated object, sampled by a seed."""
 
 
 class HasViewpoint(Protocol):
-    """Knows where its objects are usually seen from."""
+    """Has a typical viewpoint of its objects."""
 
     viewpoint: Camera
 
@@ -211,13 +211,16 @@ LACKING = {
     CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of eg3d",
     CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
     RendersRays: "renders whole pictures, so single rays have no colour",
+    HasMovingGaussians: "holds no Gaussians that move; deformable-splatting does",
+    HasViewpoint: "does not know where its objects are usually seen from; eg3d does",
+    DrawsPictures: "draws one picture at a time",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }
 
 
 def can(method: object, capability: type[Any]) -> bool:
-    """True if a method, or all of a class, has a capability. Its class must have the functions: a network may be called
-    `field` too. Values must be there and not None; `isinstance` does not find those that are submodules."""
+    """True if a method, or all of a class, has a capability. Its class must have the functions, since a network may be
+    called `field` too. Values must be there and not None; `isinstance` does not find submodules."""
     kind = method if isinstance(method, type) else type(method)
     functions = [name for name in vars(capability) if not name.startswith("_")]
     values = [getattr(method, name, None) for name in capability.__annotations__]
@@ -225,7 +228,7 @@ def can(method: object, capability: type[Any]) -> bool:
 
 
 def needs(method: object, capability: type[Any]) -> Any:
-    """The method, for whoever needs a capability of it. Raises LumigraphError, saying what it lacks, without."""
+    """The method itself. Raises LumigraphError, naming the capability, for a method without it."""
     if not can(method, capability):
         raise LumigraphError(f"{type(method).__name__} {LACKING[capability]}")
     return method

@@ -1,4 +1,4 @@
-"""Contexts of building and learning: seeded random numbers, frozen parameters."""
+"""Contexts: seeded random numbers, frozen parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import nn
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """A block whose random numbers of PyTorch itself, on the CPU, follow from a seed; those outside go on unchanged."""
+    """Block with seeded random numbers of PyTorch's global CPU generator, whose state is restored afterwards."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
@@ -19,7 +19,7 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def frozen(*modules: nn.Module) -> Iterator[None]:
-    """A block in which parameters of modules get no gradient, which still flows through them to their inputs."""
+    """Block in which parameters of modules get no gradient, which still flows through to their inputs."""
     learnt = [p for module in modules for p in module.parameters() if p.requires_grad]
     for p in learnt:
         p.requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Controls: what a user may turn on a trained method, by name."""
+"""Controls: named settings of a trained method."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ class Configured(Protocol):
 
 @dataclass(frozen=True)
 class Control:
-    """One thing that `Method.given` can be told by name: a number within a range, or one of several choices.
+    """One setting of `Method.given` by name: a number within a range, or one of several choices.
 
-    name:    what a user types: `--set NAME=VALUE`, `--animate NAME=A:B`; the viewer's label
-    default: what holds where nobody says anything
-    range:   (least, most) of a number; None where there are choices
+    name:    as typed: `--set NAME=VALUE`, `--animate NAME=A:B`; the viewer's label
+    default: initial value
+    range:   (least, most) of a number; None for choices
     choices: names to choose from; empty for a number
     unit:    of a number, as a user reads it: "stops", "degrees"
-    about:   what it does, in one sentence
-    of_photographs: whether choices beside the default are numbers of photographs, which a command takes by name as well
+    about:   its effect, in one sentence
+    of_photographs: whether choices beside the default are numbers of photographs, which commands also take by name
     blends:  whether a value may lie between two choices: "A:B:0.3" is three tenths of the way from A to B
-    files:   endings of file names that are taken beside the choices
+    files:   suffixes of file names allowed beside the choices
     """
 
     name: str
@@ -52,7 +52,7 @@ class Control:
         assert (self.range is None) != (not self.choices), f"{self.name} needs either a range or choices"
 
     def checked(self, value: Value) -> Value:
-        """The value as this control holds it, from a number or from text. Raises LumigraphError for any other."""
+        """Value of this control, from a number or from text. Raises LumigraphError for any other."""
         if self.choices:
             if str(value) in self.choices or (self.blends and self._is_blend(str(value))):
                 return str(value)
@@ -81,8 +81,8 @@ class Control:
         return ", ".join([*self.choices[: NAMED - 1], "...", self.choices[-1]])
 
     def over(self, stations: Sequence[Value], frames: int) -> list[Value]:
-        """The values of a film's frames: a number, and a choice that blends, goes evenly from one station to the next,
-        the first and the last included; any other choice holds each station for as many frames."""
+        """Values of a film's frames: a number, and a choice that blends, is interpolated evenly between stations, ends
+        included; any other choice holds each station for as many frames."""
         values = [self.checked(station) for station in stations]
         if self.choices and not self.blends:
             return [values[i * len(values) // frames] for i in range(frames)]
@@ -104,8 +104,8 @@ class Control:
 
 
 def blend(value: str) -> tuple[str, str, float]:
-    """Two choices between which a value of a blending control lies, and its share of the way from the first to the
-    second; 0 for a choice alone, NaN where the text has no share."""
+    """The two choices of a value of a blending control, and its position between them; 0 for a single choice, NaN for
+    text without a position."""
     first, *rest = value.split(":")
     if not rest:
         return first, first, 0.0
@@ -117,5 +117,5 @@ def blend(value: str) -> tuple[str, str, float]:
 
 
 def moment(times: tuple[float, float]) -> Control:
-    """The control `time` of a method that follows a moving scene. times: `Frame.times`."""
+    """The control `time` of a method of dynamic scenes. times: `Frame.times`"""
     return Control("time", times[0], range=times, about="Which moment of the capture is shown.")

@@ -1,4 +1,4 @@
-"""Measured depth as a teacher, for every method: one group of numbers and one loss."""
+"""Depth supervision for every method: one group of numbers and one loss."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEPTH_DEVIATION = 0.01  # relative deviation of a measurement, where the capture
 
 @dataclass(frozen=True)
 class DepthNumbers:
-    """A Config's numbers of measured depth."""
+    """A Config's numbers of depth supervision."""
 
     depth_weight: NonNegative = 0.0  # weight of measured depth in the loss; higher: better geometry, worse colours
 
@@ -33,15 +33,14 @@ def depth_layers(config: Any, scene: Scene) -> tuple[str, ...]:
 def depth_terms(
     config: Any, extra: dict[str, Tensor], depth: Float[Tensor, "*pixels"], opacity: Float[Tensor, "*pixels"]
 ) -> dict[str, Tensor]:
-    """The term of measured depth, by name; none where it is not read.
+    """The depth loss by name; none if it is disabled.
 
         L = weight mean(s (sqrt(1 + r^2) - 1) + 1 - opacity),    r = (depth - D) / (s D)
 
     over pixels with a measured distance D of relative deviation s. An error within the deviation has hardly a gradient;
-    a larger one counts by its share of the distance, so that single wrong measurements do not rule. What was measured
-    is opaque.
+    a larger one counts by its share of the distance, so that outliers do not dominate. Measured pixels are opaque.
     extra:          layers of the batch
-    depth, opacity: of the rendering; depth is along the ray, infinite where nothing is
+    depth, opacity: of the rendering; depth is along the ray, infinite for empty rays
     """
     if not (numbers := getattr(config, "measured", None)) or not numbers.depth_weight:
         return {}

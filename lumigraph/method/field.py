@@ -21,11 +21,11 @@ Features = Tensor | tuple[Tensor, ...]  # of points, one row each: what `Field.c
 class Field(Part):
     """Density and colour at points, in two steps: a sampler needs density at many points and colour at few.
 
-    A code is a row of numbers for each point that colour, or with `deforms` geometry too, depends on: an appearance, a
-    moment, a shape. A field that needs none ignores it. Fields compose: a field under a deformation is a field.
+    A code is a row of numbers for each point on which colour, or with `deforms` geometry too, depends: an appearance, a
+    time, a shape. A field without one ignores it. Fields compose: a field under a deformation is a field.
 
     deforms:       whether geometry depends on the code
-    cheap_density: whether density is a mere look-up, so that a sampler asks for it at all samples at once
+    cheap_density: whether density is a mere look-up, so that a sampler evaluates it at all samples at once
     joint:         whether density and colour come from one look-up, so that calling the field costs less than
                    `geometry` and then `colour`
     """
@@ -40,7 +40,7 @@ class Field(Part):
 
     @abstractmethod
     def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
-        """sRGB-encoded colour seen along unit directions. features: as `geometry` gives them"""
+        """sRGB-encoded colour seen along unit directions. features: from `geometry`"""
 
     def density(self, points: Points, code: Codes | None = None) -> Densities:
         """Density per scene unit."""
@@ -53,10 +53,10 @@ class Field(Part):
 
     @property
     def step_length(self) -> float:
-        """Length of a sample, in the field's coordinates, that resolves its grid."""
+        """Sample length, in the field's coordinates, that resolves its grid."""
         raise NotImplementedError(f"{type(self).__name__} has no grid, so a sampler needs a step length of its own")
 
     @property
     def min_weight(self) -> float | None:
-        """Weight in a ray's colour up to which a sample gets no colour; None where every sample gets one."""
+        """Compositing weight below which a sample gets no colour; None if every sample gets one."""
         return None

@@ -29,19 +29,19 @@ class FieldMethod(RayMethod, ABC):
 
     @property
     def shown_code(self) -> Float[Tensor, "1 code"] | None:
-        """The code of pictures, by the settings; None without one."""
+        """Code of pictures, by the settings; None without one."""
         return None
 
     def code(self, rays: Rays) -> Float[Tensor, "#ray code"] | None:
-        """The code that the field depends on, of each ray or one row for all; None without one."""
+        """Code of the field, for each ray or one row for all; None without one."""
         return self.shown_code
 
     def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Pass]:
-        """Passes of the field along rays, under their codes. generator: of random places in training"""
+        """Passes of the field along rays, with their codes. generator: of jitter in training"""
         return self.sampler.sample(rays, self.network, self.code(rays), generator)
 
     def looks(self, rays: Rays) -> list[Look]:
-        """Density and colour along rays, one entry for each pass, the one that is composited last."""
+        """Density and colour along rays, one entry for each pass, the composited one last."""
         return [self._look(each, rays) for each in self.passes(rays)]
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
@@ -55,7 +55,7 @@ class FieldMethod(RayMethod, ABC):
     def behind(
         self, rays: Rays, code: Float[Tensor, "#ray code"] | None, background: Float[Tensor, "#ray 3"]
     ) -> Float[Tensor, "#ray 3"]:
-        """Colours behind everything: the background, or a sky."""
+        """Background colours of rays: the scene's, or a sky."""
         for part in self.parts:
             background = part.behind(rays, code, background)
         return background
@@ -68,7 +68,7 @@ class FieldMethod(RayMethod, ABC):
 
     @property
     def rays_per_chunk(self) -> int:  # type: ignore[override]
-        """Number of rays that are rendered at once."""
+        """Number of rays in a rendering chunk."""
         return self.sampler.rays_per_chunk
 
     # At points
@@ -86,7 +86,7 @@ class FieldMethod(RayMethod, ABC):
     # Training
 
     def density_in_training(self, generator: torch.Generator) -> Density:
-        """Density for the sampler's grid and its terms, which must cover every code that rays may have."""
+        """Density for the sampler's grid and its loss terms, over all codes that rays may have."""
         return self.density
 
     def rays_in_a_step(self, data: Scene) -> float:
@@ -97,7 +97,7 @@ class FieldMethod(RayMethod, ABC):
         return data.sample_rays(self.sampler.batch_size, generator, layers=layers).to(self.device)
 
     def learn(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
-        """Passes along rays of photographs at random places, and the sampler's loss terms by name."""
+        """Passes along rays of photographs with jitter, and the sampler's loss terms by name."""
         return self.learn_along(self.moved(rays), generator)
 
     def moved(self, rays: Rays) -> Rays:
@@ -107,7 +107,7 @@ class FieldMethod(RayMethod, ABC):
         return rays
 
     def learn_along(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
-        """Passes along rays at random places, and the sampler's loss terms by name."""
+        """Passes along rays with jitter, and the sampler's loss terms by name."""
         passes = self.passes(rays, generator)
         last = passes[-1]
         self.figures |= {"rays": len(rays), "samples": last.evaluated, "visible_samples": len(last.samples)}

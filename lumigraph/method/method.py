@@ -1,4 +1,4 @@
-"""Method: one paper, which learns from a dataset and renders cameras."""
+"""Method: one paper, trained on a dataset and rendered for cameras."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .part import Part
 class Lesson(Protocol):
     """Input of one step: rays, a photograph, points of a shape. Its length is their number.
 
-    unit: what is counted, in the plural: "rays", "points"
+    unit: of the length, in the plural: "rays", "points"
     """
 
     unit: ClassVar[str]
@@ -37,22 +37,24 @@ class Lesson(Protocol):
 
 @runtime_checkable
 class Descend(Protocol):
-    """The trainer's part of a step: gradients of summed terms, checked to be finite, then the optimizers' step."""
+    """Descent of one step, provided by the trainer: gradients of summed terms, checked to be finite, then the
+    optimizers' step.
+    """
 
     def __call__(self, terms: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer] | None = None) -> None: ...
 
 
 class Method(nn.Module, ABC):
-    """One paper: something that learns from a dataset's batches and can be seen through a Camera.
+    """One paper: trained on a dataset's batches, and rendered for a Camera.
 
-    frame:   where the scene is (bounds, reach, near distance, background, number of images). A saved run holds it,
-             so that a method can be built again where the photographs are gone.
+    frame:   bounds, reach, near distance, background, number of images. It is stored in a run, so that a method can be
+             built again without the photographs
     config:  the paper's numbers, a frozen dataclass named Config in the method's file
-    figures: of the last step, by name, worth a line in metrics.jsonl; "mse", the squared error of colours, becomes
-             the PSNR that training shows
-    settings: values that `given` set, by the names of the controls
-    progress: share of the budget (steps or seconds) that is spent, in [0, 1]; the trainer sets it ahead of each step
-    All that must survive a resume lives in parameters, buffers and optimizers.
+    figures: of the last step, by name, for metrics.jsonl; "mse", the squared error of colours, becomes the PSNR of
+             training
+    settings: values set by `given`, by the names of the controls
+    progress: spent share of the budget (steps or seconds), in [0, 1]; the trainer sets it before each step
+    All state that must survive a resume is in parameters, buffers and optimizers.
     """
 
     Config: ClassVar[type]
@@ -76,39 +78,39 @@ class Method(nn.Module, ABC):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """The Config to use where the user chose none: the paper's on a GPU, `cpu_preset` elsewhere."""
+        """Default Config: the paper's on a GPU, `cpu_preset` elsewhere."""
         return cls.Config() if device.type == "cuda" else cls.cpu_preset()
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """Numbers that learn most in a minute on a CPU; the paper's by default."""
+        """Config for best results after a minute on a CPU; the paper's by default."""
         return cls.Config()
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
-        """The Config of a method that begins as another one's field, where the user chose none."""
+        """Default Config of a method initialised from a teacher's field."""
         return cls.preset(device)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        """Lower bound of the bytes needed beside what is built at first: grids that are refined and, with `learning`,
-        activations kept for gradients. By default the sum over the Config's parts that know theirs."""
+        """Lower bound of the bytes needed beside the initial parameters: grids that are refined and, with `learning`,
+        activations for gradients. By default the sum over the Config's parts."""
         held = (getattr(config, x.name) for x in dataclasses.fields(config))
         return sum(x.further_bytes(frame, learning) for x in held if hasattr(x, "further_bytes"))
 
     def growth_bytes(self) -> int:
-        """Bytes by which the method may grow while it learns, of those that are free."""
+        """Bytes by which the method may grow in training, within free memory."""
         return 0
 
     # Learning
 
     def steps_per_pass(self, data: Any) -> float:
-        """Steps after which everything in the "train" split was learnt from once, on average; one photograph, shape or
-        member a step by default."""
+        """Number of steps of one pass over the "train" split, on average; one photograph, shape or member a step by
+        default."""
         return len(data.splits["train"])
 
     def steps_for(self, quality: Quality, data: Any) -> int:
-        """Steps that a quality asks for on these data: a budget that is the same on every machine."""
+        """Number of steps of a quality on these data: a budget that is the same on every machine."""
         return self.efforts[quality].steps(self.steps_per_pass(data))
 
     @abstractmethod
@@ -116,12 +118,12 @@ class Method(nn.Module, ABC):
         """Input of one step. All randomness comes from `generator`, on the CPU."""
 
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
-        """The terms to minimise, by name; their sum descends."""
+        """Loss terms by name; their sum is minimised."""
         raise NotImplementedError(f"{type(self).__name__} has neither `loss` nor a `step` of its own")
 
     def step(self, batch: Any, step: int, descend: Descend) -> dict[str, Tensor]:
-        """One step of learning; gives the terms to record. Once downhill by default; a method may call `descend`
-        several times (adversaries, tracking), with some of its optimizers, or never (fusion)."""
+        """One training step; returns the terms to record. One descent by default; a method may call `descend` several
+        times (adversaries, tracking), with some of its optimizers, or never (fusion)."""
         terms = self.loss(batch, step)
         descend(terms)
         return terms
@@ -131,10 +133,10 @@ class Method(nn.Module, ABC):
         return [optimizer for part in self.parts for optimizer in part.optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> float | dict[str, float] | None:
-        """The learning rate of this step, which the trainer gives to the optimizers: one for all groups of
-        parameters, or by their "name"; each group multiplies it by its own "scale". None leaves them as they are.
+        """Learning rate of this step: one for all groups of parameters, or by their "name"; each group multiplies it by
+        its own "scale". None keeps the current ones.
 
-        progress: share of the budget (steps or seconds) spent, in [0, 1]
+        progress: spent share of the budget (steps or seconds), in [0, 1]
         """
         return None
 
@@ -146,34 +148,34 @@ class Method(nn.Module, ABC):
 
     @property
     def complete(self) -> bool:
-        """True if nothing is left to learn at any budget, such as after the last photograph of a fusion."""
+        """True if training is complete at any budget, such as after the last photograph of a fusion."""
         return False
 
     def begin(self, data: Any, seconds: float = math.inf) -> None:
-        """Called once, ahead of the first step of a new run: what the data tell without any learning.
+        """Initialise from the data; called once, before the first step of a new run.
 
-        seconds: the whole budget, of which a small share may be used; infinite where steps are counted
+        seconds: the whole budget, of which a small share may be used; infinite for a budget in steps
         """
         for part in self.parts:
             part.begin(self, data, seconds)
 
     def compile_begin(self) -> None:
-        """Called on a copy before the clock starts: compile what `begin` needs and no step does."""
+        """Compile kernels that only `begin` uses; called on a copy before the clock starts."""
         for part in self.parts:
             part.compile_begin()
 
     def before_step(self, step: int, progress: float) -> None:
-        """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
+        """Hook before each step. progress: spent share of the budget (steps or seconds), in [0, 1]"""
         for part in self.parts:
             part.before_step(self, step, progress)
 
     def after_step(self, step: int) -> None:
-        """Called once the step is done."""
+        """Hook after each step."""
         for part in self.parts:
             part.after_step(self, step)
 
     def statistics(self) -> dict[str, float]:
-        """Figures of the last step worth a line in metrics.jsonl, e.g. rays and samples."""
+        """Figures of the last step for metrics.jsonl, e.g. rays and samples."""
         return self.figures
 
     # Being seen
@@ -184,7 +186,7 @@ class Method(nn.Module, ABC):
 
     @property
     def background(self) -> Float[Tensor, "1 3"]:
-        """The colour behind the scene, one row for all rays."""
+        """Background colour of the scene, one row for all rays."""
         return torch.tensor([self.frame.background], device=self.device)
 
     # Parts
@@ -196,7 +198,7 @@ class Method(nn.Module, ABC):
 
     @property
     def moves_cameras(self) -> bool:
-        """True if a part learns poses; `begin` then derives nothing from the given ones."""
+        """True if a part optimises poses; `begin` then derives nothing from the given ones."""
         return any(part.moves_cameras for part in self.parts)
 
     def storage(self) -> dict[str, Stored]:
@@ -213,25 +215,25 @@ class Method(nn.Module, ABC):
 
     @property
     def takes(self) -> tuple[type, ...]:
-        """The kinds of evidence that `given` takes now: those of the class, and of the parts as they were trained."""
+        """Kinds of evidence that `given` currently accepts: those of the class, and of the trained parts."""
         parts = (part for part in self.children() if isinstance(part, Part))
         return (*self.accepts, *(kind for part in parts for kind in part.accepts))
 
     @property
     def evidence_views(self) -> int | None:
-        """Default number of photographs of a scene as evidence; None for all to learn from."""
+        """Default number of a scene's photographs used as evidence; None for all training ones."""
         return None
 
     def evidence_bytes(self, scene: Scene) -> int:
-        """Bytes at least that being given a scene takes."""
+        """Least bytes for a scene as evidence."""
         return 0
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same weights, told something: evidence (photographs, points, a light ...) or values of `controls`.
+        """The method with evidence (photographs, points, a light ...) or values of `controls`.
 
-        What comes back shares all parameters and is an ordinary method: films, viewer and exports need nothing more.
+        The result shares all parameters and is an ordinary method for films, viewer and exports.
         A method that takes evidence overrides this, and calls it for its controls.
-        Raises LumigraphError for what this method cannot be told.
+        Raises LumigraphError for anything that the method does not accept.
         """
         parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
         chosen = [[n for n, part in parts.items() if isinstance(piece, part.accepts)] for piece in evidence]
@@ -256,22 +258,22 @@ class Method(nn.Module, ABC):
         return told
 
     def control(self, name: str) -> Value:
-        """The value of a control: as told, or its default."""
+        """Value of a control: as set, or its default."""
         if name in self.settings:
             return self.settings[name]
         return next(x.default for x in self.controls if x.name == name)
 
     def moments(self, rays: Rays) -> Float[Tensor, " ray"]:
-        """When each ray looks, for methods that follow a moving scene and offer `controls.moment`: as told by the
-        control `time`, else as its camera says, else at the first moment of the capture."""
+        """Time of each ray, for methods of dynamic scenes with `controls.moment`: the control `time`, else the camera's
+        time, else the first time of the capture."""
         if "time" not in self.settings and rays.time is not None:
             return rays.time
         first, _ = self.frame.times or (0.0, 0.0)
         return torch.full_like(rays.radius, float(self.settings.get("time", first)))
 
     def refined(self, cameras: Camera) -> Camera:
-        """The cameras of photographs as this method has come to see them, by their `image_index`; as they are where it
-        learns no poses. Evaluation, films and exports go by these."""
+        """Cameras of photographs with learnt pose corrections, by their `image_index`; unchanged without pose
+        optimisation. Evaluation, films and exports use these."""
         for part in self.parts:
             cameras = part.refined(cameras)
         return cameras
@@ -280,12 +282,14 @@ class Method(nn.Module, ABC):
 
     @classmethod
     def of(cls, other: Method, config: Any) -> Method:
-        """A method of this kind made of another one instead of from data. Raises LumigraphError where none can be."""
+        """A method of this kind converted from another one instead of trained on data. Raises LumigraphError if that is
+        impossible.
+        """
         raise LumigraphError(f"{cls.__name__} cannot be made of {type(other).__name__}; it learns from data alone")
 
     def random(self, number: int) -> torch.Generator:
-        """Random numbers that depend on the config's seed and a number alone, the step for example, so that a resumed
-        run draws the same."""
+        """Random generator seeded by the config's seed and a number, such as the step, so that a resumed run samples
+        the same."""
         return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
 
     @property

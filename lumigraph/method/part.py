@@ -1,4 +1,4 @@
-"""Part: a submodule of a Method that takes part in its training, and in what a user may change afterwards."""
+"""Part: a submodule of a Method with hooks for training and for user settings."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .controls import Control
 
 class Part(nn.Module):
     """A submodule with hooks that its Method visits, as `nn.Module.train` visits submodules: poses, appearance codes,
-    exposure, samplers. All hooks do nothing by default. `method` is the Method that holds the part.
+    exposure, samplers. All hooks do nothing by default. `method` is the Method of the part.
 
-    moves_cameras: whether it learns poses, so that what other parts derive from given poses would be wrong
+    moves_cameras: whether it optimises poses, so that other parts must not rely on the given ones
     """
 
     moves_cameras: ClassVar[bool] = False
@@ -26,16 +26,16 @@ class Part(nn.Module):
     # Training
 
     def compile_begin(self) -> None:
-        """Compile kernels that `begin` needs and no step does; called on a copy before the clock starts."""
+        """Compile kernels that only `begin` uses; called on a copy before the clock starts."""
 
     def begin(self, method: Any, data: Any, seconds: float) -> None:
-        """Initialise from the data ahead of the first step of a new run; see `Method.begin`."""
+        """Initialise from the data before the first step of a new run; see `Method.begin`."""
 
     def before_step(self, method: Any, step: int, progress: float) -> None:
-        """Follow a schedule ahead of each step. progress: share of the budget spent, in [0, 1]"""
+        """Hook before each step, for schedules. progress: spent share of the budget, in [0, 1]"""
 
     def after_step(self, method: Any, step: int) -> None:
-        """Finish a step."""
+        """Hook after each step."""
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         """Fresh optimizers over the part's own parameters."""
@@ -51,7 +51,7 @@ class Part(nn.Module):
 
     @property
     def few_view_priors(self) -> tuple[str, ...]:
-        """Names of the priors that supervised places which photographs leave open, for the verdict on a run."""
+        """Names of the priors that supervise unobserved regions, for the verdict on a run."""
         return ()
 
     # Rendering
@@ -71,7 +71,7 @@ class Part(nn.Module):
     def behind(
         self, rays: Rays, code: Float[Tensor, "#ray code"] | None, background: Float[Tensor, "#ray 3"]
     ) -> Float[Tensor, "#ray 3"]:
-        """Colours behind everything: the background, or a sky."""
+        """Background colours of rays: the scene's, or a sky."""
         return background
 
     # Settings
@@ -87,6 +87,6 @@ class Part(nn.Module):
         return ()
 
     def adapted(self, method: Any, evidence: Any) -> Part:
-        """The part adapted to a piece of evidence, such as a photograph whose exposure it finds; it shares all tensors
-        with this one. method: the one that is being adapted, a copy"""
+        """The part adapted to a piece of evidence, such as a photograph's exposure; it shares all tensors with this
+        one. method: a copy, which is being adapted"""
         raise NotImplementedError

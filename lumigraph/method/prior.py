@@ -1,4 +1,4 @@
-"""Prior: knowledge of a method that learnt from many scenes or shapes, and its method of one that it is given."""
+"""Prior: a method trained on many scenes or shapes, and inference of a single one."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from .method import Method
 
 @dataclass(frozen=True)
 class Prior:
-    """method: one that learns from a Collection and takes a Scene as evidence, or learns from several shapes and takes
-    one of them, or a scan or picture of it; see `Method.accepts`"""
+    """Prior of a trained method. method: trained on a Collection with a Scene as evidence, or on several shapes with
+    one of them, or a scan or picture of it, as evidence; see `Method.accepts`"""
 
     method: Method
 
@@ -26,8 +26,8 @@ class Prior:
     def of(method: Method, learnt_from: str, where: Path | str) -> Prior:
         """The prior in a trained method.
 
-        learnt_from: what it learnt from, in the words of `Dataset.kind`
-        Raises LumigraphError, naming `where`, for a method that is none.
+        learnt_from: training data, in the words of `Dataset.kind`
+        Raises LumigraphError, naming `where`, for a method without one.
         """
         evidence = {Collection.kind: Scene, Shapes.kind: Shapes}.get(learnt_from)
         if evidence not in method.accepts:
@@ -43,10 +43,10 @@ class Prior:
         return Scene not in self.method.accepts
 
     def infer(self, scene: Any) -> Method:
-        """An ordinary method of one scene, given its photographs to learn from; or of one shape. The prior itself
-        learns nothing.
+        """Infer an ordinary method of one scene from its training photographs; or of one shape. The prior itself is not
+        trained.
 
-        Raises LumigraphError where memory does not hold what there is to find in so many photographs.
+        Raises LumigraphError if the photographs exceed memory.
         """
         if not isinstance(scene, Scene):
             return self.method.given(scene)
@@ -58,6 +58,5 @@ class Prior:
         return self.method.given(scene)
 
     def draw(self, seed: int) -> Method:
-        """An ordinary method of an object that nobody has photographed. Raises LumigraphError for a prior that draws
-        none."""
+        """Generate an ordinary method of a new object. Raises LumigraphError for a prior that cannot."""
         return needs(self.method, CanDraw).drawn(seed)

@@ -23,20 +23,20 @@ POSE_RAYS = 512  # of a photograph, from which the error of a pose is measured
 
 
 class RayMethod(Method):
-    """A Method that sees one ray at a time: write `looks` or `render_rays`, inherit the rest."""
+    """A Method that renders rays independently: write `looks` or `render_rays`, inherit the rest."""
 
     any_lens: ClassVar[bool] = True
     efforts: ClassVar[Efforts] = BY_RAY
     rays_per_chunk: int = 16_384
 
     def steps_per_pass(self, data: Any) -> float:
-        """Steps after which as many rays were seen as the training photographs have pixels to learn from."""
+        """Number of steps with as many rays as the training photographs have trusted pixels."""
         if not isinstance(data, Scene):
             return super().steps_per_pass(data)
         return data.pixels("train") / self.rays_in_a_step(data)
 
     def rays_in_a_step(self, data: Scene) -> float:
-        """Rays that a step learns from, about: those of a first one, which a copy draws."""
+        """Approximate number of rays of a step, measured on a copy's first step."""
         fresh = copy.deepcopy(self)
         fresh.progress = 0.0
         return len(fresh.batch(data, torch.Generator().manual_seed(0)))
@@ -47,13 +47,13 @@ class RayMethod(Method):
 
     @property
     def pass_weights(self) -> dict[str, float]:
-        """Weights of the passes' errors in the loss, by the names of their looks; 1 for one that is not named. Nothing
-        is learnt from a pass of weight 0. By default the Config's `coarse_loss_weight`, if it has one."""
+        """Loss weights of the passes, by the names of their looks; 1 for others. A pass of weight 0 is not trained. By
+        default the Config's `coarse_loss_weight`, if it has one."""
         return {"coarse": getattr(self.config, "coarse_loss_weight", 1.0)}
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """The squared error of each pass's picture (Mildenhall 2020, eq. 6), where `looks` takes a generator beside the
-        rays: of the samples' random places in training."""
+        """Squared error of each pass's picture (Mildenhall 2020, eq. 6), for `looks` with a generator of jitter in
+        training."""
         background = self.background
         target = batch.before(background)
         terms, taught = dict[str, Tensor](), dict[str, Tensor]()
@@ -67,12 +67,12 @@ class RayMethod(Method):
         return terms | taught
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """Rendering of each ray before a background colour: the last look, composited."""
+        """Rendering of each ray over a background colour: the last look, composited."""
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
 
     def colour_pairs(self, photograph: Photograph) -> ColourPairs:
-        """Colours as a function of a photograph's pose at random trusted pixels; see `RefinesPoses`."""
+        """Rendered colours as a function of a photograph's pose at random trusted pixels; see `RefinesPoses`."""
 
         def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
             batch = photograph.sample_rays(POSE_RAYS, generator).to(self.device)

@@ -1,4 +1,4 @@
-"""Sampler: the places along rays where a field is evaluated, and Pass, the outcome."""
+"""Sampler: sample positions along rays for a field, and Pass, the result."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 @dataclass(frozen=True)
 class Pass:
-    """Samples along rays with a field's geometry there; colours follow, under any code.
+    """Samples along rays with a field's geometry there; colours follow, with any code.
 
     density:    per scene unit
-    features:   what `Field.colour` takes, of the samples that get a colour
+    features:   input of `Field.colour`, of the samples that get a colour
     directions: of the same samples
     coloured:   indices of the samples that get a colour; None for all
-    rgb:        of a field that gives density and colour at once
-    evaluated:  number of points at which density was evaluated
+    rgb:        of a field that evaluates density and colour jointly
+    evaluated:  number of density evaluations
     scale:      applied to colours, to scale their gradients as those of density were
     proposals:  of a proposal sampler, for its loss
-    field:      that was evaluated; None for the one of the method
+    field:      evaluated one; None for the method's
     """
 
     name: str
@@ -57,7 +57,7 @@ class Pass:
         return Look(self.name, self.samples, self.density, self.scale(rgb) if self.scale else rgb)
 
     def keep(self, mask: Bool[Tensor, " sample"]) -> Pass:
-        """The samples that a mask picks, of a pass all of whose samples get a colour later."""
+        """The samples in a mask, of a pass whose samples all get a colour later."""
         features = tuple(x[mask] for x in self.features) if isinstance(self.features, tuple) else self.features[mask]
         samples, density, directions = self.samples.keep(mask), self.density[mask], self.directions[mask]
         return replace(self, samples=samples, density=density, features=features, directions=directions)
@@ -71,18 +71,19 @@ class Pass:
 
 
 def codes_at(rays: Int[Tensor, " sample"], code: Float[Tensor, "ray code"]) -> Float[Tensor, "sample code"]:
-    """The code of each sample's ray. An embedding's gradient is the fastest of all look-ups."""
+    """Code of each sample's ray. An embedding's gradient is the fastest of all look-ups."""
     return code.expand(len(rays), -1) if len(code) == 1 else embedding(rays, code)
 
 
 class Sampler(Part):
-    """Chooses where along rays a field is evaluated, with its start-up, schedule, loss terms, optimizer and storage.
+    """Chooses where along rays a field is evaluated, with its initialisation, schedule, loss terms, optimizer and
+    storage.
 
-    is_open:        whether it samples rays without an end
+    is_open:        whether it samples unbounded rays
     batch_size:     number of rays of the next step
     expected_rays:  number of rays of a typical step
-    rays_per_chunk: rays that are rendered at once
-    evaluated:      number of points of the last training step at which density was evaluated
+    rays_per_chunk: number of rays in a rendering chunk
+    evaluated:      number of density evaluations in the last training step
     """
 
     is_open: ClassVar[bool] = False
@@ -95,21 +96,21 @@ class Sampler(Part):
     def sample(
         self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
-        """Passes along rays, the one that is composited last.
+        """Passes along rays, the composited one last.
 
         code:      of each ray
-        generator: of random places in training; None in rendering, where samples lie at fixed places
+        generator: of jitter in training; None in rendering, with fixed positions
         """
 
     def terms(self, density: Density, last: Pass, generator: torch.Generator) -> dict[str, Tensor]:
-        """Loss terms by name. density: of the field, per scene unit. last: the pass that is composited"""
+        """Loss terms by name. density: of the field, per scene unit. last: the composited pass"""
         return {}
 
     def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
-        """Initialise from what a teacher holds (`components.fields.teacher`), in place of `begin`."""
+        """Initialise from a teacher (`components.fields.teacher`), instead of `begin`."""
 
     def settle(self, density: Density, chance: torch.Generator) -> None:
-        """Follow a field that was taught by a teacher. density: per scene unit"""
+        """Update after distillation of the field from a teacher. density: per scene unit"""
 
     def release(self) -> None:
-        """Drop what sampling alone needs, once the field is baked."""
+        """Free data that only sampling needs, after the field is baked."""

@@ -23,6 +23,8 @@ from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, betwee
 from ..method import FieldMethod
 from ..method.depth import DepthNumbers
 
+DENSITY_NOISE = 1.0  # deviation of noise on captures' raw density in training, appendix A
+
 
 @dataclass(frozen=True)
 class Config:
@@ -36,7 +38,6 @@ class Config:
     hidden_width: Width = 256  # channels of a layer, appendix A; wider holds more detail, and costs time
     learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 5.3; higher: faster, may diverge
     final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, section 5.3
-    density_noise: NonNegative = 1.0  # deviation of noise on captures' raw density in training, appendix A; 0: none
     networks: Annotated[int, between(1, 2)] = 2  # networks: 2, one for each pass, or 1 for both, which is faster
     coarse_loss_weight: NonNegative = 1.0  # weight of the coarse colours, eq. 6; 0, with one network: it only guides
     transmittance_threshold: Share = 0.0  # transmittance at which a ray terminates; higher is faster, less exact
@@ -64,7 +65,7 @@ class NeRF(FieldMethod):
         super().__init__(frame, c)
         space = space_of(frame)
         self.poses = poses_for(frame, c.poses)
-        noise = c.density_noise if space.is_open else 0.0
+        noise = DENSITY_NOISE if space.is_open else 0.0
         joining = self.poses.weights if self.poses else None
         self.network = CoordinateField(c.network, c.hidden_width, space, joining=joining, noise=noise)
         if c.networks == 2:

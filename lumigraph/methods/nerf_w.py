@@ -14,7 +14,7 @@ from torch.nn.functional import softplus
 from .. import kernels
 from ..camera.rays import Look, Rays, Rendering, Samples
 from ..components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes, sky_for
-from ..components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ..components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ..components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, side_by_side
 from ..components.fields.layers import MLP, Dense, in_chunks, truncated_exp
@@ -22,6 +22,7 @@ from ..components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, Hiera
 from ..components.sampling.samplers import sampling_bytes
 from ..components.sampling.spaces import space_of
 from ..components.training.photometric import backdrop
+from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
 from ..files.ranges import Layers, NonNegative, PositiveShare, Seed, Share, Width, changed
 from ..method import FieldMethod, Pass, seeded
@@ -139,7 +140,7 @@ HIDDEN, SHOWN = "hidden", "shown"
 class NeRFW(FieldMethod):
     """A static scene whose colours depend on the appearance of a photograph, and a transient of each photograph."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: EncodedHashField | CoordinateField
     transient_head: TransientHead | HashTransientHead
     appearance: AppearanceCodes
@@ -166,10 +167,8 @@ class NeRFW(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        return changed(
-            Config(), **CPU_BACKBONE, coarse_samples=64, fine_samples=64,
-            transient_layers=2, transient_width=32, transient_start=0.1, beta_min=0.1,
-        )  # fmt: skip
+        return changed(Config(), **CPU_BACKBONE, coarse_samples=64, fine_samples=64, transient_layers=2,
+            transient_width=32, transient_start=0.1, beta_min=0.1)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

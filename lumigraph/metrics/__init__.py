@@ -31,10 +31,10 @@ WINDOW, DEVIATION = 11, 1.5  # pixels of SSIM's Gaussian window
 
 @dataclass(frozen=True)
 class Score:
-    """A figure that says how well something was done.
+    """A score of an evaluation.
 
     unit:   as a user reads it; empty for a plain number
-    digits: after the point, as it is shown
+    digits: decimals to show
     """
 
     name: str
@@ -51,7 +51,7 @@ class Score:
 
 
 def scores_of(result: dict[str, Any]) -> list[Score]:
-    """The scores in what eval.json says, in what it says of one view, or in a benchmark's row; the headline first."""
+    """The scores in eval.json, in its entry of one view, or in a benchmark's row; the headline first."""
     if "scores" in result:
         return [Score(**score) for score in result["scores"]]
     return [
@@ -62,7 +62,7 @@ def scores_of(result: dict[str, Any]) -> list[Score]:
 
 
 def named(scores: Sequence[Score], name: str) -> Score | None:
-    """The score of a name, if it is among them."""
+    """Score by name, or None."""
     return next((score for score in scores if score.name == name), None)
 
 
@@ -109,7 +109,7 @@ def blur(images: Float[Tensor, "image 1 height width"]) -> Float[Tensor, "image 
 def intersection_over_union(a: Bool[Tensor, " point"], b: Bool[Tensor, " point"]) -> float:
     """Intersection over union of two volumes, by the points inside of each. In [0, 1]; 1 if both are empty.
 
-    The points should lie evenly in a box that holds both.
+    The points should be uniform in a box around both.
     """
     either = int((a | b).sum())
     return int((a & b).sum()) / either if either else 1.0
@@ -118,8 +118,8 @@ def intersection_over_union(a: Bool[Tensor, " point"], b: Bool[Tensor, " point"]
 def chamfer_distance(
     learnt: Float[Tensor, "learnt 3"], true: Float[Tensor, "true 3"], size: float
 ) -> tuple[float, float, float]:
-    """Chamfer-L1 between points of two surfaces, in tenths of a size: the mean of accuracy (from what is learnt to the
-    nearest true point) and completeness (the other way), and these two."""
+    """Chamfer-L1 between points of two surfaces, in tenths of a size: the mean of accuracy (from learnt points to the
+    nearest true ones) and completeness (the other way), and these two."""
     accuracy, completeness = nearest(learnt, true)[0].mean(), nearest(true, learnt)[0].mean()
     unit = size / 10
     return float(accuracy + completeness) / 2 / unit, float(accuracy) / unit, float(completeness) / unit

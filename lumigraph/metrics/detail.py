@@ -1,4 +1,4 @@
-"""Fine detail of a rendering beside its photograph. Sharp foliage that is a pixel away has a low PSNR."""
+"""Fine detail of a rendering compared with its photograph. Sharp foliage shifted by a pixel has a low PSNR."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ Grey = Float[Tensor, "height width"]
 
 @dataclass(frozen=True)
 class FineDetail:
-    """Fine detail of a rendering, measured.
+    """Fine detail of a rendering.
 
     sharpness: amplitude of a rendering's fine detail, as a share of its photograph's
-    shift_gain: PSNR in dB that shifts of up to 2 pixels add, each square of 15 pixels by its own
+    shift_gain: PSNR in dB gained by shifts of up to 2 pixels, separately for each square of 15 pixels
     """
 
     sharpness: float
@@ -69,10 +69,10 @@ def detail(
 
 
 def fine(image: Grey) -> Grey:
-    """Fine detail: the difference of two means."""
+    """Fine detail: the difference of two box filters."""
     return box(image, FINE) - box(image, COARSE)
 
 
 def box(image: Grey, size: int) -> Grey:
-    """Mean of a square around each pixel, of its part inside the image."""
+    """Box filter: mean of a square around each pixel, within the image."""
     return avg_pool2d(image[None], size, 1, size // 2, count_include_pad=False)[0]

@@ -98,12 +98,12 @@ RANDOM_SIZE = 64  # pixels across
 
 class RandomFeatures:
     """Means and deviations over the picture of the rectified outputs of four convolutions, each at half the size of the
-    one before, with weights drawn once (He 2015) from NumPy's frozen generator. Every second filter has no mean, so it
-    sees edges and noise alone.
+    one before, with random weights (He 2015) from NumPy's frozen generator. Every second filter has zero mean, so it
+    responds to edges and noise alone.
 
-    It was trained on nothing, so it favours no method and no data, and is the same ruler on every machine. It measures
-    colours, edges and textures at four scales; it knows no objects. Figures of different sizes of sets, and those of
-    Inception, are not comparable with its own. Random networks as judges: Naeem 2020, arXiv 2002.09797, section 5.
+    It is untrained, so it favours no method and no data, and is identical on every machine. It measures colours, edges
+    and textures at four scales, not objects. Figures of different sizes of sets, and those of Inception, are not
+    comparable with its own. Random networks for evaluation: Naeem 2020, arXiv 2002.09797, section 5.
     """
 
     name = "random features"
@@ -142,10 +142,10 @@ THREE, SHORT_ROW, SHORT_COLUMN, FIVE = (3, 3), (1, 3), (3, 1), (5, 5)
 
 
 class Inception:
-    """The 2048 features ahead of the last layer of Inception v3 (Szegedy 2016), as FID has it: of TensorFlow's release
-    of 2015, with its averages that leave the border out, and its maximum in the last block.
+    """The 2048 features before the last layer of Inception v3 (Szegedy 2016), as used for FID: TensorFlow's release of
+    2015, with averages that leave the border out, and a maximum in the last block.
 
-    weights: by torchvision's names; share: of a network with so many times fewer channels, as tests make one
+    weights: by torchvision's names; share: reduction factor of channels, for small networks in tests
     """
 
     name = "Inception"
@@ -204,7 +204,7 @@ class Inception:
         return relu(x * gain[:, None, None] + (bias - mean * gain)[:, None, None])
 
     def _weight(self, name: str, shape: Sequence[int]) -> Tensor:
-        """A tensor by its name, or one without numbers while shapes are compared. Raises LumigraphError for another
+        """A tensor by name, or a meta tensor while shapes are compared. Raises LumigraphError for another
         architecture."""
         found = self.weights.get(name)
         if self._fits and (found is None or tuple(found.shape) != tuple(shape)):
@@ -258,7 +258,7 @@ class Inception:
 
 
 def averaged(x: Tensor) -> Tensor:
-    """Mean of each 3x3 neighbourhood, without what lies beyond the border."""
+    """Mean of each 3x3 neighbourhood, within the border."""
     return avg_pool2d(x, 3, 1, 1, count_include_pad=False)
 
 

@@ -1,11 +1,11 @@
-"""LPIPS: how different two pictures look, by features that a network learnt from photographs (Zhang et al. 2018).
+"""LPIPS: perceptual distance of two pictures, by learnt features (Zhang et al. 2018).
 
-The weights are other people's and not part of this package; they are read from files that the user has:
+The weights are not part of this package; they are read from files of the user:
 
     alexnet-owt-*.pth   AlexNet as torchvision publishes it: the backbone's convolutions
-    alex.pth            of the authors' repository (PerceptualSimilarity, folder weights/v0.1): how much channels count
+    alex.pth            of the authors' repository (PerceptualSimilarity, folder weights/v0.1): weights of channels
 
-or from one safetensors file that holds both under the same names.
+or from one safetensors file with both under the same names.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Lpips:
     """The distance of Zhang 2018, eq. 1, over the five rectified convolutions of AlexNet."""
 
     def __init__(self, weights: dict[str, Tensor]):
-        """weights: `features.N.weight`, `features.N.bias` and `linK.model.1.weight`; others are passed over."""
+        """Load weights: `features.N.weight`, `features.N.bias` and `linK.model.1.weight`; others are ignored."""
         self.weights = {name: weights[name].detach().float() for name in SHAPES}
 
     def __call__(self, a: Float[Tensor, "height width 3"], b: Float[Tensor, "height width 3"]) -> float:
@@ -83,12 +83,12 @@ SHAPES: dict[str, tuple[int, ...]] = {
 
 
 def unit(x: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 channel height width"]:
-    """Features of length one at each place."""
+    """Features normalised to unit length at each pixel."""
     return x / (x.norm(dim=1, keepdim=True) + EPSILON)
 
 
 def named_files(given: Sequence[Path]) -> list[Path]:
-    """The files with weights: those given, otherwise those that LUMIGRAPH_LPIPS names, as PATH names folders."""
+    """Files with weights: the given ones, otherwise those of LUMIGRAPH_LPIPS, separated as in PATH."""
     return list(given) or [Path(name) for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
 
 
@@ -117,7 +117,7 @@ def load_lpips(paths: Sequence[Path]) -> Lpips:
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """Named tensors of a safetensors file or a PyTorch state dict. No code in it runs."""
+    """Named tensors of a safetensors file or a PyTorch state dict, without executing code in it."""
     with reading(path, "is no file of weights", "give safetensors or a state dict"):
         if path.suffix == ".safetensors":
             return safetensors.torch.load(path.read_bytes())

@@ -19,8 +19,8 @@ Poses = Float[np.ndarray, "pose 3 4"]
 
 
 def aligned(estimate: Poses, truth: Poses) -> Poses:
-    """The estimate under the rotation and shift that bring its positions closest to the truth's, in the least squares
-    (Umeyama 1991, eqs. 40 and 41, with a scale of 1)."""
+    """The estimate aligned to the truth by a least-squares rotation and shift of its positions (Umeyama 1991, eqs. 40
+    and 41, with a scale of 1)."""
     a, b = estimate[:, :, 3], truth[:, :, 3]
     u, _, vt = np.linalg.svd((b - b.mean(0)).T @ (a - a.mean(0)))
     rotation = u * [1, 1, np.sign(np.linalg.det(u @ vt))] @ vt

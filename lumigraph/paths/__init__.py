@@ -16,7 +16,6 @@ from .keyframes import CameraPath
 
 DEFAULT_SIZE = 480  # pixels of a film by default
 DEFAULT_FRAMES = 120  # of a film along a path without a length
-PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "still", "held-out")
 
 
 def film_cameras(
@@ -25,7 +24,7 @@ def film_cameras(
     """The cameras of a film, one for each frame.
 
     cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
-    path:   one of PATH_KINDS, or a CameraPath
+    path:   name of one (`export/options.py`), or a CameraPath
     frames: None for the default of the path: 120, every held-out view, as long as keyframes last
     size:   longer side; None as the photographs, up to a limit
     Raises LumigraphError for held-out views where there are none, or of several sizes.

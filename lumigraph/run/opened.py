@@ -139,14 +139,14 @@ class Opened(ABC):
         """Cloud in the source's frame, in the order of the method's. Raises LumigraphError for a model without
         Gaussians.
         """
-        return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix)
+        return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix, far=True)
 
     def view_names(self) -> dict[str, list[str]]:
         """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         return {}
 
-    def find_view(self, split: str, view: str) -> int:
-        """Number of a photograph in a split, by its name or number. Raises LumigraphError if there is none."""
+    def find_view(self, split: str, view: str) -> tuple[str, Camera]:
+        """Name and camera of a photograph, by its name or number in a split. Raises LumigraphError if there is none."""
         names = self.view_names().get(split, [])
         if not names:
             raise LumigraphError(f"{self.path} has no views in the split {split!r}; choose another --split")
@@ -156,7 +156,7 @@ class Opened(ABC):
                 f"There is no view {view!r} in the split {split!r} of {self.path}; give --view a number from 0 to "
                 f"{len(names) - 1}, or a name such as {names[0]}"
             )
-        return number
+        return names[number], self.cameras()[split][number]
 
     def survey(self, cameras: Camera) -> Camera:
         """Cameras for extracting meshes and points: its own, or a dome above its ring."""

@@ -114,48 +114,42 @@ class Settings:
 
 
 def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[str, Any]:
-    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. Options
-    that are constants now, by their names in capitals beside the Config or a part of it, are left out, with a warning
-    of another value."""
-    parts, made = [*parts_of(kind)], dict[str, Any]()
-    places = {name: (*path, name) for path, part in parts for name in hints(part)}
-    modules = [vars(sys.modules[part.__module__]) for _, part in parts]
-    for path, value in leaves(said):
-        name = path[-1]
-        constants = [module[name.upper()] for module in modules if name.upper() in module]
-        if name in places or not constants:
-            put(made, places.get(name, path), value)
-        elif value not in map(msgspec.to_builtins, constants):
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(constants[0])} now"
+    """JSON of a Config, each option at its place in this version; no two options of a Config have one name. What is a
+    constant now, by its name in capitals beside the Config or a part of it, is left out, with a warning of another
+    value."""
+    parts = [*parts_of(kind)]
+    modules = [vars(sys.modules[part.__module__]) for part in parts]
+    known = {name: held for part in parts for name, held in hints(part).items()}
+
+    def constants(name: str) -> list[Any]:
+        return [module[name.upper()] for module in modules if name.upper() in module and name not in known]
+
+    def leaves(said: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+        for name, value in said.items():
+            is_part = isinstance(value, dict) and is_dataclass(known.get(name, kind)) and not constants(name)
+            yield from leaves(value) if is_part else [(name, value)]
+
+    def placed(part: Any) -> dict[str, Any]:
+        inner = {name: held for name, held in hints(part).items() if is_dataclass(held)}
+        own = {name: found.pop(name) for name in hints(part) if name in found and name not in inner}
+        return own | {name: placed(held) for name, held in inner.items()}
+
+    found = dict(leaves(said))
+    made = placed(kind)
+    for name, value in found.items():
+        if not (values := constants(name)):
+            made[name] = value
+        elif value not in map(msgspec.to_builtins, values):
+            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(values[0])} now"
             warnings.warn(text, LumigraphWarning, stacklevel=2)
     return made
 
 
-def parts_of(kind: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """A dataclass and those that it holds, each after its path."""
-    yield path, kind
-    for name, part in hints(kind).items():
-        if is_dataclass(part):
-            yield from parts_of(part, (*path, name))
-
-
-def leaves(said: dict[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Values of nested JSON that are no dictionaries, each after its path."""
-    for name, value in said.items():
-        if isinstance(value, dict):
-            yield from leaves(value, (*path, name))
-        else:
-            yield (*path, name), value
-
-
-def put(made: dict[str, Any], path: tuple[str, ...], value: Any) -> None:
-    """Set a value at a path of nested JSON, unless something else than a dictionary is on the way."""
-    inner: Any = made
-    for name in path[:-1]:
-        inner = inner.setdefault(name, {})
-        if not isinstance(inner, dict):
-            return
-    inner[path[-1]] = value
+def parts_of(kind: Any) -> Iterator[Any]:
+    """A dataclass and those that it holds."""
+    yield kind
+    for part in filter(is_dataclass, hints(kind).values()):
+        yield from parts_of(part)
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:

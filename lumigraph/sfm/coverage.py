@@ -1,4 +1,4 @@
-"""Coverage of a subject by photographs: the angle around it, gaps, elevations, and places for more photographs."""
+"""Coverage of a subject by photographs: the angle around it, gaps, elevations, and positions for more photographs."""
 
 from __future__ import annotations
 

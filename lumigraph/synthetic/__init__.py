@@ -4,13 +4,13 @@
     render(stage.world, stage.cameras["test"][0])         picture, exact depth, normals, masks, albedo
     signed_distance(stage.world, points)                  exact geometry
     open_scene("procedural:still-life,size=400")          the same as any other capture
-    open_scene("procedural:tourists,jitter_poses=2")      with poses that are 2 degrees and 2 % off
-    render(stage.world_of(camera), camera)                of a scene that moves: `jelly`, `clockwork`, `street`, `swing`
-    scene_flow(stage, camera, later)                      where each pixel's surface point is at another moment
+    open_scene("procedural:tourists,jitter_poses=2")      with pose errors of 2 degrees and 2 %
+    render(stage.world_of(camera), camera)                of a dynamic scene: `jelly`, `clockwork`, `street`, `swing`
+    scene_flow(stage, camera, later)                      position of each pixel's surface point at another time
     write_blender(stage, folder)                          the same for other tools
 
     open_scene("procedural:city,crossings=6")             scenes may have options of their own
-    open_scene("procedural:walker,jitter_bones=5")        a character and its skeleton, its bones 5 degrees off
+    open_scene("procedural:walker,jitter_bones=5")        a character and its skeleton, with bone errors of 5 degrees
     open_scene("procedural:character,file=fox.glb")       the same of a skinned mesh
     open_scene("procedural:room,depth,views=300")         a depth camera's film, in metres; `exact_depth` is the truth
 
@@ -76,21 +76,21 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_block_world(request: str) -> bool:
-    """True for a scene of blocks, which has their labels as `blocks`."""
+    """True for a block world, whose labels are `Capture.blocks`."""
     name = request.partition(",")[0]
     return not is_category(request) and name in scenes.available() and hasattr(scenes.scene(name), "blocks")
 
 
 def confirm(request: str) -> None:
-    """Raise LumigraphError for a name that nothing here has."""
+    """Raise LumigraphError for an unknown name."""
     if not is_category(request):
         scenes.scene(request.partition(",")[0])
 
 
 def read(request: str) -> Capture:
-    """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
+    """The capture of a procedural name, with options after commas: "still-life", "still-life,size=400,seed=1".
 
-    Pictures are traced when they are read. Raises LumigraphError for a name or an option that does not exist.
+    Pictures are rendered when they are read. Raises LumigraphError for an unknown name or option.
     """
     if is_category(request):
         return capture(member_stage(request), f"procedural:{request}", kept=True)
@@ -108,7 +108,7 @@ def read(request: str) -> Capture:
 def block_capture(blocks: BlockLabels, source: str, size: int = 128, views: int = 60, seed: int = 0) -> Capture:
     """Pictures of blocks with exact labels and depth; lengths of the source are blocks.
 
-    size: of the square pictures, pixels; views: number of pictures to learn from; seed: position of their cameras
+    size: of the square pictures, pixels; views: number of training pictures; seed: position of their cameras
     """
     found = capture(stage_of(blocks, size, views, seed, source), source, kept=True)
     return replace(found, blocks=blocks_about_middle(blocks))
@@ -117,8 +117,8 @@ def block_capture(blocks: BlockLabels, source: str, size: int = 128, views: int 
 def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
     """A stage as photographs with known poses.
 
-    found: the cameras as they are said to be, where that differs; `about` has each `true_pose` then
-    kept:  whether pictures may be kept once they are traced
+    found: cameras with pose errors, if they differ; `about` then has each `true_pose`
+    kept:  whether rendered pictures may be cached
     """
     visible = stage.world.sky.visible
     said = found or stage.cameras
@@ -161,7 +161,7 @@ def in_source(stage: SyntheticStage, pose: Tensor) -> np.ndarray:
 
 
 def identity(stage: SyntheticStage, camera: Camera) -> str:
-    """All that a picture depends on."""
+    """Everything that a picture depends on, as a cache key."""
     if stage.called is not None and camera.image_index is not None:
         world = stage.called(int(camera.image_index))
     else:
@@ -171,7 +171,7 @@ def identity(stage: SyntheticStage, camera: Camera) -> str:
 
 
 def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]:
-    """The layers of one photograph, traced on request."""
+    """Layers of one photograph, rendered on request."""
 
     def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> PixelPlane:
         values = partial(known, stage, camera, name)
@@ -212,7 +212,7 @@ def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]
 
 
 def known_facts(stage: SyntheticStage, camera: Camera, jittered: bool) -> dict[str, Any]:
-    """Facts of one photograph. jittered: whether its pose is perturbed; the true one is then included"""
+    """Values of one photograph. jittered: whether its pose is perturbed; the true one is then included"""
     known = {TRUE_POSE: in_source(stage, camera.pose[0])} if jittered else {}
     if stage.facts is not None and camera.image_index is not None:
         known |= stage.facts(int(camera.image_index))
@@ -224,7 +224,7 @@ def known_facts(stage: SyntheticStage, camera: Camera, jittered: bool) -> dict[s
 
 
 def taken_raw(stage: SyntheticStage, camera: Camera) -> RawPhoto:
-    """The photograph as the stage's sensor takes it; nothing is traced before its pixels are read."""
+    """Raw photograph by the stage's sensor; rendered when its pixels are read."""
     assert stage.sensor is not None and camera.image_index is not None
     width, height = camera.size[0].tolist()
     light = partial(radiance, stage.world_of(camera), camera)
@@ -232,7 +232,7 @@ def taken_raw(stage: SyntheticStage, camera: Camera) -> RawPhoto:
 
 
 def without_passers_by(stage: SyntheticStage, camera: Camera) -> np.ndarray:
-    """The photograph as it would be in its own light without passers-by, bytes (height, width, 3)."""
+    """The photograph in its own light without transient objects, bytes (height, width, 3)."""
     assert stage.lasting is not None and camera.image_index is not None
     return eight_bits(*photograph(stage.lasting(int(camera.image_index)), camera), alpha=False)
 
@@ -257,8 +257,8 @@ def known(stage: SyntheticStage, camera: Camera, name: str) -> np.ndarray:
 
 
 def scene_flow(stage: SyntheticStage, camera: Camera, time: float) -> np.ndarray:
-    """Displacement (height, width, 3) of the surface point that each pixel shows, from the camera's moment to another,
-    scene units. NaN where nothing is. Optical flow is its projection."""
+    """Scene flow (height, width, 3): displacement of each pixel's surface point from the camera's time to another,
+    scene units. NaN for the background. Optical flow is its projection."""
     assert stage.moving is not None, "nothing moves"
     width, height = camera.size[0].tolist()
     now, rays = stage.world_of(camera), camera.rays(camera.pixels())
@@ -276,9 +276,9 @@ def picture(stage: SyntheticStage, camera: Camera) -> np.ndarray:
 
 
 def jittered(stage: SyntheticStage, amount: float, seed: int) -> dict[str, Camera]:
-    """The stage's cameras, those to learn from each turned by `amount` degrees about an axis of its own and moved by
-    `amount` percent of the longest side of the box of interest, or of `Stage.error`, any way. Held-out ones stay where
-    they are."""
+    """The stage's cameras with pose errors: training ones rotated by `amount` degrees about a random axis and shifted
+    by `amount` percent of the longest side of the box of interest, or of `Stage.error`, in a random direction. Held-out
+    ones are unchanged."""
     random = np.random.default_rng([seed, 0x9E3779B9])
     low, high = (np.array(corner) for corner in stage.bounds)
     shift = amount / 100 * (stage.error or float((high - low).max()))
@@ -292,14 +292,15 @@ def jittered(stage: SyntheticStage, amount: float, seed: int) -> dict[str, Camer
 
 
 def write_blender(stage: SyntheticStage, folder: Path, truth: bool = True) -> None:
-    """Render every camera of a stage into a new folder, as Blender's synthetic scenes are (Mildenhall et al. 2020).
+    """Render every camera of a stage into a new folder, in the layout of Blender's synthetic scenes (Mildenhall et al.
+    2020).
 
     FOLDER/transforms_train.json, transforms_test.json ...    poses, OpenGL convention (x right, y up, z backward);
-                                                              "time" where things move, as in D-NeRF (Pumarola 2021)
+                                                              "time" for dynamic scenes, as in D-NeRF (Pumarola 2021)
     FOLDER/train/r_0000.png                                   RGBA, or RGB where the sky is visible
     FOLDER/train/r_0000_truth.npz                             depth (along the ray), normals, ids, albedo, names
 
-    truth: also write what is exactly known about every pixel
+    truth: also write the ground truth of every pixel
     Raises FileExistsError if the folder exists, ValueError for lenses that the format cannot express.
     """
     folder.mkdir(parents=True)
@@ -325,7 +326,7 @@ def write_blender(stage: SyntheticStage, folder: Path, truth: bool = True) -> No
 
 
 def angle_across(cameras: Camera) -> float:
-    """The field of view that all cameras share, radians: all that the format says about lenses."""
+    """Field of view common to all cameras, radians: the format's only lens parameter."""
     lens = cameras.lens
     if not isinstance(lens, Pinhole):
         raise ValueError(f"Blender's format has pinhole cameras only, not {type(lens).__name__}")

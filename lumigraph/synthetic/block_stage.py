@@ -38,7 +38,7 @@ MAX_TRIES = 20  # cameras drawn for one that passes
 
 
 def blocks_about_middle(blocks: BlockLabels) -> BlockLabels:
-    """The blocks in a frame whose origin is the middle of their box."""
+    """The blocks in a frame centred at their box."""
     x, y, z = (-n / 2 for n in blocks.labels.shape)
     return BlockLabels(blocks.labels, (x, y, z))
 
@@ -46,7 +46,7 @@ def blocks_about_middle(blocks: BlockLabels) -> BlockLabels:
 def stage_of(blocks: BlockLabels, size: int, views: int, seed: int, called: str) -> SyntheticStage:
     """A world of blocks in a box from -1 to 1 along its longest side, and cameras above its ground.
 
-    Cameras to learn from are anywhere, those held out walk around the middle. called: name of the kept pictures
+    Training cameras are random, held-out ones walk around the middle. called: cache name of the pictures
     """
     labels = blocks.labels
     unit = max(labels.shape) / 2
@@ -71,8 +71,8 @@ def hash_of(labels: np.ndarray) -> str:
 
 
 def cuboids(labels: np.ndarray, unit: float):
-    """Boxes of blocks of one label, joined along z, then along y, then along x, in the tracer's unit. Blocks that
-    nobody can see are left out."""
+    """Cuboids of merged blocks of one label, along z, then y, then x, in the tracer's unit. Hidden blocks are left
+    out."""
     middle = np.array(labels.shape) / 2
     for label, name in enumerate(LABELS[1:], 1):
         low, high = COLOURS[name]
@@ -122,14 +122,14 @@ def tops(labels: np.ndarray) -> Int[np.ndarray, "x y"]:
 
 
 def clear_height(height: np.ndarray, x: float, y: float, reach: int = CLEARANCE) -> float:
-    """Height of the highest block around a place."""
+    """Height of the highest block around a position."""
     i, j = int(x), int(y)
     around = height[max(i - reach, 0) : i + reach + 1, max(j - reach, 0) : j + reach + 1]
     return float(around.max()) if around.size else 0.0
 
 
 def anywhere(world: World, labels: np.ndarray, count: int, unit: float, random: np.random.Generator):
-    """Poses above random places. One whose picture has too few labels, or is too close to a block, is drawn anew."""
+    """Random poses above the ground. Pictures with too few labels, or too close to a block, are rejected."""
     height, middle, poses = tops(labels), np.array(labels.shape) / 2, []
     for _ in range(count):
         for _ in range(MAX_TRIES):
@@ -183,9 +183,9 @@ def walk(labels: np.ndarray, count: int, unit: float) -> Float[np.ndarray, "came
 def aimed(
     eye: np.ndarray, ahead: np.ndarray, drop: float, distance: float, middle: np.ndarray, unit: float
 ) -> Float[np.ndarray, "3 4"]:
-    """Pose of a camera in blocks, in the tracer's unit.
+    """Pose of a camera in blocks, converted to the tracer's unit.
 
-    ahead: horizontal direction, any length; drop, distance: height over the eye and distance of what it looks at
+    ahead: horizontal direction, any length; drop, distance: of the point of interest, below the eye and ahead of it
     """
     low, high = map(math.radians, PITCHES)
     pitch = min(max(math.atan2(drop, max(distance, 1.0)), low), high)

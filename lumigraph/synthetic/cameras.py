@@ -16,7 +16,7 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> Float[np.ndarray, "3 4"]:
-    """Pose of a camera at `eye` whose picture's centre is `target` and whose top points `up`."""
+    """Pose of a camera at `eye` looking at `target`, with `up` upwards in its picture."""
     eye, target, up = (torch.as_tensor(np.asarray(x, np.float64)) for x in (eye, target, up))
     return geometry.look_at(eye, target - eye, up).numpy()
 
@@ -24,8 +24,8 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> Float[np.ndarray, "3 4"]:
 def pinhole(
     poses: Float[np.ndarray, "camera 3 4"], size: int | tuple[int, int], field_of_view: float | np.ndarray
 ) -> Camera:
-    """The lens of pictures of `size` (width, height) pixels, or so many square, `field_of_view` degrees wide, or of
-    each camera."""
+    """Cameras with pinhole lenses. size: (width, height) in pixels, or a number for squares; field_of_view: degrees
+    across, of all or of each"""
     count = len(poses)
     shape = torch.tensor([size, size] if isinstance(size, int) else size)
     angles = np.broadcast_to(np.radians(field_of_view), count)
@@ -41,7 +41,7 @@ def sphere_point(azimuth: float, elevation: float, radius: float = 1.0) -> np.nd
 
 
 def dome(count: int, radius: float, random: np.random.Generator, lowest: float = 2.0, highest: float = 80.0):
-    """Poses on a dome, evenly spread and a little shaken, all looking near the origin. Elevations in degrees."""
+    """Poses on a dome, evenly spread with jitter, looking near the origin. Elevations in degrees."""
     low, high = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
     start, poses = random.uniform(0, 2 * math.pi), []
     order = random.permutation(count)  # any first few views should surround the object, too
@@ -54,7 +54,7 @@ def dome(count: int, radius: float, random: np.random.Generator, lowest: float =
 
 
 def spiral(count: int, radius: float, random: np.random.Generator, lowest: float = 12.0, highest: float = 60.0):
-    """Poses on a path that climbs around the origin in two turns."""
+    """Poses on a spiral that climbs around the origin in two turns."""
     start, poses = random.uniform(0, 2 * math.pi), []
     for share in (np.arange(count) + 0.5) / count:
         elevation = math.radians(lowest + (highest - lowest) * share)
@@ -63,7 +63,7 @@ def spiral(count: int, radius: float, random: np.random.Generator, lowest: float
 
 
 def walk(count: int, inner: float, outer: float, random: np.random.Generator):
-    """Poses on a ring around the origin at eye height, by turns looking across the middle and away from it."""
+    """Poses on a ring around the origin at eye height, alternately looking inward and outward."""
     start, poses = random.uniform(0, 2 * math.pi), []
     for k in range(count):
         azimuth = start + GOLDEN_ANGLE * k + random.normal(0, 0.05)
@@ -75,7 +75,7 @@ def walk(count: int, inner: float, outer: float, random: np.random.Generator):
 
 
 def stroll(count: int, radius: float, random: np.random.Generator):
-    """Poses once around the origin, the gaze sweeping twice over everything."""
+    """Poses once around the origin, with the viewing direction turning twice."""
     start, poses = random.uniform(0, 2 * math.pi), []
     for share in (np.arange(count) + 0.5) / count:
         azimuth = start + 2 * math.pi * share
@@ -86,10 +86,10 @@ def stroll(count: int, radius: float, random: np.random.Generator):
 
 
 def hand_held(count: int, half_axes: tuple[float, float], random: np.random.Generator, loops: float = 1.05):
-    """Poses of a camera that is carried around the origin, looking outward: translation, rotation, tremor, a loop.
+    """Poses of a hand-held camera around the origin, looking outward: translation, rotation, tremor, a loop.
 
-    half_axes: of the ellipse that is walked, scene units
-    loops:     times around; above 1 the end sees the beginning again
+    half_axes: of the elliptic path, scene units
+    loops:     times around; above 1 the end overlaps the beginning
     """
     start, phase = random.uniform(0, 2 * math.pi), random.uniform(0, 2 * math.pi, (6, 3))
     poses = []

@@ -1,5 +1,5 @@
-"""Captions of plain things, "a red cube beside a blue ball", and pictures of them: training data of a text-and-image
-model, with pairs of things that no training caption has."""
+"""Captions of plain objects, "a red cube beside a blue ball", and pictures of them: training data of a text-and-image
+model, with held-out pairs of objects."""
 
 from __future__ import annotations
 
@@ -62,18 +62,18 @@ def caption(group: Group) -> str:
 
 
 def pairs() -> list[Group]:
-    """All pairs of things that share neither colour nor shape, each once, in a fixed random order."""
+    """All pairs of objects of different colour and shape, each once, in a fixed random order."""
     found = [(a, b) for a, b in itertools.combinations(THINGS, 2) if a.colour != b.colour and a.shape != b.shape]
     return [found[i] for i in np.random.default_rng(0).permutation(len(found))]
 
 
 def held_out() -> list[Group]:
-    """Pairs that no training caption has, alone or with a third thing."""
+    """Held-out pairs, in no training caption, alone or with a third object."""
     return pairs()[:HELD_OUT]
 
 
 def training_groups(random: np.random.Generator, count: int) -> Iterator[Group]:
-    """Groups of one, two or three things to learn from, each held-out pair left out."""
+    """Training groups of one, two or three objects, without held-out pairs."""
     never = {frozenset(pair) for pair in held_out()}
     while count:
         size = random.choice(3, p=SIZE_SHARES) + 1
@@ -84,7 +84,7 @@ def training_groups(random: np.random.Generator, count: int) -> Iterator[Group]:
 
 
 def world(group: Group, random: np.random.Generator) -> World:
-    """The things side by side on an invisible floor, in a row through the middle that is turned at random."""
+    """Objects in a row on an invisible floor, at a random angle."""
     radii = random.uniform(0.32, 0.45, len(group)) * (1.0 if len(group) < 3 else 0.8)
     places = np.cumsum([0.0, *(radii[:-1] + radii[1:] + random.uniform(0.02, 0.2, len(group) - 1))])
     places = (places - places.mean()) if len(group) > 1 else random.uniform(-0.1, 0.1, 1)
@@ -103,7 +103,7 @@ def world(group: Group, random: np.random.Generator) -> World:
 
 
 def picture(group: Group, size: int, random: np.random.Generator) -> UInt8[np.ndarray, "size size 4"]:
-    """The things from a random side, with straight alpha."""
+    """Picture of the objects from a random side, with straight alpha."""
     eye = sphere_point(random.uniform(0, 2 * np.pi), np.radians(random.uniform(*ELEVATIONS)), DISTANCE)
     camera = pinhole(look_at(eye, random.normal(0, 0.06, 3))[None], size, random.uniform(*FIELDS_OF_VIEW))
     return eight_bits(*photograph(world(group, random), camera, samples=4, more=0), alpha=True)

@@ -1,8 +1,8 @@
-"""Characters that move by a skeleton, photographed: exact bones of every moment, or disturbed ones.
+"""Photographed characters with a skeleton: exact bones at all times, or perturbed ones.
 
-Moments go from 0 to 1. One camera goes twice around the character, or a rig that stands still photographs every moment.
-Held out are four still cameras at moments of training and halfway between two of them, and as split "val" poses after
-moment 1 that are in no motion: every joint is turned by UNSEEN_TURN degrees about a random axis.
+Times go from 0 to 1. One camera goes twice around the character, or a static rig photographs every time. Held out are
+four static cameras at training times and halfway between two of them, and as split "val" novel poses after time 1:
+every joint is turned by UNSEEN_TURN degrees about a random axis.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ Joints = Float[np.ndarray, "bone 3 4"]  # joint-to-world matrices
 class CharacterOptions(Pictures):
     """Options of every scene, and of characters.
 
-    rig:          cameras of a rig, which photograph every moment; 0 for one moving camera
-    jitter_bones: degrees by which every joint of the moments to learn from is said to be turned, about random axes
+    rig:          cameras of a rig, which photograph every time; 0 for one moving camera
+    jitter_bones: error of the given bones at training times: degrees about random axes
     """
 
     rig: Annotated[int, between(0, 100)] = 0
@@ -53,26 +53,26 @@ class CharacterOptions(Pictures):
 
 @runtime_checkable
 class Character(Protocol):
-    """Something that a skeleton moves.
+    """A character with a skeleton.
 
-    skeleton: with the pose at rest, in the world
+    skeleton: with the rest pose, in the world
     """
 
     @property
     def skeleton(self) -> Skeleton: ...
 
     def pose(self, share: float) -> Joints:
-        """Joints at a share of the capture, 0 to 1."""
+        """Joints at a time from 0 to 1."""
 
     def world(self, pose: Joints) -> World:
-        """The character in a pose, and its light."""
+        """The character in a pose, with its light."""
 
     def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of the box around it in a pose."""
+        """Bounding box in a pose: lowest and highest corner."""
 
 
 def photographed(character: Character, size: int, views: int, seed: int, rig: int, jitter_bones: int) -> SyntheticStage:
-    """The character with cameras around it, and its skeleton at all moments."""
+    """The character with cameras around it, and its skeleton at all times."""
     random = np.random.default_rng((seed, 0xB0E5))
     moments = np.linspace(0, 1, max(views // rig, MIN_MOMENTS) if rig else max(views, MIN_MOMENTS))
     halfway = 0.5 * (moments[:-1] + moments[1:])[BETWEEN // 2 :: BETWEEN]
@@ -124,7 +124,7 @@ def photographed(character: Character, size: int, views: int, seed: int, rig: in
 def _called(
     character: Character, cameras: dict[str, Camera], times: np.ndarray, poses: list[Joints]
 ) -> Callable[[int], str]:
-    """A name for the character in the pose of each photograph."""
+    """Cache name of each photograph, by character and pose."""
     every = torch.cat([camera.time for camera in cameras.values() if camera.time is not None]).tolist()
 
     def name(index: int) -> str:
@@ -142,7 +142,7 @@ def _taken(stops: list[tuple[float, float, float]], size: int) -> Camera:
 
 
 def _numbered(cameras: dict[str, Camera]) -> dict[str, Camera]:
-    """Cameras with the numbers of their photographs."""
+    """Cameras with image indices."""
     found, first = {}, 0
     for name, batch in cameras.items():
         found[name] = replace(batch, image_index=first + torch.arange(len(batch)))

@@ -32,13 +32,13 @@ UNMEASURED = 0  # stored where nothing was measured
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """The numbers of a depth camera, and the length of the world's unit.
+    """Parameters of a depth camera, and the length of the world's unit.
 
     unit:     metres to a unit of the world
     baseline: metres from the camera to the projector on its right
-    range:    metres along the axis that are measured
-    grazing:  cosines between ray and normal: nothing is measured below the first, all above the second
-    seed:     of the noise, beside the number of the picture
+    range:    measured depths along the axis, metres
+    grazing:  cosines between ray and normal: nothing is measured below the first, everything above the second
+    seed:     of the noise, combined with the number of the picture
     """
 
     unit: float
@@ -48,7 +48,7 @@ class DepthCamera:
     seed: int = 0
 
     def measure(self, world: World, camera: Camera) -> UInt16[np.ndarray, "height width"]:
-        """Depth along the optical axis in millimetres, 0 where nothing was measured, of a batch of one camera."""
+        """Depth along the optical axis in millimetres, 0 for unmeasured, of a batch of one camera."""
         width, height = camera.size[0].tolist()
         random = np.random.default_rng([self.seed, 0 if camera.image_index is None else int(camera.image_index)])
         shift = PIXEL_NOISE * width / FULL_WIDTH * random.standard_normal((width * height, 2))
@@ -69,7 +69,7 @@ class DepthCamera:
         return found.reshape(height, width)
 
     def shadowed(self, world: World, camera: Camera, rays: Rays, depth: Float[np.ndarray, " ray"]) -> np.ndarray:
-        """Mask of the points on rays that something hides from the projector."""
+        """Mask of the points on rays that are occluded from the projector."""
         points = rays.at(torch.from_numpy(depth).float())
         projector = camera.position + camera.pose[0, :, 0] * self.baseline / self.unit
         beams = points - projector

@@ -27,7 +27,7 @@ GOLDEN = 0.7548776662466927, 0.5698402909980532  # Roberts' R2 sequence
 
 
 class LightTable(NamedTuple):
-    """An environment map as the tracer reads it.
+    """An environment map as input of the tracer.
 
     ends:       cumulative probability of the pixels
     density:    probability of each pixel per steradian
@@ -61,7 +61,9 @@ def pixel_at(table, d):
 
 @njit(**INNER_OPTIONS)
 def drawn(table, u, v, w):
-    """Direction of the map by three numbers in [0, 1): its pixel by probability, and the place within it."""
+    """Importance-sampled direction of the map from three numbers in [0, 1): its pixel by probability, and the
+    position in it.
+    """
     rows, columns = table.density.shape
     pixel, last = 0, rows * columns - 1
     while pixel < last:
@@ -82,7 +84,7 @@ def frame_of(n):
 
 @njit(**INNER_OPTIONS)
 def reflected(base, mirror, alpha, n, v, way):
-    """(f, probability per steradian of `way` in `highlight`) of a material from a light `way` to an eye v."""
+    """(f, pdf of `highlight` per steradian) of a material from a light direction `way` to an eye direction v."""
     nl, nv = dot(n, way), max(dot(n, v), 1e-4)
     f = scale(base, 1.0 / math.pi)
     if mirror[0] + mirror[1] + mirror[2] <= 0.0:
@@ -99,7 +101,7 @@ def reflected(base, mirror, alpha, n, v, way):
 
 @njit(**INNER_OPTIONS)
 def highlight(n, v, alpha, u, w):
-    """Direction in which a microfacet mirrors the eye, drawn by D (Walter 2007, eq. 35)."""
+    """Light direction for a microfacet normal sampled by D (Walter 2007, eq. 35)."""
     cosine = math.sqrt((1.0 - u) / (1.0 + (alpha * alpha - 1.0) * u))
     sine, turn = math.sqrt(max(0.0, 1.0 - cosine * cosine)), 2.0 * math.pi * w
     x, y = frame_of(n)
@@ -109,7 +111,7 @@ def highlight(n, v, alpha, u, w):
 
 @njit(**INNER_OPTIONS)
 def colours_of(material, albedo):
-    """(matt reflectance, reflectance of the highlight head-on, alpha)"""
+    """(diffuse reflectance, specular reflectance at normal incidence, alpha)"""
     coat = 0.04 * material.gloss
     mirror = mix((coat, coat, coat), albedo, material.metal)
     return scale(albedo, 1.0 - material.metal), mirror, max(material.roughness**2, MIN_ALPHA)
@@ -117,7 +119,7 @@ def colours_of(material, albedo):
 
 @njit(**INNER_OPTIONS)
 def direct(objects, nodes, table, found, p, n, v, base, mirror, alpha, samples, u0, v0, w0):
-    """Radiance towards v of a surface from map and suns, `samples` of either strategy."""
+    """Radiance towards v of a surface from map and suns, `samples` of either sampling strategy."""
     total = (0.0, 0.0, 0.0)
     start = along(p, RAY_OFFSET, n)
     glossy = mirror[0] + mirror[1] + mirror[2] > 0.0
@@ -143,11 +145,11 @@ def direct(objects, nodes, table, found, p, n, v, base, mirror, alpha, samples, 
 
 
 def _build(sources: int):
-    """The entry points; see `tracer._build`."""
+    """Compile the entry points; see `tracer._build`."""
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def light(arrays, table, origins, directions, radius, first, samples, bounces, out):
-        """Radiance of each ray, and 1 where it meets something; `samples` of map and highlights, for each."""
+        """Radiance of each ray, and 1 for a hit; `samples` of map and highlights each."""
         objects, materials, _, _, nodes = arrays
         for i in range(len(origins)):
             o, d = vec(origins[i]), vec(directions[i])
@@ -185,7 +187,7 @@ def _build(sources: int):
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def unoccluded(arrays, points, normals, directions, out):
-        """1 where a direction above a surface leaves the world unhindered, else 0."""
+        """Visibility: 1 for a direction above a surface that leaves the world unoccluded, else 0."""
         for i in range(len(points)):
             n = vec(normals[i])
             start = along(vec(points[i]), RAY_OFFSET, n)
@@ -196,7 +198,7 @@ def _build(sources: int):
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def roughness(arrays, origins, directions, out):
-        """Roughness of the material that each ray meets; NaN where it meets none."""
+        """Roughness of the material at each ray's hit; NaN for a miss."""
         for i in range(len(origins)):
             o, d = vec(origins[i]), vec(directions[i])
             _, found = meet(arrays.objects, arrays.nodes, o, d, INFINITY, 0.0, -1)

@@ -1,7 +1,7 @@
-"""Cameras of scenes that move, from time 0 to time 1: one camera that moves as well, or a rig that stands still.
+"""Cameras of dynamic scenes, from time 0 to time 1: one moving camera, or a static rig.
 
-Two further cameras stand still and are held out. They see the moments of training in turn, and every fourth moment
-between two of them: one set of views shows what new cameras and what new moments cost.
+Two further static cameras are held out. They alternate between training times and every fourth time between two of
+them: one set of views measures the cost of new cameras and of new times.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ MIN_MOMENTS = 2
 
 @dataclass(frozen=True)
 class Filmed(Pictures):
-    """Options of every scene, and of those that are filmed.
+    """Options of every scene, and of filmed ones.
 
-    views:  photographs of one moving camera, each at a moment of its own, or of all cameras of a rig
-    rig:    cameras of a rig, which photograph every moment; 0 for one moving camera
-    sweeps: times that the moving camera goes to one side, to the other, and back
+    views:  photographs of one moving camera, each at its own time, or of all cameras of a rig
+    rig:    cameras of a rig, which photograph every time; 0 for one moving camera
+    sweeps: number of sweeps of the moving camera to one side, to the other, and back
     """
 
     rig: Annotated[int, between(0, 100)] = 0
@@ -41,8 +41,8 @@ class Filmed(Pictures):
 
 
 def film(size: int, views: int, seed: int, rig: int, sweeps: int = 1, radius: float = 3.6) -> dict[str, Camera]:
-    """Cameras by split. The moving one goes to one side, to the other, and back, 2.4 degrees from one of 100
-    photographs to the next, 3.8 at most, and as many times that as it sweeps; the seed shifts where it begins."""
+    """Cameras by split. The moving one sweeps to one side, to the other, and back, 2.4 degrees from one of 100
+    photographs to the next, 3.8 at most, times the number of sweeps; the seed shifts its start."""
     random = np.random.default_rng(seed)
     start, aside = random.uniform(0, 2 * math.pi), random.normal(0, 2.0, 2)
     moments = np.linspace(0, 1, max(views // rig, MIN_MOMENTS) if rig else max(views, MIN_MOMENTS))
@@ -60,13 +60,13 @@ def film(size: int, views: int, seed: int, rig: int, sweeps: int = 1, radius: fl
 
 
 def taken(stops: list, size: int, radius: float, aside: np.ndarray) -> Camera:
-    """Cameras that look at the origin. stops: azimuth from the front and elevation, degrees, and time of each;
-    aside: degrees by which all are moved"""
+    """Cameras that look at the origin. stops: azimuth from the front and elevation, degrees, and time of each; aside:
+    azimuth offset of all, degrees"""
     around, up = np.radians([(FRONT + azimuth + aside[0], elevation + aside[1]) for azimuth, elevation, _ in stops]).T
     poses = np.stack([look_at(sphere_point(a, b, radius), np.zeros(3)) for a, b in zip(around, up, strict=True)])
     return timed(pinhole(poses, size, FIELD_OF_VIEW), np.array([stop[2] for stop in stops]))
 
 
 def timed(cameras: Camera, times: np.ndarray) -> Camera:
-    """Cameras that take their photographs at these moments."""
+    """Cameras with these times of exposure."""
     return replace(cameras, time=torch.from_numpy(times).float())

@@ -1,7 +1,8 @@
 """Collections of procedural objects: "toys,count=200" are many, "toys,member=3" is one of them as a scene of its own.
-So are meshes: "path/to/folder" are all that lie in it, "path/to/mesh.obj" is a scene.
+So
+are meshes: "path/to/folder" is a collection of all its meshes, "path/to/mesh.obj" a scene.
 
-Its pictures are traced once and then lie in the user's cache, for a collection is gone through again and again.
+Pictures are rendered once and cached, since training passes over a collection many times.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ MAX_ELEVATION = 60.0  # degrees of the cameras above and below the horizon: no s
 
 @dataclass(frozen=True)
 class Member:
-    """size: of the square pictures, pixels; views: to learn from; seed: of everything; turned: 1 for a random rotation;
-    member: its number."""
+    """Request for one member. size: of the square pictures, pixels; views: training views; seed: of everything; turned:
+    1 for a random rotation; member: its number"""
 
     size: Annotated[int, between(1, 8192)] = 64
     views: Annotated[int, between(1, 10_000)] = 20
@@ -48,7 +49,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Many:
-    """Request for many members, like `Member`; count: of members."""
+    """Request for many members, like `Member`. count: of members"""
 
     count: Annotated[int, between(1, 100_000)] = 200
     size: Annotated[int, between(1, 8192)] = 64
@@ -58,13 +59,13 @@ class Many:
 
 
 def is_category(request: str) -> bool:
-    """True if a request is for objects of a category, or for meshes."""
+    """True for a request for objects of a category, or for meshes."""
     return request.partition(",")[0] in categories.available() or path_of(request) is not None
 
 
 def path_of(request: str) -> Path | None:
-    """The folder or the mesh that a request names; None where it names something procedural. Scenes and categories go
-    first: a folder that is called like one is named ./chairs."""
+    """Folder or mesh of a request; None for a procedural one. Scenes and categories take precedence: a folder of the
+    same name is given as ./chairs."""
     name = request.partition(",")[0]
     if name in (*categories.available(), *scenes.available()):
         return None
@@ -73,14 +74,14 @@ def path_of(request: str) -> Path | None:
 
 
 def is_collection(request: str) -> bool:
-    """True if a request is for all members of a category, or all meshes of a folder, rather than for one."""
+    """True for all members of a category, or all meshes of a folder; False for a single one."""
     if (path := path_of(request)) is not None:
         return path.is_dir()
     return is_category(request) and not any(text.strip().startswith("member=") for text in request.split(",")[1:])
 
 
 def members_of(request: str) -> dict[str, str]:
-    """Request for each member, by its name. Raises LumigraphError for a folder without meshes."""
+    """Request for each member, by name. Raises LumigraphError for a folder without meshes."""
     name, many = told(Many, request)
     said = {key: value for key, value in asdict(many).items() if key != "count" and (key != "turned" or value)}
     shared = ",".join(f"{key}={value}" for key, value in said.items())
@@ -93,7 +94,7 @@ def members_of(request: str) -> dict[str, str]:
 
 
 def member_stage(request: str) -> SyntheticStage:
-    """One object and the cameras around it. Raises LumigraphError for a file of a mesh that holds no surface."""
+    """One object with cameras around it. Raises LumigraphError for a mesh file without a surface."""
     name, one = told(Member, request)
     if (path := path_of(request)) is not None:
         number = zlib.crc32(path.name.encode())
@@ -106,7 +107,7 @@ def member_stage(request: str) -> SyntheticStage:
 
 def plates(path: Path) -> Iterator[Object]:
     """Plates for the triangles of a mesh, centred at the origin, in the mean colours of their corners. Raises
-    LumigraphError for a file that holds no surface."""
+    LumigraphError for a file without a surface."""
     mesh = meshes.read_shape(path, path.stem).mesh
     if not len(mesh.faces):
         raise LumigraphError(f"{path} holds points and no surface, of which there is nothing to photograph")
@@ -122,8 +123,8 @@ def plates(path: Path) -> Iterator[Object]:
 
 
 def turned(stage: SyntheticStage, size: int, seed: tuple[int, int]) -> SyntheticStage:
-    """The stage with its objects turned about the origin by a random rotation; light and horizon stay. Cameras stand
-    all around. `Stage.turn` is the rotation since the object stood upright, where that is known.
+    """The stage with its objects in a random rotation about the origin; light and horizon stay. Cameras are all around.
+    `Stage.turn` is the rotation from the upright orientation, if known.
 
     size: of the square pictures, pixels
     """
@@ -142,7 +143,7 @@ def turned(stage: SyntheticStage, size: int, seed: tuple[int, int]) -> Synthetic
 
 
 def any_rotation(random: np.random.Generator) -> np.ndarray:
-    """A rotation matrix, all equally likely: the first factor of a Gaussian matrix (Stewart 1980)."""
+    """Uniformly random rotation matrix: the first factor of a Gaussian matrix (Stewart 1980)."""
     q, r = np.linalg.qr(random.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))

@@ -1,4 +1,4 @@
-"""From a world and a camera to a picture: rays through every pixel, traced on all cores, averaged."""
+"""Rendering of a world for a camera: rays through every pixel, traced on all cores, averaged."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def render(world: World, camera: Camera, samples: int = 4, more: int = 8) -> Ren
 
     samples: rays per pixel; more: further rays where the first ones differ
 
-    Returns (height, width, ...). Straight `rgb` (black where nothing is), `opacity` the share of the pixel that things
-    cover (sky counts where it is visible), and `depth` along the ray through the pixel's centre, infinite in the sky.
+    Returns (height, width, ...). Straight `rgb` (black for the background), `opacity`, each pixel's coverage by objects
+    (and the sky where it is visible), and `depth` along the ray through the pixel's centre, infinite in the sky.
     Extras, for the same ray: `normals` (unit, world frame, zero in the sky), `ids` (index into `world.names`, -1 for
     none), `albedo` (diffuse reflectance, linear).
     """
@@ -60,7 +60,7 @@ def render(world: World, camera: Camera, samples: int = 4, more: int = 8) -> Ren
 
 
 def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """The picture alone, float32: straight sRGB colours (height, width, 3) and coverage (height, width) in [0, 1]."""
+    """Only the picture, float32: straight sRGB colours (height, width, 3) and coverage (height, width) in [0, 1]."""
     width, height = camera.size[0].tolist()
     if world.environment is not None:
         light = lit(world, camera)
@@ -81,7 +81,7 @@ def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) ->
 
 
 def radiance(world: World, camera: Camera, samples: int = 12) -> np.ndarray:
-    """The light of every pixel, linear sRGB (height, width, 3), without a film that bends what is bright."""
+    """Radiance of every pixel, linear sRGB (height, width, 3), without the film's tone curve."""
     if world.environment is not None:
         return lit(world, camera)[..., :3]
     if world.fog is not None:
@@ -117,9 +117,9 @@ def lit(world: World, camera: Camera, samples: int = 4, lights: int = 32) -> Flo
 
 
 def scattered(world: World, camera: Camera, samples: int = 4, along: int = 16) -> Float[np.ndarray, "height width 3"]:
-    """Radiance (linear sRGB) of every pixel of a world in fog, before black.
+    """Radiance (linear sRGB) of every pixel of a world in fog, over black.
 
-    samples: rays per pixel; along: places on each ray for each lamp
+    samples: rays per pixel; along: samples along each ray for each lamp
     """
     assert world.fog is not None
     width, height = camera.size[0].tolist()
@@ -142,7 +142,7 @@ def scattered(world: World, camera: Camera, samples: int = 4, along: int = 16) -
 def unoccluded(
     world: World, points: np.ndarray, normals: np.ndarray, directions: np.ndarray
 ) -> Bool[np.ndarray, "point direction"]:
-    """Mask of the directions above each surface point in which nothing is in the way."""
+    """Mask of the unoccluded directions above each surface point."""
     out = np.empty((len(points), len(directions)), bool)
 
     def work(first: int) -> None:
@@ -155,7 +155,7 @@ def unoccluded(
 
 
 def roughness(world: World, rays: Rays) -> Float[np.ndarray, " ray"]:
-    """Roughness of the material that each ray meets; NaN where it meets none."""
+    """Roughness of the material at each ray's hit; NaN for a miss."""
     origins, directions, _ = _arrays(rays)
     out = np.empty(len(rays))
     environment.roughness(world.arrays, origins, directions, out)
@@ -163,7 +163,7 @@ def roughness(world: World, rays: Rays) -> Float[np.ndarray, " ray"]:
 
 
 def open_sky(world: World, rays: Rays) -> Float[np.ndarray, " ray"]:
-    """Share of a uniform sky's light that reaches the surface which each ray meets; NaN where it meets none."""
+    """Ambient visibility at each ray's hit under a uniform sky; NaN for a miss."""
     seen, even = trace(world, rays, shaded=False), EnvironmentLight.uniform()
     towards, power = (x.double().numpy() for x in even.lamps)
     hit = np.flatnonzero(seen.identity >= 0)
@@ -181,7 +181,7 @@ def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:
 
 
 def trace(world: World, rays: Rays, shaded: bool = True) -> RayHits:
-    """Hits of rays. `radiance` is linear light after the film's response, in [0, 1]; black unless shaded."""
+    """Hits of rays. `radiance` is linear light after the film's response, in [0, 1]; black unless `shaded`."""
     n = len(rays)
     origins, directions, radius = _arrays(rays)
     seen = RayHits(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))
@@ -198,7 +198,7 @@ def trace(world: World, rays: Rays, shaded: bool = True) -> RayHits:
 def signed_distance(world: World, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
     """Distance from points to the nearest surface, scene units, negative inside: the surface is its zero level.
 
-    Exact outside; inside exact where objects do not overlap, otherwise no further than the true surface.
+    Exact outside; inside exact where objects do not overlap, otherwise a lower bound.
     """
     out = np.empty(len(points))
     points_in = points.detach().double().contiguous().numpy()
@@ -212,7 +212,7 @@ def signed_distance(world: World, points: Float[Tensor, "point 3"]) -> Float[Ten
 
 
 def _gather(world: World, camera: Camera, places: Tensor, samples: int, aims: int) -> np.ndarray:
-    """Sums over `samples` rays around each place on the picture, and how they differ: see `tracer.gather`.
+    """Sums over `samples` rays around each pixel position, and their differences: see `tracer.gather`.
 
     aims: shadow rays that each of them sends to each light
     """
@@ -232,7 +232,7 @@ def _gather(world: World, camera: Camera, places: Tensor, samples: int, aims: in
 
 
 def _uneven(pixels: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Pixels whose few samples may have missed something: they differ among themselves, or from their neighbours."""
+    """Pixels to supersample: their samples differ, or they differ from their neighbours."""
     uneven = spread > MAX_CONTRAST
     seen = np.sqrt(pixels[..., :4])
     for axis in (0, 1):
@@ -243,12 +243,12 @@ def _uneven(pixels: np.ndarray, spread: np.ndarray) -> np.ndarray:
 
 
 def _arrays(rays: Rays) -> tuple[np.ndarray, ...]:
-    """Origins, directions and radius as the tracer reads them."""
+    """Origins, directions and radius as input of the tracer."""
     return tuple(x.detach().double().contiguous().numpy() for x in (rays.origins, rays.directions, rays.radius))
 
 
 def hammersley(count: int) -> np.ndarray:
-    """Evenly spread points in the unit square; a rotated grid for four."""
+    """Hammersley points in the unit square; a rotated grid for four."""
     k = np.arange(count)
     mirrored = sum((k >> bit & 1) / 2.0 ** (bit + 1) for bit in range(count.bit_length()))
     return np.stack([(k + 0.5) / count, mirrored + 0.5 / count], -1)

@@ -3,8 +3,8 @@
     L(o, d) = int_0^t T(s) sigma_s p(cos) E(x_s) ds + T(t) L_surface,      T(s) = exp(-sigma_t s)
     p(cos)  = (1 - g^2) / (4 pi (1 + g^2 - 2 g cos)^(3/2)),                E(x) = Phi / r^2 exp(-sigma_t r) V
 
-E is the irradiance that a lamp leaves on what faces it at a distance r, V whether it is visible. The integral is
-sampled at equal angles around each lamp (Kulla and Fajardo 2012), where its 1 / r^2 is constant. Surfaces are matt.
+E is the irradiance of a lamp at a distance r on a surface facing it, V its visibility. The integral is sampled at equal
+angles around each lamp (Kulla and Fajardo 2012), where its 1 / r^2 is constant. Surfaces are matt.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MIN_DISTANCE = 1e-3  # of a ray from a lamp's middle, scene units
 
 @njit(**INNER_OPTIONS)
 def henyey_greenstein(cosine, g):
-    """Share of scattered light per steradian, by the cosine between its directions before and after."""
+    """Phase function: share of scattered light per steradian, by the cosine of the scattering angle."""
     return (1.0 - g * g) / (4.0 * math.pi * (1.0 + g * g - 2.0 * g * cosine) ** 1.5)
 
 
@@ -33,12 +33,12 @@ def visible(objects, nodes, start, way, away):
 
 
 def _build(sources: int):
-    """The entry point; see `tracer._build`."""
+    """Compile the entry point; see `tracer._build`."""
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def light(arrays, fog, origins, directions, radius, first, samples, out):
-        """Radiance of each ray. fog: sigma_s, sigma_t, g, and the radius of the ball around the origin that it fills;
-        samples: along the ray for each lamp."""
+        """Radiance of each ray. fog: sigma_s, sigma_t, g, and radius of its ball around the origin; samples: along the
+        ray for each lamp"""
         objects, materials, lights, _, nodes = arrays
         scattering, extinction, g, reach = fog[0], fog[1], fog[2], fog[3]
         for i in range(len(origins)):

@@ -1,9 +1,8 @@
-"""A camera's sensor: light becomes the raw numbers of a mosaic, with the noise that counting photons and reading them
-out adds; and what a camera makes of those.
+"""Sensor simulation: light becomes raw numbers of a mosaic, with shot noise and read noise; and its development.
 
-Its numbers are those of a Nikon D3200's raw file of a still life at base sensitivity. In flat places the variance of
+Its numbers are those of a Nikon D3200's raw file of a still life at base sensitivity. In flat regions the variance of
 its green pixels, by second differences over squares of 8 pixels, is 8 + 0.29 times the mean above black (DN², photon
-transfer): a photon that is counted is worth 0.29, and reading out adds 2.8.
+transfer): the gain is 0.29 DN per photon, and the read noise 2.8 DN.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ DN_PER_PHOTON = 0.29  # DN of one that is counted
 class Sensor:
     """Sensor of the camera: exposures and sensitivity.
 
-    exposures:   shares of the longest exposure; photographs take turns
-    sensitivity: share of what the sensor can hold that white gives it in the longest exposure
+    exposures:   relative to the longest exposure; photographs alternate
+    sensitivity: sensor value of white at the longest exposure, as a share of saturation
     """
 
     exposures: tuple[float, ...] = (1.0, 1 / 4, 1 / 16)
@@ -41,13 +40,13 @@ class Sensor:
         return self.exposures[image % len(self.exposures)]
 
     def brightness(self, image: int) -> float:
-        """Factor on the light of one photograph that makes white white."""
+        """Brightness factor of one photograph that maps white to white."""
         return 1 / (self.sensitivity * self.exposure(image))
 
     def photograph(self, radiance: Callable[[], np.ndarray], size: tuple[int, int], image: int) -> RawPhoto:
-        """A raw photograph, whose noise depends on its number alone.
+        """A raw photograph, with noise seeded by its number.
 
-        radiance: gives linear sRGB (height, width, 3), 1 for white
+        radiance: returns linear sRGB (height, width, 3), 1 for white
         """
 
         def read() -> np.ndarray:
@@ -66,7 +65,7 @@ class Sensor:
         )
 
     def numbers(self, radiance: Float[np.ndarray, "height width 3"], image: int) -> np.ndarray:
-        """Sensor readout: whole numbers of 14 bits, (height, width)."""
+        """Sensor readout: integers of 14 bits, (height, width)."""
         random = np.random.default_rng(image)
         camera = radiance @ np.linalg.inv(srgb_from_camera(np.array(COLOUR_MATRIX))).T / WHITE_BALANCE
         filters = repeated(PATTERN, (radiance.shape[1], radiance.shape[0])).astype(np.int64)

@@ -1,7 +1,7 @@
-"""Shapes: their signed distance, exact inside and out, and where a ray meets them.
+"""Shapes: signed distances, exact inside and out, and ray intersection.
 
-Each shape is centred at its own origin; an Object's pose puts it into the world. Sizes are outer sizes in scene units.
-A rounded edge is a smaller sharp core, dilated: `rounding` leaves the outer size as it was.
+Each shape is centred at its own origin; an Object's pose places it in the world. Sizes are outer sizes in scene units.
+A rounded edge is a smaller sharp core, dilated: `rounding` preserves the outer size.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ MIN_CURVATURE = 1e-6  # per scene unit; an axis of less is straight
 
 
 class SolidShape:
-    """Interface of all shapes: `describe` for the tracer, `reach` for the tree of boxes around objects."""
+    """Interface of all shapes: `describe` for the tracer, `reach` for bounding boxes."""
 
     def describe(self) -> tuple[int, tuple[float, ...], float, tuple[float, float, float]]:
-        """Kind, numbers of the core, rounding, and half-size of the box around it in its own frame."""
+        """Kind, numbers of the core, rounding, and half-size of the bounding box in its own frame."""
         raise NotImplementedError
 
     def reach(self, rotation: np.ndarray) -> np.ndarray:
-        """Half-size of the upright box around the shape once it is turned: of a box."""
+        """Half-size of the axis-aligned box around the rotated shape: of a box."""
         return np.abs(rotation) @ np.array(self.describe()[3])
 
     def at_rest(self, points: np.ndarray) -> np.ndarray:
-        """Points of the body as they lie when it is not deformed; both in the shape's frame."""
+        """Inverse deformation: rest positions of points of the body; both in the shape's frame."""
         return points
 
     def deformed(self, points: np.ndarray) -> np.ndarray:
-        """Points of the body at rest where they are now; the inverse of `at_rest`."""
+        """Deformation: current positions of points of the body at rest; the inverse of `at_rest`."""
         return points
 
 
@@ -48,7 +48,7 @@ class Turned(SolidShape):
     """A shape of revolution about z."""
 
     def reach(self, rotation: np.ndarray) -> np.ndarray:
-        """Half-size of the upright box around the shape once it is turned: of a cylinder."""
+        """Half-size of the axis-aligned box around the rotated shape: of a cylinder."""
         radius, _, height = self.describe()[3]
         upright = np.abs(rotation[:, 2])
         return radius * np.sqrt(np.maximum(1 - upright**2, 0)) + height * upright
@@ -104,7 +104,7 @@ class Cone(Turned):
 
 @dataclass(frozen=True)
 class Torus(Turned):
-    """A ring around z: `radius` to the middle of the tube, which is `tube` thick (a radius, too)."""
+    """A ring around z. radius: to the middle of the tube; tube: its radius"""
 
     radius: float
     tube: float
@@ -143,8 +143,8 @@ class Plane(SolidShape):
 
 @dataclass(frozen=True)
 class Triangle(SolidShape):
-    """A plate, of twice `rounding` thick and rounded all around: (-base, -height), (base, -height) and (apex, height)
-    before rounding, in the plane z = 0. The longest side lies along x, so that |apex| <= base; see `triangle_of`."""
+    """A plate, twice `rounding` thick: (-base, -height), (base, -height) and (apex, height) before rounding, in the
+    plane z = 0. The longest side lies along x, so that |apex| <= base; see `triangle_of`."""
 
     base: float
     apex: float
@@ -162,7 +162,7 @@ class SoftCapsule(SolidShape):
 
     radius, half_height: at rest; the axis is 2 half_height long
     curvature: of the axis, per scene unit, towards +x; at most a half circle
-    stretch:   factor on the axis's length; the cross-section shrinks by its root, so that the volume stays
+    stretch:   factor on the axis's length; the cross-section shrinks by its root, which preserves the volume
     """
 
     radius: float
@@ -177,7 +177,7 @@ class SoftCapsule(SolidShape):
         return CAPSULE, numbers, 0.0, (aside + radius, radius, half + radius)
 
     def axis(self, along: np.ndarray | float) -> tuple[Any, Any, Any]:
-        """x and z of the axis so far along, and the angle that it has turned by, radians."""
+        """x and z of the axis at a length along it, and its angle there, radians."""
         angle = self.curvature * along
         half = 0.5 * angle
         chord = along * np.sinc(half / math.pi)
@@ -213,7 +213,7 @@ def triangle_of(corners: np.ndarray, thickness: float) -> tuple[Triangle, np.nda
 
 @njit(**INNER_OPTIONS)
 def beside_segment(x, y, ax, ay, bx, by):
-    """Squared distance to a segment in the plane; and on which side, positive to its left."""
+    """Squared distance to a segment in the plane; and the side, positive to its left."""
     dx, dy, px, py = bx - ax, by - ay, x - ax, y - ay
     s = min(max((px * dx + py * dy) / (dx * dx + dy * dy), 0.0), 1.0)
     return (px - s * dx) ** 2 + (py - s * dy) ** 2, dx * py - dy * px
@@ -221,14 +221,14 @@ def beside_segment(x, y, ax, ay, bx, by):
 
 @njit(**INNER_OPTIONS)
 def hollow(kind):
-    """True if a ray that leaves the shape can meet it again: it is not convex."""
+    """True for a shape that is not convex: a ray that leaves it can meet it again."""
     return kind == TORUS or kind == ARCH or kind == CAPSULE
 
 
 @njit(**INNER_OPTIONS)
 def at_rest(kind, size, p):
-    """A point of a body where it lies when it is not deformed; textures are fixed there. Beyond the ends of a soft
-    capsule's axis, along their tangents. It calls nothing compiled, so that Python may call it."""
+    """Rest position of a body's point, where textures are fixed. Beyond the ends of a soft capsule's axis, along their
+    tangents. It calls nothing compiled, so that Python may call it."""
     if kind != CAPSULE:
         return p
     x, y, z = p
@@ -315,7 +315,7 @@ def distance(kind, size, p):
 
 @njit(**INNER_OPTIONS)
 def gradient(kind, size, p):
-    """The outward normal at a point of the surface: central differences over a tetrahedron (Quilez 2015)."""
+    """Outward normal at a point of the surface: central differences over a tetrahedron (Quilez 2015)."""
     h = 1e-5
     a = distance(kind, size, (p[0] + h, p[1] - h, p[2] - h))
     b = distance(kind, size, (p[0] - h, p[1] - h, p[2] + h))
@@ -335,7 +335,7 @@ def inverse(d):
 
 @njit(**INNER_OPTIONS)
 def slab(o, over, low, high):
-    """Distances at which a ray enters and leaves a box, enter > leave if it misses; over is one over its direction."""
+    """Entry and exit distances of a ray in a box, enter > leave for a miss. over: one over its direction"""
     ax, bx = (low[0] - o[0]) * over[0], (high[0] - o[0]) * over[0]
     ay, by = (low[1] - o[1]) * over[1], (high[1] - o[1]) * over[1]
     az, bz = (low[2] - o[2]) * over[2], (high[2] - o[2]) * over[2]
@@ -345,7 +345,7 @@ def slab(o, over, low, high):
 
 @njit(**INNER_OPTIONS)
 def quadratic(a, b, c):
-    """Roots of a t² + 2 b t + c, smaller first; infinity twice if there are none."""
+    """Roots of a t² + 2 b t + c, smaller first; infinity twice without any."""
     root = b * b - a * c
     if root < 0.0 or a < MIN_COMPONENT:
         return INFINITY, INFINITY
@@ -355,7 +355,7 @@ def quadratic(a, b, c):
 
 @njit(**INNER_OPTIONS)
 def intersect(kind, size, half, o, d, limit):
-    """Distance to where a ray from outside first meets the shape, infinity beyond `limit`. In the shape's frame."""
+    """Distance to the first hit of a ray from outside, infinity beyond `limit`. In the shape's frame."""
     if kind == PLANE:
         t = -o[2] / (d[2] if abs(d[2]) > MIN_COMPONENT else MIN_COMPONENT)
         return t if t > 0.0 and t < limit and d[2] < 0.0 else INFINITY

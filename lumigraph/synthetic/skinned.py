@@ -1,6 +1,6 @@
 """Skinned characters of glTF files in the tracer: a plate for each triangle, moved by bones.
 
-The tree over plates is built once, and its boxes are fitted to every further pose.
+The tree over plates is built once, and its boxes are refitted to every further pose.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ MIN_LENGTH = 1e-9  # of sides and normals, against division by zero
 
 
 class SkinnedBody:
-    """A character of a file at the origin, as `characters.Character` asks for one.
+    """A character of a file at the origin, a `characters.Character`.
 
-    clip, seconds: the animation that it plays, which repeats, and for how long
+    clip, seconds: its animation, which repeats, and the duration
     """
 
     def __init__(self, path: Path, clip: int = 0, seconds: float = 0.0):
@@ -61,7 +61,7 @@ class SkinnedBody:
         )
 
     def pose(self, share: float) -> Joints:
-        """Joints at a share of the capture, 0 to 1."""
+        """Joints at a time from 0 to 1."""
         found = self.character.pose(self.number, share * self.seconds)
         moved = self.placed.points(torch.from_numpy(found[:, :, 3].copy())).numpy()
         return np.concatenate([found[:, :, :3], moved[:, :, None]], -1)
@@ -75,12 +75,12 @@ class SkinnedBody:
         return np.einsum("vij,vj->vi", np.tensordot(weights, turn, 1), self.vertices) + weights @ shift
 
     def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of the box around it in a pose."""
+        """Bounding box in a pose: lowest and highest corner."""
         vertices = self.skinned(pose)
         return vertices.min(0), vertices.max(0)
 
     def world(self, pose: Joints) -> World:
-        """The character in a pose, and its light."""
+        """The character in a pose, with light."""
         lit = World((), (KEY, FILL), SKY)
         empty = lit.arrays
         objects, low, high = self.plates(self.skinned(pose))
@@ -130,7 +130,7 @@ class SkinnedBody:
 def fitted_boxes(
     nodes: np.ndarray, levels: list[np.ndarray], low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes of a tree's nodes around other boxes of the same objects. levels: its inner nodes, the deepest first"""
+    """Refit the boxes of a tree's nodes to new boxes of the same objects. levels: its inner nodes, the deepest first"""
     leaves = nodes["object"] >= 0
     own = nodes["object"].clip(0)
     lowest, highest = np.where(leaves[:, None], low[own], 0), np.where(leaves[:, None], high[own], 0)

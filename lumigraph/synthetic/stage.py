@@ -1,4 +1,4 @@
-"""A stage: a world, and the cameras around it; and options behind its name: "still-life,size=400,seed=1"."""
+"""Stage: a world with cameras; and options in its name: "still-life,size=400,seed=1"."""
 
 from __future__ import annotations
 
@@ -25,28 +25,25 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True)
 class SyntheticStage:
-    """A procedural scene ready to be photographed.
+    """A procedural scene with cameras.
 
-    world:   at the first moment, where things move
-    cameras: by split; their `time` says when each photograph is taken, where things move
+    world:   at the first time of a dynamic scene
+    cameras: by split; with `time` in a dynamic scene
     bounds:  the box of interest, lowest and highest corner
-    reach:   half-size of the cube around the origin that holds everything worth modelling
-    near:    distance from every camera within which there is nothing
-    moving:  the world at a moment; None where nothing moves
-    differing: the world when a photograph was taken, by its `image_index`, where light or people differ from one to the
-             next; None where they do not
-    lasting: the same without whatever only passed by
-    turn:    rotation from the frame in which an object of a category stands upright and faces the way that all of them
-             do, to the world; None where there is no such frame
-    sensor:  what takes its photographs raw, which the cameras' `image_index` counts; None where they are pictures alone
-    facts:   what a photograph says of itself, by its `image_index`; see `Scene.about`
-    called:  a name for all that the world of a photograph depends on, by its `image_index`, under which its picture is
-             kept; None where pictures are not kept
-    depth_camera: measures depth beside the pictures, which the cameras' `image_index` counts; None where depth is exact
-    unit:    of the source's frame to a unit of the world
-    tracks:  boxes of the rigid things that move
-    skeleton: bones of a character at all moments, in the world
-    error:   the length of which errors of poses are so many percent; None for the longest side of the bounds
+    reach:   half-size of the cube around the origin that contains the whole model
+    near:    near distance of every camera; the space in front is empty
+    moving:  the world at a time; None for a static scene
+    differing: the world of a photograph, by its `image_index`, where light or people vary; None where they do not
+    lasting: the same without transient objects
+    turn:    rotation to the world from the common upright orientation of a category; None without one
+    sensor:  takes raw photographs, indexed by `image_index`; None for pictures alone
+    facts:   values of a photograph by its `image_index`; see `Scene.about`
+    called:  cache key of a photograph's world, by its `image_index`; None for pictures that are not cached
+    depth_camera: measures depth beside the pictures, indexed by `image_index`; None for exact depth
+    unit:    of the source's frame per unit of the world
+    tracks:  boxes of the moving rigid objects
+    skeleton: bones of a character at all times, in the world
+    error:   reference length of pose errors in percent; None for the longest side of the bounds
     """
 
     world: World
@@ -69,7 +66,7 @@ class SyntheticStage:
 
     @cached_property
     def moving_things(self) -> tuple[int, ...]:
-        """Numbers, in the world's `names`, of the things that move."""
+        """Numbers, in the world's `names`, of the moving objects."""
         if self.moving is None:
             return ()
         times = [t for cameras in self.cameras.values() if cameras.time is not None for t in cameras.time.tolist()]
@@ -79,7 +76,7 @@ class SyntheticStage:
         return tuple(i for i, name in enumerate(self.world.names) if name in changed)
 
     def world_of(self, camera: Camera) -> World:
-        """The world at the moment when a camera (a batch of one) takes its photograph."""
+        """The world at the time of a camera (a batch of one)."""
         if self.differing is not None and camera.image_index is not None:
             return self.differing(int(camera.image_index))
         return self.world if self.moving is None or camera.time is None else self.moving(float(camera.time))
@@ -89,8 +86,8 @@ class SyntheticStage:
 class Pictures:
     """Options of every scene.
 
-    size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand;
-    jitter_poses: degrees, and percent of the box of interest, by which poses to learn from are off
+    size: of the square pictures, pixels; views: number of training photographs; seed: of the camera positions;
+    jitter_poses: error of training poses: degrees, and percent of the box of interest
     """
 
     size: Annotated[int, between(1, 8192)] = 200
@@ -100,7 +97,7 @@ class Pictures:
 
 
 def told(kind: type[Options], request: str) -> tuple[str, Options]:
-    """The name and the options as a dataclass. Raises LumigraphError for an option that does not exist."""
+    """Parse a name with options to the name and a dataclass. Raises LumigraphError for an unknown option."""
     name, *rest = request.split(",")
     return name, typed(kind, dict(parse(kind, request, text) for text in rest), f"procedural:{request}")
 

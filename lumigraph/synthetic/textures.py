@@ -1,8 +1,8 @@
-"""Textures: colours that fill space, so that every shape can be cut out of them.
+"""Textures: solid textures, which fill space.
 
 A texture blends two colours by a pattern in the object's own frame. All patterns are band-limited: an edge is as wide
-as the pixel's footprint, and noise finer than that fades to its mean, so that far pavements grow grey, not noisy.
-Colours are written as they look on screen (sRGB) and computed with as reflectances (linear).
+as the pixel's footprint, and finer noise fades to its mean, so that distant pavements are grey, not noisy. Colours are
+specified as sRGB and computed with as linear reflectances.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Plain(Texture):
 
 @dataclass(frozen=True)
 class Checker(Texture):
-    """Squares of side `size` on whatever faces x, y or z, cubes in between; a square's middle lies at `shift`."""
+    """Squares of side `size` on faces across x, y or z, cubes in between; `shift` is a square's centre."""
 
     kind = CHECKER
     size: float = 0.1
@@ -54,7 +54,7 @@ class Checker(Texture):
 
 @dataclass(frozen=True)
 class Stripes(Texture):
-    """Bands across z, `share` of each period in colour b."""
+    """Bands across z. share: of each period in colour b"""
 
     kind = STRIPES
     period: float = 0.1
@@ -100,8 +100,8 @@ class Marble(Texture):
 
 @dataclass(frozen=True)
 class Bricks(Texture):
-    """A running bond of colour a with joints of colour b on what faces x and y, square slabs of side `length` on what
-    faces z. Every brick has its own shade, darker or lighter by up to `variation`."""
+    """A running bond of colour a with joints of colour b on faces across x and y, square slabs of side `length` on
+    faces across z. Every brick has its own shade, darker or lighter by up to `variation`."""
 
     kind = BRICKS
     length: float = 0.24
@@ -122,14 +122,14 @@ class Mottle(Texture):
 
 @njit(**INNER_OPTIONS)
 def scramble(x, y, z):
-    """Sixteen bits of a lattice point's own, from its coordinates times three large primes (Teschner 2003)."""
+    """Hash of a lattice point, 16 bits: its coordinates times three large primes (Teschner 2003)."""
     h = (x ^ y ^ z) & 0xFFFFFFFF
     return (((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF) >> 16
 
 
 @njit(**INNER_OPTIONS)
 def slope(bits, x, y, z):
-    """A lattice point's gradient, times an offset from it."""
+    """Dot product of a lattice point's gradient with an offset from it."""
     k = bits & 15
     return GRADIENTS[k, 0] * x + GRADIENTS[k, 1] * y + GRADIENTS[k, 2] * z
 
@@ -159,7 +159,9 @@ def noise(x, y, z):
 
 @njit(**INNER_OPTIONS)
 def clouds(p, size, finest, footprint):
-    """Noise summed over octaves from `size` down to `finest`, each half as strong; what the footprint covers fades."""
+    """Fractal noise over octaves from `size` down to `finest`, each half as strong; octaves below the footprint
+    fade.
+    """
     total, strength, shift = 0.0, 0.5, 0.0
     while size > 0.99 * finest:
         keep = 1.0 - smooth(footprint / size, 0.25, 0.6)
@@ -172,7 +174,9 @@ def clouds(p, size, finest, footprint):
 
 @njit(**INNER_OPTIONS)
 def band(x, period, share, footprint):
-    """1 on `share` of each period, 0 elsewhere, edges as wide as the footprint; x = 0 is the middle of a band."""
+    """Square wave: 1 on `share` of each period, 0 elsewhere, edges as wide as the footprint; x = 0 is the middle of
+    a band.
+    """
     from_edge = 0.5 * share * period - abs(x - period * math.floor(x / period + 0.5))
     sharp = clamp(0.5 + from_edge / max(footprint, 1e-6), 0.0, 1.0)
     blur = smooth(footprint / period, 0.3, 1.0)

@@ -1,8 +1,8 @@
-"""The ray tracer: what each ray through a world sees. Compiled once; scenes are data.
+"""Ray tracer of procedural worlds. Compiled once; scenes are data.
 
-Light: what lamps and sun send straight to a surface, reflected by chalk (Lambert) and gloss (GGX, Walter 2007; Fresnel
-after Schlick 1994), each ray asking for one point of each light whether it is in shadow; light from the whole sky, less
-in corners; and one mirrored bounce on whatever is glossy.
+Light: direct light of lamps and sun on diffuse (Lambert) and specular surfaces (GGX, Walter 2007; Fresnel after Schlick
+1994), with one shadow ray per light and ray; light from the whole sky, with ambient occlusion; and one mirror bounce on
+glossy surfaces.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SHOULDER = 0.75  # radiance above this is compressed as by film, so that highlig
 
 
 def spread(count: int) -> np.ndarray:
-    """Points in the unit disc of which any few successive ones are evenly spread (Roberts' R2 sequence)."""
+    """Low-discrepancy points in the unit disc (Roberts' R2 sequence)."""
     k = np.arange(count)
     radius, turn = np.sqrt((0.5 + k * 0.7548776662466927) % 1), 2 * np.pi * (k * 0.5698402909980532 % 1)
     return np.stack([radius * np.cos(turn), radius * np.sin(turn)], -1)
@@ -52,8 +52,8 @@ DISC = spread(256)  # successive rays, hence the samples of a pixel, aim at diff
 def meet(objects, nodes, o, d, limit, enough, leaving):
     """(distance, object) of the first surface along a ray, or (infinity, -1) if none is nearer than limit.
 
-    enough:  the search ends early with any surface nearer than this: 0 finds the first, infinity whether there is one
-    leaving: the object on whose surface the ray begins, or -1: where that is convex, the ray cannot meet it again
+    enough:  the search ends early with any surface nearer than this: 0 finds the first, infinity any
+    leaving: the object on whose surface the ray begins, or -1: a convex one is skipped
     """
     best, found, i = limit, -1, 0
     over = inverse(d)
@@ -105,7 +105,7 @@ def clearance(objects, nodes, p):
 
 @njit(**INNER_OPTIONS)
 def surroundings(sky, d, cover):
-    """Radiance from the sky in a direction; of which clouds cover a share."""
+    """Radiance of the sky in a direction. cover: share of clouds"""
     if d[2] < 0.0:
         return mix(vec(sky.horizon), vec(sky.ground), smooth(-d[2], 0.0, 0.25))
     colour = mix(vec(sky.horizon), vec(sky.zenith), 1.0 - (1.0 - min(d[2], 1.0)) ** 3)
@@ -119,8 +119,8 @@ def surroundings(sky, d, cover):
 
 @njit(**INNER_OPTIONS)
 def ambient(objects, nodes, sky, found, p, n):
-    """Light from all of the sky onto a surface, less what its neighbourhood hides (Evans 2006): balls that touch the
-    surface from outside, each within the last, and how much room other things leave around their centres."""
+    """Sky light on a surface with ambient occlusion (Evans 2006): nested balls that touch the surface from outside, and
+    the clearance around their centres."""
     h = sky.reach
     large, middle, small = 1.0, 1.0, 1.0
     centre = along(p, h, n)
@@ -146,7 +146,7 @@ def ambient(objects, nodes, sky, found, p, n):
 
 @njit(**INNER_OPTIONS)
 def towards(toward, width, ray):
-    """Direction to one of the points of a round light; successive rays choose different ones.
+    """Direction to a sample point of a round light; successive rays choose different ones.
 
     toward: direction to its centre; width: tangent of half its apparent size
     """
@@ -157,7 +157,7 @@ def towards(toward, width, ray):
 
 @njit(**INNER_OPTIONS)
 def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray, aims):
-    """Radiance that a surface sends back along a ray d, all but its mirrored surroundings."""
+    """Reflected radiance of a surface along a ray d, without mirror reflections."""
     base = scale(albedo, 1.0 - material.metal)
     coat = 0.04 * material.gloss
     mirror = mix((coat, coat, coat), albedo, material.metal)
@@ -196,13 +196,13 @@ def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray, 
 
 @njit(**INNER_OPTIONS)
 def film(x):
-    """Linear up to the shoulder, then ever slower towards one."""
+    """Tone curve of the film: linear up to the shoulder, then saturating towards one."""
     return x if x < SHOULDER else 1.0 - (1.0 - SHOULDER) * math.exp((SHOULDER - x) / (1.0 - SHOULDER))
 
 
 @njit(**INNER_OPTIONS)
 def surface(thing, material, p, d, width):
-    """(normal, reflectance) at a point of an object that a ray along d meets; width: of the ray there."""
+    """(normal, reflectance) at a ray's hit on an object. d: ray direction; width: of the ray there"""
     local = rotate_back(thing.rotation, along(p, -1.0, vec(thing.position)))
     shape_normal = gradient(thing.kind, thing.size, local)
     n = rotate(thing.rotation, shape_normal)
@@ -253,12 +253,12 @@ def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
 
 
 def _build(sources: int):
-    """The entry points. Numba's cache on disk looks at this file only; `sources`, being part of the compiled functions,
+    """Compile the entry points. Numba's disk cache checks this file only; `sources`, part of the compiled functions,
     renews it when any file of the tracer changes."""
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def trace(arrays, origins, directions, radius, first, aims, radiance, depth, normal, identity, reflectance):
-        """Everything about each ray. first: number of the first; aims: shadow rays to each light, 0 for no shading."""
+        """All outputs of each ray. first: number of the first; aims: shadow rays to each light, 0 for no shading"""
         objects, materials, lights, sky, nodes = arrays
         for i in range(len(origins)):
             o, d, ray = vec(origins[i]), vec(directions[i]), first + i + 0 * sources
@@ -270,8 +270,8 @@ def _build(sources: int):
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def gather(arrays, origins, directions, radius, first, aims, samples, pixels):
-        """Rays pixel by pixel, `samples` to each: sums of radiance where something was seen, how often that was, and
-        the largest difference between two samples, in radiance's square root, which is about as unequal as it looks."""
+        """Sums over `samples` rays of each pixel: radiance of hits, number of hits, and the largest difference between
+        two samples in the square root of radiance, which approximates perceived difference."""
         objects, materials, lights, sky, nodes = arrays
         for pixel in range(len(pixels)):
             begin = scramble((first + pixel) * PRIMES[0], PRIMES[1], 0 * sources)  # pixels should form no pattern

@@ -1,4 +1,4 @@
-"""Vectors of three as tuples, for compiled code: they live in registers and read like the equation."""
+"""Vectors of three as tuples, for compiled code: they live in registers."""
 
 from __future__ import annotations
 

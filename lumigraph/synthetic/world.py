@@ -1,7 +1,7 @@
 """Contents of a procedural scene: objects with a shape, a material and a rigid pose; lights; a sky.
 
-Everything is a frozen value, so a moved, relit or repainted scene is `dataclasses.replace` away and the first stays as
-it was. `World.arrays` flattens it for the tracer, which is compiled once and never again for a new scene.
+Everything is a frozen value: a moved, relit or repainted scene is a `dataclasses.replace`. `World.arrays` flattens it
+for the tracer, which needs no compilation for a new scene.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FAR_DISTANCE = 1e30  # in place of infinity, because infinity times zero is not 
 
 
 def record(**fields: str) -> np.dtype:
-    """Type of a row for the tracer, from NumPy's names of its fields' types."""
+    """Row type for the tracer, from NumPy's names of its fields' types."""
     return np.dtype(list(fields.items()))
 
 
@@ -41,7 +41,7 @@ NODE = record(low="3f8", high="3f8", object="i8", skip="i8")
 
 
 class Arrays(NamedTuple):
-    """A world as the tracer reads it."""
+    """A world as input of the tracer."""
 
     objects: np.ndarray
     materials: np.ndarray
@@ -59,7 +59,7 @@ class Pose:
 
     @staticmethod
     def at(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Pose:
-        """The pose at a place, leaning by `tilt` degrees (about x), then turned by `turn` degrees (about z)."""
+        """Pose at a position, tilted by `tilt` degrees (about x), then turned by `turn` degrees (about z)."""
         rotation = rotation_about((0, 0, 1), turn) @ rotation_about((1, 0, 0), tilt)
         return Pose((x, y, z), nested(rotation))
 
@@ -76,7 +76,7 @@ class Pose:
         return (points - np.array(self.position)) @ np.array(self.rotation)
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """The pose that moves by `inner` first, then by this one."""
+        """Composition: `inner` first, then this pose."""
         rotation, position = np.array(self.rotation), np.array(self.position)
         moved = rotation @ np.array(inner.position) + position
         return Pose(tuple(moved.tolist()), nested(rotation @ np.array(inner.rotation)))
@@ -84,7 +84,9 @@ class Pose:
 
 @dataclass(frozen=True)
 class Material:
-    """texture:   diffuse colour, and the colour of the reflection where it is metal
+    """Reflectance of a surface.
+
+    texture:   diffuse colour, and specular colour of a metal
     gloss:     strength of the clear coat, 0 for chalk, 1 for varnish (reflects 4 % head-on, more at grazing angles)
     roughness: width of the highlights, 0.1 polished, 0.6 satin
     metal:     0 for paint, wood and stone, 1 for bare metal
@@ -103,8 +105,8 @@ class Material:
 
 @dataclass(frozen=True)
 class Object:
-    """A shape somewhere. Objects of one name are parts of one thing: they share its mask and move together, as a
-    rigid body unless there is one alone."""
+    """A shape with a pose. Objects of one name are parts of one thing: they share its mask and move together; only a
+    single object may deform."""
 
     shape: SolidShape
     material: Material
@@ -112,7 +114,7 @@ class Object:
     name: str = "object"
 
     def scaled(self, factor: float) -> Object:
-        """It so many times larger, seen from the world's origin; its texture stays as fine as it was."""
+        """The object scaled about the world's origin; its texture keeps its scale."""
 
         def times(value: Any) -> Any:
             return tuple(map(times, value)) if isinstance(value, tuple) else factor * value
@@ -128,9 +130,9 @@ class Object:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A glowing ball: shadows soften with its radius.
+    """A glowing ball, with soft shadows by its radius.
 
-    power: radiance of a white chalk surface that faces it at distance one; falls off with the distance squared
+    power: radiance of a white diffuse surface that faces it at distance one; falls off with the distance squared
     """
 
     position: Vector
@@ -151,7 +153,7 @@ class Sun:
 
     direction: towards it
     radius:    half its apparent width, radians
-    power:     radiance of a white chalk surface that faces it
+    power:     radiance of a white diffuse surface that faces it
     """
 
     direction: Vector
@@ -175,9 +177,9 @@ class Sky:
     light:   factor on the three colours
     clouds:  share of white clouds, 0 for none
     haze:    share of light lost per scene unit to the horizon's colour
-    reach:   how far things darken each other's corners (ambient occlusion), scene units
+    reach:   of ambient occlusion, scene units
     exposure: factor on all radiance before the film's response
-    balance: further factors on red, green and blue: the camera's white balance
+    balance: white balance of the camera: factors on red, green and blue
     """
 
     zenith: Colour = (1.0, 1.0, 1.0)
@@ -199,10 +201,10 @@ class Sky:
 
 @dataclass(frozen=True)
 class Fog:
-    """Haze in a ball around the origin that scatters the light of lamps once, and shows surfaces through it.
+    """Fog in a ball around the origin with single scattering of lamps' light.
 
     scattering, absorption: per scene unit
-    anisotropy: g of the phase function (Henyey and Greenstein 1941): 0 for even, towards 1 for forward scattering
+    anisotropy: g of the phase function (Henyey and Greenstein 1941): 0 for isotropic, towards 1 for forward scattering
     reach:      radius of the ball
     """
 
@@ -214,11 +216,11 @@ class Fog:
 
 @dataclass(frozen=True)
 class World:
-    """A scene to photograph. z points up, lengths in scene units.
+    """A procedural scene. z points up, lengths in scene units.
 
-    environment: an exact light from all sides in place of lights and sky; None where there is none
-    bounces:     reflections of its light between surfaces, 0 or 1
-    fog:         what scatters the light of lamps; then there is no other light. None for clear air
+    environment: an exact environment light in place of lights and sky; None without one
+    bounces:     interreflections of its light, 0 or 1
+    fog:         scatters the light of lamps, then the only lights; None for clear air
     """
 
     objects: tuple[Object, ...]
@@ -234,17 +236,17 @@ class World:
         return tuple(dict.fromkeys(o.name for o in self.objects))
 
     def moved(self, name: str, motion: Pose) -> World:
-        """The world after the thing of this name made a rigid motion."""
+        """The world with the object of this name transformed."""
         if name not in self.names:
             raise KeyError(f"nothing here is called {name!r}; there are {', '.join(self.names)}")
         objects = (replace(o, pose=motion @ o.pose) if o.name == name else o for o in self.objects)
         return replace(self, objects=tuple(objects))
 
     def carried(self, points: np.ndarray, things: np.ndarray, later: World) -> np.ndarray:
-        """Positions (point, 3) in a later world of points of this one's surfaces. The exact correspondence.
+        """Positions (point, 3) in a later world of surface points of this one. The exact correspondence.
 
-        things: number in `names` of what each point belongs to; -1 stays where it is
-        later:  the same things, moved or deformed
+        things: number in `names` of each point's object; points of -1 stay
+        later:  the same objects, moved or deformed
         """
         found = np.array(points, np.float64)
         for number, name in enumerate(self.names):
@@ -255,7 +257,7 @@ class World:
         return found
 
     def transformed(self, motion: Pose) -> World:
-        """The world after everything in it, lights included, made a rigid motion; the sky stays."""
+        """The world with everything in it, lights included, transformed; the sky stays."""
         objects = (replace(o, pose=motion @ o.pose) for o in self.objects)
         return replace(self, objects=tuple(objects), lights=tuple(x.moved(motion) for x in self.lights))
 
@@ -286,8 +288,8 @@ class World:
 
 
 def joined(parts: Sequence[World], lights: tuple[Lamp | Sun, ...], sky: Sky) -> World:
-    """The objects of several worlds in one, and in one light. Each part is flattened once for all worlds that it
-    becomes part of. No name may be in two of them."""
+    """Objects of several worlds in one, with one light. Each part is flattened once for all worlds that it becomes part
+    of. Names must be unique."""
     world = World(tuple(o for part in parts for o in part.objects), lights, sky)
     names = [name for part in parts for name in part.names]
     assert len(names) == len(set(names)), "a name is in two parts"
@@ -322,14 +324,14 @@ def rotation_about(axis: Vector, degrees: float) -> np.ndarray:
 
 
 def nested(matrix: np.ndarray):
-    """The rows of a matrix, as `Pose.rotation` has them."""
+    """Rows of the matrix as nested tuples, the type of `Pose.rotation`."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 
 def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The tree over boxes (low, high), as an array of NODE in depth-first order: where a ray misses a box, it goes on
-    at `skip`, past everything inside it; there is no stack. Unbounded ones come first; the others are split again and
-    again where a ray then has least to ask (surface area heuristic, Goldsmith and Salmon 1987)."""
+    """Bounding volume hierarchy over boxes (low, high), as an array of NODE in depth-first order: where a ray misses a
+    box, it continues at `skip`, past everything inside it; there is no stack. Unbounded ones come first; the others are
+    split by the surface area heuristic (Goldsmith and Salmon 1987)."""
     if not boxes:
         return np.zeros(0, NODE)
     low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR_DISTANCE, FAR_DISTANCE) for x in zip(*boxes, strict=True))
@@ -355,7 +357,7 @@ def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 
 
 def split_boxes(low: np.ndarray, high: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two groups whose boxes, weighted by how many each holds, have least surface."""
+    """Split into two groups of least surface area times number."""
     if len(members) == 2:
         return members[:1], members[1:]
     best, groups = np.inf, (members[:1], members[1:])

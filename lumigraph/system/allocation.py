@@ -1,6 +1,6 @@
-"""Allocation: how this process takes memory from the system, and when it gives it back.
+"""Allocation: memory of this process between training steps.
 
-A training step allocates and frees a hundred megabytes. GNU's C library requests every large piece from the system and
+A training step allocates and frees a hundred megabytes. GNU's C library requests every large block from the system and
 returns it at once, and the system zeroes each page again: a third of the processor time of a step of Instant-NGP. So
 freed memory is kept, up to a limit, for the next step.
 """
@@ -26,11 +26,11 @@ USER_SETTINGS = {  # by which users, and programs, say so themselves
 
 @cache
 def settle_memory() -> None:
-    """Let all threads of the process allocate from one arena and keep freed memory there, unless the user's environment
-    decides.
+    """Let all threads of the process allocate from one arena and keep freed memory there, unless the environment
+    overrides it.
 
     GNU's C library gives every thread an arena of its own, whose freed memory others cannot use: a process that opened
-    six viewers one after the other held 130 MB of it. Our threads are few and allocate seldom.
+    six viewers one after the other kept 130 MB of it. Our threads are few and allocate seldom.
     """
     if sys.platform != "linux" or "malloc" in os.environ.get("GLIBC_TUNABLES", ""):
         return
@@ -42,7 +42,7 @@ def settle_memory() -> None:
 
 
 def give_back_memory() -> None:
-    """Return freed memory that is kept to the system, at the end of work that took much."""
+    """Return freed memory to the system, after work that needed much."""
     gc.collect()
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError):  # another C library

@@ -1,7 +1,7 @@
-"""Child processes: Python that imports installed packages alone, in a folder of ours, ended with its parent.
+"""Child processes: Python that imports only installed packages, in a folder of ours, ended with its parent.
 
-Python puts its working directory first on the path of imports, and Numba reads a configuration there. A child therefore
-works in no folder that somebody else may have made. What it is to do arrives as a Request, in which text stays a value.
+Python puts its working directory first on the import path, and Numba reads a configuration there. So a child never
+works in a folder that another user may have made. Its task is a Request, in which text stays data.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ class Request:
     options: dict[str, Any] = field(default_factory=dict)
 
     def start(self, program: Sequence[str] = REQUESTED, **pipes: Any) -> subprocess.Popen[Any]:
-        """A child that runs it. program: words of Python before the request; pipes: of subprocess.Popen"""
+        """Start a child process that runs the request. program: words of Python before it; pipes: of
+        subprocess.Popen
+        """
         child = start_python(program, stdin=subprocess.PIPE, **pipes)
         assert child.stdin is not None
         with contextlib.suppress(BrokenPipeError), child.stdin:  # a child that has ended already
@@ -43,11 +45,11 @@ class Request:
 def start_python(
     words: Sequence[str], ends_by: int = signal.SIGTERM, folder: Path = PACKAGE, **options: Any
 ) -> subprocess.Popen[Any]:
-    """subprocess.Popen of Python with these words, whose imports do not begin in the working directory.
+    """subprocess.Popen of Python with these words, which imports nothing from the working directory.
 
     folder:  the working directory, for words with relative paths
-    ends_by: signal that the child is sent when this process ends, even where that was killed. Linux alone can promise
-             that; elsewhere a child should watch its standard input, which ends at the same moment.
+    ends_by: signal to the child when this process ends, even if killed. Only Linux guarantees it; elsewhere a child
+             should watch its standard input, which closes at the same time.
     """
     tied_to_us = tied(ends_by) if sys.platform == "linux" else None
     return subprocess.Popen([*PYTHON, *words], cwd=folder, preexec_fn=tied_to_us, **options)

@@ -1,4 +1,4 @@
-"""The one door to the terminal: what is printed stands as it is. Style is given beside a text, never written in it.
+"""Terminal output: text is printed literally, without markup. Style is an argument, never part of a text.
 
 So a folder may be called `[/bold]`, `:smile:` or `{0}`, and is printed by that name.
 """
@@ -33,7 +33,7 @@ def dim(text: object) -> Any:
 
 
 def styled(text: object, style: str) -> Any:
-    """A rich Text, which stands as it is in one style."""
+    """A literal rich Text in one style."""
     from rich.text import Text
 
     return Text(str(text), style=style)

@@ -1,4 +1,4 @@
-"""Isolation from the working directory, which may be a folder that somebody else made."""
+"""Isolation from the working directory, which another user may have made."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Compiled kernels of an installed package, kept for the next environment with the same files (Numba).
+"""Shared Numba cache of an installed package's kernels, for all environments with the same files.
 
-Importing this module has Numba ask KernelLocator first, so rooms with kernels import it before any is defined.
+Importing this module registers KernelLocator first with Numba, so rooms with kernels import it before any is defined.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PACKAGE = Path(__file__).parents[1]
 
 @cache
 def fingerprint(package: Path) -> str:
-    """Name for the kernels of a package: changes with any of its files and with Numba, not with where they lie."""
+    """Cache name of a package's kernels: a hash of its files and Numba's version, independent of their location."""
     digest = hashlib.sha256(numba.__version__.encode())
     for file in sorted(package.rglob("*.py")):
         content = file.read_bytes()
@@ -30,11 +30,11 @@ def fingerprint(package: Path) -> str:
 
 
 class KernelLocator(UserWideCacheLocator):
-    """Folder in which Numba keeps a function's machine code: the same for all environments that hold the same package.
+    """Numba cache folder, common to all environments with the same package.
 
-    Numba's own folders depend on where the source file lies, so each environment would compile all kernels anew. The
-    processor and the types of the arguments are part of Numba's index. In a source tree, whose files change one by one,
-    in a folder that cannot be written and with NUMBA_CACHE_DIR Numba's own folders hold.
+    Numba's own folders depend on the source file's path, so each environment would compile all kernels anew. The
+    processor and the argument types are part of Numba's index. In a source tree, whose files change one by one, in a
+    read-only folder and with NUMBA_CACHE_DIR Numba's own folders are used.
     """
 
     package = PACKAGE

@@ -1,7 +1,7 @@
-"""pycolmap, loaded after Pillow, without log files, and so that SIGTERM stays ours.
+"""pycolmap, imported after Pillow, without log files, and without its SIGTERM handler.
 
-- Once pycolmap is loaded first, the first PNG that Pillow saves ends the process by a double free.
-- Its logging library answers SIGTERM by a stack of C++ and exit code -15.
+- If pycolmap is imported first, the first PNG that Pillow saves crashes the process by a double free.
+- Its logging library answers SIGTERM with a C++ stack trace and exit code -15.
 - It writes the names of all photographs to files in the system's temporary folder, which other users may read.
 """
 

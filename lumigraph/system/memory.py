@@ -1,4 +1,4 @@
-"""Memory: how much this process has needed, how much more there is, and how much images may take."""
+"""Memory: peak use of this process, free memory, and the budget of images."""
 
 from __future__ import annotations
 
@@ -36,10 +36,7 @@ GROUP_FILES = {  # limit of a control group, its use, and the use that the syste
 
 
 def peak_memory(device: torch.device) -> int:
-    """Bytes that this process has held at most: of a GPU what tensors took there, otherwise resident main memory.
-
-    0 where the system does not tell.
-    """
+    """Peak memory of this process in bytes: on a GPU that of tensors, otherwise resident main memory; 0 if unknown."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     if STATUS_FILE.exists():  # getrusage would count the process that started this one too
@@ -57,7 +54,7 @@ def room_for(size: int, device: torch.device) -> int:
 
 
 def free_on(device: torch.device) -> int:
-    """Bytes that may still be had on a device."""
+    """Free bytes on a device."""
     if device.type != "cuda":
         return free_memory()
     reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
@@ -65,25 +62,25 @@ def free_on(device: torch.device) -> int:
 
 
 def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str] | str) -> None:
-    """Raise LumigraphError unless so many bytes may be had on a device. what: needs them; remedy: needs less"""
+    """Raise LumigraphError unless a device has this much free memory. what: its purpose; remedy: way to need less"""
     if size > (free := free_on(device)):
         less = remedy if isinstance(remedy, str) else remedy()
         raise LumigraphError(f"{what} would need {gigabytes(size)} of memory, and {gigabytes(free)} are free; {less}")
 
 
 def ask_for_picture(width: int, height: int, device: torch.device) -> None:
-    """Raise LumigraphError unless a rendering of so many pixels may be had on a device."""
+    """Raise LumigraphError unless a device has memory for a rendering of this size."""
     what = f"A picture of {width} x {height} pixels"
     ask_for(BYTES_PER_PIXEL * width * height, device, what, "give a smaller --size")
 
 
 def gigabytes(size: float) -> str:
-    """Bytes for people: "0.3 GB", "1,234 GB"."""
+    """Bytes as text: "0.3 GB", "1,234 GB"."""
     return f"{size / 1e9:,.1f} GB" if size < 1e11 else f"{size / 1e9:,.0f} GB"
 
 
 def want_of_memory(error: BaseException) -> str | None:
-    """One sentence for a fault that is for want of memory: what asked for how much. None for any other fault."""
+    """Sentence for an out-of-memory error, with purpose and size. None for any other error."""
     told = str(error)
     if not (isinstance(error, MemoryError | torch.OutOfMemoryError) or any(sign in told for sign in MEMORY_FAULTS)):
         return None
@@ -99,7 +96,7 @@ def want_of_memory(error: BaseException) -> str | None:
 
 
 def free_memory() -> int:
-    """Bytes that this process may still have: of the machine, of its control groups, of its addresses."""
+    """Free bytes of this process: the least of the machine, its control groups and its address space."""
     try:
         with open("/proc/meminfo", encoding="ascii") as file:
             known = dict(line.split(":") for line in file)
@@ -110,13 +107,13 @@ def free_memory() -> int:
 
 
 def limits() -> list[tuple[int, int]]:
-    """Limits of this process's memory and how much of each is used, in bytes: of its control groups (version 1 or 2),
-    of the groups around them, and of its addresses (`ulimit -v`)."""
+    """Memory limits of this process and use of each, in bytes: of its control groups (version 1 or 2) with their
+    parents, and of its address space (`ulimit -v`)."""
     return group_limits() + address_limit()
 
 
 def address_limit() -> list[tuple[int, int]]:
-    """Limit of addresses and how many are in use, mapped files included; empty without a limit."""
+    """Limit of the address space and its use, mapped files included; empty without a limit."""
     with suppress(OSError, ValueError, ImportError, IndexError):
         resource = importlib.import_module("resource")
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
@@ -151,7 +148,7 @@ def open_text(path: Path) -> str:
 
 
 def memory_for_images() -> int:
-    """Bytes of images to keep in memory: a share of what this process may have in all, and of what is free now."""
+    """Memory budget of images in bytes: a share of this process's total memory, and of its free memory."""
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -161,5 +158,5 @@ def memory_for_images() -> int:
 
 
 def threads_for(each: int, most: int = MAX_THREADS) -> int:
-    """Number of threads for work that takes so many bytes in each: at least one, at most the processor's."""
+    """Number of threads for work of so many bytes each: at least one, at most the processor's."""
     return max(1, min(os.cpu_count() or 1, most, room_for(each, torch.device("cpu"))))

@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: a bar on a terminal, plain lines in a log; numbers and times in few digits."""
+"""Progress of long work on stderr: a bar on a terminal, plain lines in a log; short numbers and times."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def report(description: str, count: int, total: int | None) -> None:
 
 
 def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
-    """The items one by one; what takes longer than a moment is seen."""
+    """The items one by one, with a progress bar after a moment."""
     with counting(description, total) as done:
         for number, item in enumerate(items, 1):
             yield item
@@ -53,10 +53,10 @@ def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
 
 @contextmanager
 def counting(description: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
-    """A function that takes how many of `total` are done; None for an unknown total.
+    """Callback for the number of finished items out of `total`; None for an unknown total.
 
-    What takes longer than a moment is seen: as a bar on a terminal, in a log as a line now and then. A stage within
-    another one is not shown.
+    Progress is shown after a moment: as a bar on a terminal, in a log as an occasional line. Nested stages are not
+    shown.
     """
     stage = ProgressStage(description, total)
     try:
@@ -69,7 +69,7 @@ def counting(description: str, total: int | None = None) -> Iterator[Callable[[i
 
 
 class ProgressStage:
-    """One piece of work, watched by a thread of its own: so it is seen even where its first item takes long."""
+    """A stage of work with progress display from a thread of its own, which also covers a slow first item."""
 
     _shown: ProgressStage | None = None  # one at a time
 
@@ -86,7 +86,7 @@ class ProgressStage:
         report(self.description, count, self.total)
 
     def end(self, well: bool) -> None:
-        """Stop watching. well: whether the work came to its end"""
+        """End the display. well: whether the work was completed"""
         if ProgressStage._shown is not self:
             return
         ProgressStage._shown = None
@@ -110,7 +110,7 @@ class ProgressStage:
             self._told, pause = True, min(INTERVAL_GROWTH * pause, MAX_INTERVAL)
 
     def _draw(self) -> None:
-        """A bar until the work is over."""
+        """Draw a bar until the work ends."""
         counts = (BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn(True))
         columns = counts if self.total else (TimeElapsedColumn(),)
         name = TextColumn("{task.description}", "bold", markup=False)
@@ -148,12 +148,12 @@ class NumberedStages:
 
 
 def tell(line: str) -> None:
-    """A line to stderr."""
+    """Write a line to stderr."""
     print(line, file=sys.stderr, flush=True)
 
 
 def short(number: float) -> str:
-    """Three digits and a prefix: 1 234 567 is 1.23 M."""
+    """Number with three digits and an SI prefix: 1 234 567 is 1.23 M."""
     for size, prefix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if number >= size:
             return f"{number / size:.3g}{prefix}"
@@ -161,5 +161,5 @@ def short(number: float) -> str:
 
 
 def clock(seconds: float) -> str:
-    """90 is 1:30."""
+    """Seconds as a clock time: 90 is 1:30."""
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

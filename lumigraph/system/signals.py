@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: work ends, nothing half-done counts as done, exit codes name the signal."""
+"""Ctrl-C and SIGTERM: work ends cleanly, and exit codes name the signal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIGACTION_BYTES = 1024  # no system's struct sigaction is as large
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal to end the command. number: the signal's;  listener: repeats it until it is heeded"""
+    """A signal to end the command. number: the signal's;  listener: raises it again until it is handled"""
 
     def __init__(self, number: int, listener: listening | None = None):
         super().__init__(number)
@@ -27,7 +27,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def number_of(stopped: KeyboardInterrupt) -> int:
-    """The signal behind an exception: Python's own is Ctrl-C's."""
+    """Signal number of an exception: KeyboardInterrupt is Ctrl-C's."""
     return stopped.number if isinstance(stopped, Stopped) else signal.SIGINT
 
 
@@ -37,14 +37,14 @@ def exit_code(number: int | None) -> int:
 
 
 def go_on_unless(number: int | None) -> None:
-    """Raise Stopped if there was a signal: for who calls `fit` and has no use for what is half learnt."""
+    """Raise Stopped if there was a signal: for callers of `fit` that cannot use a partial result."""
     if number is not None:
         raise Stopped(number)
 
 
 @contextlib.contextmanager
 def until_interrupted() -> Iterator[None]:
-    """A block that ends by Ctrl-C, which is well; SIGTERM still ends the command."""
+    """Block that Ctrl-C ends without an error; SIGTERM still ends the command."""
     try:
         yield
     except KeyboardInterrupt as stopped:
@@ -55,10 +55,10 @@ def until_interrupted() -> Iterator[None]:
 
 
 class listening:  # noqa: N801
-    """Inside this block both signals raise Stopped, even where the shell has Ctrl-C ignored: who sends it means it.
+    """Block in which both signals raise Stopped, even where the shell has Ctrl-C ignored.
 
-    Libraries may lose an exception that comes out of nowhere: NumPy does when it is loaded, Python in a destructor. So
-    none is raised while something is loaded, and one that was lost is raised again.
+    Libraries may swallow an asynchronous exception: NumPy does during its import, Python in a destructor. So none is
+    raised during an import, and a swallowed one is raised again.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class listening:  # noqa: N801
         self._home = None
 
     def heeded(self) -> None:
-        """The signal has ended what it was to end."""
+        """Mark the signal as handled."""
         self._heeded.set()
         if self._reminder is not None:
             self._reminder.join()
@@ -107,7 +107,7 @@ class listening:  # noqa: N801
                 signal.pthread_kill(threading.main_thread().ident or 0, number)
 
     def _is_loading(self, frame: FrameType | None) -> bool:
-        """True while a module is being loaded inside the block."""
+        """True during an import inside the block."""
         while frame is not None and frame is not self._home:
             if frame.f_code.co_filename.startswith("<frozen importlib"):
                 return True
@@ -116,7 +116,7 @@ class listening:  # noqa: N801
 
 
 class Interrupt:
-    """Inside this block the first Ctrl-C or SIGTERM only leaves its number; the second acts as usual."""
+    """Block in which the first Ctrl-C or SIGTERM only records its number; the second acts as usual."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -135,7 +135,7 @@ class Interrupt:
 
 
 class Handlers:
-    """Handler of both signals, until `restore`. Without effect in other threads than the main one."""
+    """Handler of both signals, until `restore`. No effect outside the main thread."""
 
     def __init__(self, hear: Callable[[int, Any], object]):
         self.hear = hear
@@ -153,9 +153,9 @@ class Handlers:
 
 @contextlib.contextmanager
 def untouched() -> Iterator[None]:
-    """Inside this block a library may be loaded that takes SIGTERM for itself; afterwards it acts as before.
+    """Block for importing a library that installs its own SIGTERM handler; restores the previous one.
 
-    Python would not notice that its own handler has gone, so this asks the system, which answers in any thread.
+    Python would not notice the replacement of its handler, so this uses the system call, which works in any thread.
     """
     if os.name == "nt":
         yield

@@ -1,10 +1,10 @@
-"""Threads: how those that share a loop wait for each other.
+"""Threads: spin-waiting of OpenMP threads.
 
-GNU's OpenMP lets a thread that has nothing to do look for work 300 000 times before it sleeps: some milliseconds. Alone
-on the machine that saves waking it, which a training step would do dozens of times. Beside other programs a thread that
-looks keeps the processor from the one that it waits for. So threads look for that long, and hardly at all while others
-hold them up (`benchmarks/busy.py`). A shorter look for all times costs too much: of a step of splatting with small
-photographs, a sixth at 100 000 and a quarter at 40 000.
+GNU's OpenMP lets an idle thread spin 300 000 times before it sleeps: some milliseconds. On an idle machine that saves
+waking it, dozens of times in a training step. Beside other programs a spinning thread takes the processor from the one
+that it waits for. So threads spin that long, and hardly at all while other programs compete (`benchmarks/busy.py`). A
+shorter spin at all times costs too much: of a step of splatting with small photographs, a sixth at 100 000 and a
+quarter at 40 000.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ TASKS_FOLDER = Path("/proc/self/task")
 
 
 def settle(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Say how long threads look for work, unless the user's environment says how they wait.
+    """Set the spin count of threads, unless the environment sets their wait policy.
 
-    It counts for libraries that are loaded afterwards: for PyTorch and Numba, or for Numba alone where PyTorch was
+    It applies to libraries that are loaded afterwards: to PyTorch and Numba, or to Numba alone where PyTorch was
     imported before Lumigraph.
     """
     if not any(name in environment for name in USER_SETTINGS):
@@ -41,10 +41,10 @@ def settle(environment: MutableMapping[str, str] = os.environ) -> None:
 
 
 def share_one_pool() -> None:
-    """Have PyTorch and Numba use the same threads, where both run theirs by GNU's OpenMP.
+    """Make PyTorch and Numba use one thread pool, where both use GNU's OpenMP.
 
-    PyTorch brings a copy of the library, and Numba takes the system's. Each copy keeps threads of its own, and those of
-    one look for work on the processors that the other's need. The copy that is loaded first serves both.
+    PyTorch brings a copy of the library, and Numba takes the system's. Each copy has a pool of its own, and idle
+    threads of one spin on the processors that the other needs. The copy that is loaded first serves both.
     """
     if sys.platform == "linux" and "torch" not in sys.modules:
         with contextlib.suppress(OSError):  # a system without it: Numba then has threads of another kind
@@ -53,10 +53,10 @@ def share_one_pool() -> None:
 
 @contextlib.contextmanager
 def considerate() -> Iterator[None]:
-    """Inside this block, and for LINGER_SECONDS after the last such block, threads hardly look for work while other
-    programs hold them up.
+    """Block in which, and for LINGER_SECONDS after which, threads hardly spin while other programs compete for
+    processors.
 
-    Only where Linux tells so; a user's own way of waiting stays. Blocks may lie inside each other.
+    Only on Linux, which reports contention; the user's own wait policy is kept. Blocks may be nested.
     """
     if not (TASKS_FOLDER / str(os.getpid()) / "schedstat").exists() or os.environ.get("GOMP_SPINCOUNT") != str(
         SPIN_COUNT
@@ -71,7 +71,7 @@ def considerate() -> Iterator[None]:
 
 
 class ContentionWatch:
-    """A thread that makes way for other programs while anybody works, and a little longer: work comes in short pieces,
+    """Thread that reduces spinning under contention during work, and a little longer, since work comes in short pieces
     such as pictures."""
 
     def __init__(self) -> None:
@@ -81,7 +81,7 @@ class ContentionWatch:
 
     @property
     def running(self) -> bool:
-        """True while the thread of this process lives."""
+        """True while this process's thread runs."""
         return self._thread is not None and self._thread.is_alive() and self._process == os.getpid()
 
     def enter(self) -> None:
@@ -110,7 +110,9 @@ class ContentionWatch:
             self._thread.join()
 
     def _held(self, over: threading.Event, contention: Callable[[], float]) -> float:
-        """Share of the time in which others hold us up; without work for a while, 0, and it is over."""
+        """Share of the time that our threads waited for a processor; after a while without work 0, and `over` is
+        set.
+        """
         with self._lock:
             if self._workers == 0 and time.monotonic() > self._left + LINGER_SECONDS:
                 over.set()
@@ -122,8 +124,8 @@ WATCH = ContentionWatch()
 
 
 class Contention:
-    """Calling it tells the share of the time that our threads could have run, since the last call or since it was made,
-    in which others had the processor."""
+    """Contention meter: each call returns the share of runnable time, since the last call, in which other programs had
+    the processor."""
 
     def __init__(self) -> None:
         self._before = self._now()
@@ -146,10 +148,10 @@ class Contention:
 
 
 def make_way(over: threading.Event, held: Callable[[], float]) -> None:
-    """Until it is over: crowd our threads for a while whenever others hold them up.
+    """Until `over` is set: oversubscribe threads for a while whenever there is contention.
 
-    Whether others are still there shows best once threads look for work again: those that sleep may be woken on one
-    processor, where they hold up each other.
+    Contention is measured best while threads spin: sleeping ones may be woken on one processor, where they delay each
+    other.
     """
     crowding: tuple[threading.Thread, threading.Event] | None = None
     looks = 0
@@ -167,22 +169,21 @@ def make_way(over: threading.Event, held: Callable[[], float]) -> None:
 
 
 def disperse(thread: threading.Thread, leave: threading.Event) -> None:
-    """Let the crowd go, and wait until it is gone: Python that ends while a thread is inside PyTorch aborts."""
+    """End the extra threads and wait for them: Python aborts if it exits while a thread is inside PyTorch."""
     leave.set()
     thread.join()
 
 
 def crowd(leave: threading.Event) -> None:
-    """Hold a second set of threads in each copy of OpenMP, which sleep. For OpenMP they are more than there are
-    processors, and then every thread looks for work a hundred times only (GOMP_SPINCOUNT in the manual of GNU's
-    libgomp)."""
+    """Start a second, sleeping pool in each copy of OpenMP. It then counts more threads than processors, and every
+    thread spins only a hundred times (GOMP_SPINCOUNT in the manual of GNU's libgomp)."""
     for openmp in openmp_copies():
         openmp.GOMP_parallel(openmp.omp_get_thread_num, None, processors(), 0)  # each thread asks for its number
     leave.wait()
 
 
 def openmp_copies() -> list[ctypes.CDLL]:
-    """Copies of GNU's OpenMP in this process: one, or two where PyTorch was imported before Lumigraph."""
+    """Loaded copies of GNU's OpenMP: one, or two where PyTorch was imported before Lumigraph."""
     lines = Path("/proc/self/maps").read_text().splitlines()
     paths = {line.split(maxsplit=5)[-1] for line in lines if "/libgomp" in line}
     return [ctypes.CDLL(path) for path in sorted(paths) if Path(path).exists()]  # an update may have removed one

@@ -1,4 +1,4 @@
-"""Work: training, rendering, evaluation and exports run inside `at_work`, from Python as from the command line."""
+"""Work: context of training, rendering, evaluation and exports, from Python as from the command line."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ OPT_OUT = "LUMIGRAPH_AS_IS"  # environment variable: the process's memory and th
 
 @contextlib.contextmanager
 def at_work() -> Iterator[None]:
-    """A block, or a function, of heavy work: memory that a step frees is kept for the next one, and threads do not look
-    for work while other programs hold them up. The first is for the whole process, from then on.
+    """Block, or decorated function, of heavy work: freed memory is kept for the next step, and threads hardly spin
+    under contention. The first is for the whole process, from then on.
 
-    LUMIGRAPH_AS_IS=1 in the environment leaves both alone.
+    LUMIGRAPH_AS_IS=1 in the environment disables both.
     """
     if os.environ.get(OPT_OUT):
         yield

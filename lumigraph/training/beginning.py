@@ -1,4 +1,4 @@
-"""Begin a run: open its data, build its method, decide how long it trains."""
+"""Begin a run: check its data, build its method, decide how long it trains."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from .. import methods
-from ..budget import Budget, given_budget
+from ..budget import Budget
 from ..datasets.dataset import Dataset, check_kind
 from ..files import scene_name
 from ..files.names import next_free
@@ -38,8 +38,7 @@ def begin_run(
     check_new(output)
     seed = getattr(config, "seed", options.seed)
     method = build(methods.find(name), data.frame, config, device, seed, learning=True)
-    budget = given_budget(options.steps, options.seconds, options.quality)
-    if budget is None:
+    if (budget := options.budget) is None:
         quality = options.quality or method.default_quality
         steps = method.steps_for(quality, data) if quality else None
         budget = Budget(steps, quality=quality) if quality else Budget(seconds=DEFAULT_SECONDS)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from ..budget import Quality, about_quality, given_budget
+from ..budget import Limited, Quality, about_quality
 from ..files.options import DeviceOption, ReaderOption, SeedOption, StepsOption, option
 from ..files.ranges import Count, Downscale, Positive, Scales, Seconds, Steps
 
@@ -17,7 +17,7 @@ TRACKED_SIDE = 320  # pixels along the longer side of a frame, about, where the 
 
 
 @dataclass(frozen=True)
-class TrainOptions:
+class TrainOptions(Limited):
     """Options of training, which ends after steps, seconds or the steps of a quality."""
 
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
@@ -42,10 +42,6 @@ class TrainOptions:
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
 
-    def check(self) -> None:
-        """Raises LumigraphError for more than one way to say how long."""
-        given_budget(self.steps, self.seconds, self.quality)
-
     @property
     def of_dataset(self) -> dict[str, Any]:
         """Options of `open_dataset`."""
@@ -58,7 +54,7 @@ class TrainOptions:
 
 
 @dataclass(frozen=True)
-class ResumeOptions:
+class ResumeOptions(Limited):
     """Options of training that goes on."""
 
     seconds: Annotated[Seconds | None, option("S", "unchanged")] = None

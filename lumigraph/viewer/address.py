@@ -16,7 +16,7 @@ MAX_PORT_TRIES = 100  # ports after the usual one
 
 @dataclass(frozen=True)
 class Address:
-    """A host as the user named it, and a port that was free a moment ago.
+    """Host as the user named it, and a port that was free when checked.
 
     token: secret that a browser must send; empty where only this machine can reach the viewer
     """
@@ -37,18 +37,17 @@ class Address:
 
     @property
     def urls(self) -> list[str]:
-        """All addresses that the viewer answers to, as far as they can be found."""
+        """All addresses that reach the viewer, as far as they can be found."""
         hosts = own_addresses() if is_wildcard(self.host) else [self.host]
         secret = f"/?token={self.token}" if self.token else ""
         return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}{secret}" for host in hosts]
 
 
 def choose_address(host: str = HOST, port: int | None = None, token: str = "") -> Address:
-    """An address to listen at. Without a port, the first free one from 8080 on.
+    """Choose an address to listen at. Without a port, the first free one from 8080 on.
 
-    token: secret that the starter of this process shares with it; without one, other machines get one in the address,
-           with a warning
-    Raises LumigraphError if the host is not this machine's or the port is not to be had.
+    token: secret shared with the parent process; without one, other machines get one in the address, with a warning
+    Raises LumigraphError for a host that is not this machine's, and for a port in use.
     """
     if port is not None and not 0 <= port <= 65535:
         raise LumigraphError(f"There is no port {port}; give --port a number from 1 to 65535")
@@ -74,7 +73,7 @@ def new_token() -> str:
 
 
 def free_port(host: str, port: int) -> int | None:
-    """The port itself if it can be listened at (any free one for 0), None if it is in use."""
+    """The port if it is free (any free one for 0), None if it is in use."""
     try:
         family, kind, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         with socket.create_server(place[:2], family=family, reuse_port=False) as listening:

@@ -1,5 +1,5 @@
-"""ViewRequest: all settings of one picture for one client; cameras from the browser's, and their angles of view;
-Flight: a client's camera moved by the server."""
+"""ViewRequest: all settings of one picture for one client; conversions of browser cameras and their angles of view;
+Flight: animation of a client's camera by the server."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def pose_of(wxyz, position) -> tuple[tuple[float, ...], ...]:
 
 
 def rows(camera: Camera, first: int, last: int) -> Camera:
-    """The camera of rows `first` to `last` of a picture behind a pinhole lens."""
+    """Camera of rows `first` to `last` of a pinhole picture."""
     lens = camera.lens
     assert isinstance(lens, Pinhole)
     shift = torch.tensor([[0.0, float(first)]])
@@ -55,13 +55,13 @@ def angle(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> float:
 
 
 def angle_for(camera: Camera, aspect: float) -> float:
-    """Vertical angle of view, in radians, at which a window of an aspect (width / height) shows a whole photograph."""
+    """Vertical angle of view, in radians, for a window of an aspect (width / height) to contain a whole photograph."""
     across, down = angles(camera)
     return min(MAX_FIELD_OF_VIEW, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
 
 
 def angle_across(angle: float, aspect: float) -> float:
-    """Vertical angle of view, in radians, of a window that shows an angle across its smaller side, as pages do.
+    """Vertical angle of view, in radians, for an angle across a window's smaller side, the convention of web pages.
 
     aspect: width / height
     """
@@ -77,13 +77,13 @@ class ViewRequest:
     canvas:     the browser's (width, height) in pixels
     longest:    pixels along the longer side of the sharpest picture
     mode:       one of MODES, or the name of one of the method's extras
-    background: colour behind everything
+    background: background colour
     exact:      whether Gaussians are rendered here rather than by the browser
-    crop:       what is shown of the scene; None for all of it
-    depth:      whether the browser needs depth, because it draws something beside the scene
-    settings:   names and values of the method's controls that the client has turned
+    crop:       visible part of the scene; None for all of it
+    depth:      whether the browser needs depth, to draw objects beside the scene
+    settings:   names and values of the method's controls that the client has changed
     strength:   of `FloaterEvidence.floaters`; 0 for none
-    cleaned:    whether these floaters are left out; otherwise they are coloured
+    cleaned:    whether floaters are hidden; otherwise they are coloured
     """
 
     pose: tuple[tuple[float, ...], ...]
@@ -126,7 +126,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Flight:
-    """A mover of one client's camera. A new flight ends the one before."""
+    """Animation of one client's camera. A new flight cancels the previous one."""
 
     def __init__(self, client: Any):
         self._client, self._number, self.flying = client, 0, False
@@ -146,7 +146,7 @@ class Flight:
             camera.fov = angle
 
     def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
-        """Move the camera smoothly to what `place` would set. Returns on arrival, or when another flight begins."""
+        """Move the camera smoothly to the target of `place`. Returns on arrival, or when another flight begins."""
         self._number, self.flying = self._number + 1, True
         number, camera = self._number, self._client.camera
         begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
@@ -175,7 +175,7 @@ class Flight:
         seconds: float,
         shown: Callable[[int], None] = lambda frame: None,
     ) -> bool:
-        """Move the camera along a path in a time, skipping frames if need be; returns whether it came to the end.
+        """Move the camera along a path in real time, skipping frames if necessary; returns whether it reached the end.
 
         shown: called with the number of each frame that is not skipped
         """
@@ -195,7 +195,7 @@ class Flight:
 
 
 def upwards(pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, " 3"]:
-    """The up direction that makes the browser show a pose's own roll: as near to the scene's up as can be."""
+    """Up direction for the browser that reproduces a pose's roll, closest to the scene's up."""
     right = pose[:, 0]
     up = UP - (UP @ right) * right
     if up @ -pose[:, 1] < 0.05:  # upside down, or nearly level with the axis

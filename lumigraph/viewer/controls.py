@@ -1,4 +1,4 @@
-"""The tab `View` of one client: Controls for settings of the view, MethodControls for controls of the method."""
+"""Tab `View` of one client: Controls for settings of the view, MethodControls for controls of the method."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ MIN_DEGREES, MAX_DEGREES = 10.0, 120.0  # degrees
 
 
 class Controls:
-    """The contents of the tab `View` of a client of viser.
+    """Contents of the tab `View` of a viser client.
 
-    changed: called when anything that is drawn changes
-    home:    called to fly to where the view began
+    changed: called when the picture changes
+    home:    called to fly to the initial view
     """
 
     def __init__(self, client: Any, shared: Shared, changed: Callable[[], None], home: Callable[[], None]):
@@ -73,7 +73,7 @@ class Controls:
 
     @property
     def background(self) -> Vector:
-        """The background colour: the scene's own, to the last bit, until another is chosen."""
+        """Background colour: exactly the scene's own until another is chosen."""
         chosen = tuple(self._background.value)
         own = self._own
         return own if chosen == to_bytes(own) else (chosen[0] / 255, chosen[1] / 255, chosen[2] / 255)
@@ -93,13 +93,13 @@ class Controls:
         self._points.visible = True
 
     def offer_modes(self, names: list[str]) -> None:
-        """Add modes to the dropdown, those that are not there yet."""
+        """Add modes to the dropdown, without duplicates."""
         if not self._modes.keys() >= set(names):
             self._modes |= {name: name for name in names}
             self._mode.options = tuple(self._modes)
 
     def show_angle(self, radians: float) -> None:
-        """Show the camera's angle of view at the slider."""
+        """Set the slider to the camera's angle of view."""
         degrees = float(min(max(round(math.degrees(radians)), MIN_DEGREES), MAX_DEGREES))
         if degrees != self._angle.value:
             self._angle.value = degrees
@@ -129,7 +129,7 @@ PASS_SECONDS = 4.0  # through all moments, at first
 
 
 class MethodControls:
-    """The folder `Controls` in the tab `View` of a client, if the method has any. changed: called when one is moved."""
+    """Folder `Controls` in the tab `View` of a client, if the method has any. changed: called when one is moved"""
 
     def __init__(self, client: Any, shared: Shared, changed: Callable[[], None]):
         controls: Sequence[Control] = shared.method.controls
@@ -146,7 +146,7 @@ class MethodControls:
                     self._playback = Playback(client.gui, handle, control.range)
 
     def stop(self) -> None:
-        """Stop what plays."""
+        """Stop playback."""
         if self._playback is not None:
             self._playback.stop()
 
@@ -157,12 +157,12 @@ class MethodControls:
 
     @property
     def time(self) -> float | None:
-        """The shown moment of a moving scene."""
+        """Current time of a dynamic scene."""
         moment = self._now().get(TIME)
         return None if moment is None else float(moment)
 
     def show_time(self, moment: float) -> None:
-        """Turn the control `time` to a moment, where there is one."""
+        """Set the control `time`, if there is one."""
         if TIME in self._handles:
             self._handles[TIME].value = moment
 
@@ -176,7 +176,7 @@ class MethodControls:
 
 
 class Playback:
-    """Play and pause of a slider of moments: through all of them, again and again."""
+    """Play and pause button of a time slider, in a loop."""
 
     def __init__(self, gui: Any, slider: Any, span: tuple[float, float]):
         self._slider, self._span, self._number = slider, span, 0
@@ -188,7 +188,7 @@ class Playback:
         self._number += 1
 
     def play(self) -> None:
-        """Move the slider until `stop`, or until it is played again; whoever drags it goes on from there."""
+        """Move the slider until `stop` or the next call; dragging it continues from there."""
         self._number += 1
         number, (first, last), before = self._number, self._span, time.perf_counter()
         with suppress(RuntimeError):  # of a slider that is removed meanwhile, with its client

@@ -1,4 +1,4 @@
-"""A client's tab `Crop`: the part of the scene that is shown, floaters that are left out, and the rest saved."""
+"""Tab `Crop` of a client: crop of the scene, floater removal, and saving the rest."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ REMOVE, RESTORE = "Remove floaters", "Bring floaters back"
 
 
 class CropPanel:
-    """The contents of the tab.
+    """Contents of the tab.
 
     changed: called when the crop or the floaters change
-    cleaned: whether floaters are left out
-    keep:    saves the rest under a name and returns its path; None where nothing can be saved
-    notify:  shows the client a title and a text
-    locate:  the point of the scene on a ray from an origin along a direction; None where nothing is
+    cleaned: whether floaters are hidden
+    keep:    saves the rest under a name and returns its path; None if nothing can be saved
+    notify:  notifies the client with a title and a text
+    locate:  first surface point along a ray from an origin in a direction; None for empty space
     """
 
     def __init__(
@@ -93,17 +93,17 @@ class CropPanel:
 
     @property
     def strength(self) -> float:
-        """Strength of floaters that are coloured or left out; 0 for none."""
+        """Strength of floater removal or colouring; 0 for none."""
         return float(self._strength.value)
 
     def remove(self, cleaned: bool) -> None:
-        """Leave the floaters out, or show them coloured."""
+        """Hide the floaters, or colour them."""
         self.cleaned = cleaned
         self._remove.label = RESTORE if cleaned else REMOVE
         self._update()
 
     def fit(self, shape: str | None = None) -> None:
-        """Set sphere and box to the subject of the capture. shape: shown from now on; None leaves it"""
+        """Fit sphere and box to the subject of the capture. shape: becomes visible; None keeps it"""
         middle, radius, lower, upper = self._around_subject()
         self._following = True
         try:
@@ -143,7 +143,9 @@ class CropPanel:
         self._changed()
 
     def _listen(self, wanted: bool) -> None:
-        """Heed clicks in the scene while a crop is shown. viser reports single clicks, and shows a hand meanwhile."""
+        """Handle clicks in the scene while a crop is shown. viser reports single clicks, and shows a hand cursor
+        meanwhile.
+        """
         if wanted and not self._listening:
             self._client.scene.on_click()(self._clicked)
         elif self._listening and not wanted:
@@ -151,7 +153,7 @@ class CropPanel:
         self._listening = wanted
 
     def _clicked(self, event: Any) -> None:
-        """Move the crop's middle to the surface under a double click."""
+        """Move the crop's centre to the surface under a double click."""
         now, place = time.monotonic(), event.screen_pos
         (before, at), self._last_click = self._last_click, (now, place)
         if now - before > DOUBLE_CLICK_SECONDS or math.dist(place, at) > DOUBLE_CLICK_SHIFT:
@@ -170,7 +172,7 @@ class CropPanel:
         self._update()
 
     def _place_handles(self) -> None:
-        """Arrows to drag: at a box's two corners, or at a sphere's middle."""
+        """Drag handles: at a box's two corners, or at a sphere's centre."""
         numbers = {BOX: {"lower": self._lower, "upper": self._upper}, SPHERE: {"middle": self._middle}}
         wanted = numbers.get(self._shape.value, {})
         for name in {"lower", "upper", "middle"} & self._nodes.keys() - wanted.keys():
@@ -190,7 +192,7 @@ class CropPanel:
                 self._nodes[name].position = np.array(number.value)
 
     def _follower(self, number: Any) -> Callable[[Any], Any]:
-        """A callback that copies a handle's position into the panel's numbers, in the order of moves."""
+        """Callback that copies a handle's position to the panel's numbers, in the order of moves."""
 
         async def follow(event: Any) -> None:
             self._following = True

@@ -1,4 +1,4 @@
-"""A client's tab `Export`: the scene, or the visible part of it, in the formats of `lumigraph export`."""
+"""Tab `Export` of a client: the visible scene in the formats of `lumigraph export`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .shared import NAME, NAME_RULE, Exporter, ExportOption
 
 
 class ExportPanel:
-    """The contents of the tab.
+    """Contents of the tab.
 
-    tab:      of viser, where the contents go
-    title:    of the scene, for names of files
-    request:  returns the client's view, whose crop, cleaning and controls are exported
-    notify:   shows the client a title and a text
+    tab:      of viser, parent of the contents
+    title:    of the scene, for file names
+    request:  returns the client's view, with crop, cleaning and controls for the export
+    notify:   notifies the client with a title and a text
     """
 
     def __init__(

@@ -53,7 +53,7 @@ class Guard:
         self._names = own_names(address)
 
     def refusal(self, request: Request) -> str | None:
-        """Why a request gets no answer; None if it does."""
+        """Reason to refuse a request; None to accept it."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self.is_ours(hosts[0]):
             return "This is no address of the viewer; open the one that it printed"
@@ -89,7 +89,7 @@ class Guard:
         return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in tokens)
 
     def answering(self, answer: Answers) -> Answers:
-        """Another server's answers, for those who may have them; 403 for the rest."""
+        """Another server's answers for accepted requests; 403 for the rest."""
 
         async def guarded(connection: Any, request: Request) -> Response | None:
             if why := self.refusal(request):
@@ -112,7 +112,7 @@ def refused(why: str) -> Response:
 
 
 def own_names(address: Address) -> set[str]:
-    """The hosts by which a browser may have found the viewer, as `urlsplit` has them."""
+    """Hosts by which a browser may reach the viewer, as `urlsplit` gives them."""
     names: Iterable[str] = LOOPBACK
     if address.token:
         here = socket.gethostname()
@@ -219,9 +219,9 @@ DECODER = msgspec.msgpack.Decoder(
 
 
 def understood(frame: bytes | str, handle: Callable[[str], Any]) -> bytes | None:
-    """A message as viser may have it; None for messages that our page does not send.
+    """Message after validation; None for messages that our page does not send.
 
-    handle: viser's handle of a part of a panel by its number, None where there is none
+    handle: viser's handle of a panel input by its number, None for no such input
     """
     if not isinstance(frame, bytes):
         return None

@@ -21,11 +21,11 @@ EMPTY_DEPTH = 1e4  # scene units; where nothing is
 def picture(
     rendering: Rendering, camera: Camera, mode: str, rendered: Vector, background: Vector
 ) -> Float[Tensor, "height width 3"]:
-    """A picture of a rendering on the CPU, with values in [0, 1] or to be clipped to it.
+    """A picture of a rendering on the CPU; values may need clipping to [0, 1].
 
     mode:       one of MODES, or the name of an extra
-    rendered:   the background colour it was rendered in front of
-    background: the one it shall have instead, in mode colour
+    rendered:   the background colour of the rendering
+    background: its replacement, in mode colour
     """
     if mode == "colour":
         change = torch.tensor(background) - torch.tensor(rendered)
@@ -43,13 +43,13 @@ def picture(
 
 
 def extra_modes(rendering: Rendering) -> list[str]:
-    """Names of the extras that are modes beside those of every method."""
+    """Names of the extras that are modes of their own."""
     return [name for name in drawable(rendering) if name.lower() not in MODES]
 
 
 def normals(rendering: Rendering, camera: Camera) -> Float[Tensor, "height width 3"]:
-    """Unit normals of what is seen, in the scene's frame, towards the camera: those that the method gives, or else
-    the cross product of how the seen point moves from pixel to pixel."""
+    """Unit normals of the surface, in the scene's frame, towards the camera: the method's, or else cross products of
+    differences between neighbouring surface points."""
     if "normals" in rendering.extra:
         return rendering.extra["normals"]
     height, width = rendering.depth.shape
@@ -59,7 +59,7 @@ def normals(rendering: Rendering, camera: Camera) -> Float[Tensor, "height width
 
 
 def along_axis(rendering: Rendering, camera: Camera) -> Float[Tensor, "height width"]:
-    """Depth along the optical axis, as graphics cards compare it, rather than along each ray."""
+    """Depth along the optical axis, as in a depth buffer, rather than along each ray."""
     return rendering.depth * camera.cosines()
 
 
@@ -90,7 +90,7 @@ def draw_extra(
     """A picture of one drawable extra.
 
     Three channels are colours, clipped to [0, 1]. Numbers are bright where high and dark where low, labels have the
-    palette's colours; both are drawn where the scene is, and labels where they are not negative.
+    palette's colours; both only where the scene is opaque, and labels where they are not negative.
     """
     if not is_plane(values):
         return values.float().nan_to_num(0.0).clamp(0, 1)
@@ -105,13 +105,13 @@ def draw_extra(
 
 
 def heat(values: Float[Tensor, "height width"], among: Bool[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
-    """Colours of numbers along the ramp, whose ends are the 2nd and 98th percentile of those in a mask."""
+    """Colours of numbers along the ramp from their 2nd to their 98th percentile within a mask."""
     low, high = percentiles(values[among])
     return ramp(1 - ((values - low) / max(high - low, 1e-12)).nan_to_num(0.0))
 
 
 def percentiles(values: Float[Tensor, " value"]) -> tuple[float, float]:
-    """The 2nd and the 98th percentile; 0 and 1 of no values."""
+    """The 2nd and the 98th percentile; 0 and 1 for no values."""
     if not len(values):
         return 0.0, 1.0
     some = values[:: -(-len(values) // MAX_QUANTILE_VALUES)]

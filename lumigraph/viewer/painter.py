@@ -1,5 +1,5 @@
-"""Painter: a thread that draws the last request of one client, coarse while its camera moves, finer once it rests.
-Pace: the size of a picture that can be rendered in a given time. MovingPace: the same while the camera moves."""
+"""Painter: rendering thread of one client, coarse while its camera moves, finer at rest.
+Pace: picture size for a given rendering time. MovingPace: the same while the camera moves."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Pace:
         self._noted = False
 
     def note(self, pixels: int, seconds: float) -> None:
-        """Take note of a picture's time. The first is ignored: something may have been compiled for it."""
+        """Record a picture's time. The first is ignored, since it may include compilation."""
         if self._noted:
             n, t = float(pixels), seconds
             self._sums = SMOOTHING * self._sums + np.array([1, n, n * n, t, n * t])
@@ -42,8 +42,9 @@ class Pace:
         return (a, b) if a >= 0 and b > 0 else (0.0, t / n)
 
     def pixels(self, seconds: float) -> float:
-        """Number of pixels that can be rendered in a time. Where most of that time is a picture's fixed
-        cost, half as much again is allowed: a smaller picture would hardly be quicker."""
+        """Number of pixels that can be rendered in a time. Where most of that time is a picture's fixed cost, 1.5 times
+        as long is
+        allowed: a smaller picture would hardly be faster."""
         if self.costs is None:
             return 0.0
         a, b = self.costs
@@ -80,7 +81,7 @@ class MovingPace:
         self._count = 0
 
     def note(self, divisor: int, seconds: float) -> None:
-        """Take note of a picture's time. The first is ignored: something may have been compiled for it."""
+        """Record a picture's time. The first is ignored, since it may include compilation."""
         self._count += 1
         if self._count > 1:
             before = self._seconds.get(divisor, seconds)
@@ -99,8 +100,8 @@ class MovingPace:
         return next(k for k in possible if expected[k] <= (FRAME_SECONDS if k == 1 else most) or k == possible[-1])
 
     def _expected(self, divisor: int) -> float:
-        """Seconds of a picture: as measured, on a line through those of other numbers of pixels, or in proportion to
-        the side of the only size that was measured."""
+        """Expected seconds of a picture: as measured, interpolated by number of pixels, or extrapolated from a single
+        size in proportion to its side."""
         if divisor in self._seconds:
             return self._seconds[divisor]
         sizes, seconds = 1 / np.array([*self._seconds]) ** 2.0, np.array([*self._seconds.values()])
@@ -114,12 +115,12 @@ Draw = Callable[[float, Callable[[], bool]], bool]
 
 
 class Painter:
-    """A thread that draws. The last request counts; a picture at rest is abandoned when another request comes.
+    """Rendering thread. Only the last request counts; a picture at rest is abandoned when another request comes.
 
-    draw:  draw(seconds, wanted) shows the best picture that should take so many seconds and returns True if no better
+    draw:  draw(seconds, wanted) shows the best picture that takes about so many seconds and returns True if no better
            one is possible; it raises NotWantedError as soon as wanted() is false
     fault: called with each exception
-    step:  returns the step to which the method has been trained; pictures of an earlier step are stale
+    step:  returns the training step of the method; pictures of an earlier step are stale
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class Painter:
         self._thread.start()
 
     def request(self) -> None:
-        """Request a new picture; what is being drawn is out of date."""
+        """Request a new picture; the one in progress is outdated."""
         self.settled.clear()
         self._requested, self._when = self._requested + 1, time.perf_counter()
         self._wake.set()
@@ -166,7 +167,7 @@ class Painter:
                 self._sleep(self._turns.until_refresh())
 
     def _refine(self, requested: int) -> bool:
-        """Draw better pictures one after the other; whether the best was reached before another request came."""
+        """Render progressively better pictures; returns whether the best was reached before another request came."""
         for seconds in dict.fromkeys([RESTING_SECONDS, self._longest]):
             if self._try(seconds, self._while_current(requested)):
                 return True
@@ -180,7 +181,7 @@ class Painter:
 
     @property
     def _longest(self) -> float:
-        """Seconds that a picture at rest may take: limited while training, when it is soon out of date."""
+        """Largest rendering time of a picture at rest, in seconds: limited while training, when it is soon outdated."""
         return RESTING_SECONDS if self._turns.training and not self._turns.paused else NO_DEADLINE
 
     def _try(self, seconds: float, wanted: Callable[[], bool]) -> bool:

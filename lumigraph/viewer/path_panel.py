@@ -1,4 +1,4 @@
-"""A client's tab `Path`: keyframes set from its camera, played, saved, and opened again."""
+"""Tab `Path` of a client: keyframes from its camera, playback, saving and loading."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Stop:
 
 
 class PathPanel:
-    """The keyframes of one client. notify: shows the client a title and a text."""
+    """Keyframes of one client. notify: notifies the client with a title and a text"""
 
     def __init__(
         self, client: Any, shared: Shared, flight: Flight, controls: MethodControls, notify: Callable[[str, str], None]
@@ -82,7 +82,7 @@ class PathPanel:
         return list(self._chosen.options).index(self._chosen.value) if self._stops else -1
 
     def path(self) -> CameraPath:
-        """The camera path that is set now. Raises LumigraphError if it has no keyframe."""
+        """Current camera path. Raises LumigraphError without a keyframe."""
         seconds, keys = 0.0, []
         timed = all(stop.key.time is not None for stop in self._stops)  # keyframes of a still scene have no time
         for stop in self._stops:
@@ -164,7 +164,7 @@ class PathPanel:
     def _views(
         self, path: CameraPath, frames: int
     ) -> tuple[Float[np.ndarray, "frame 3 4"], list[float], list[float] | None]:
-        """Poses in the scene's frame, vertical angles for this client's window, and moments where the path has them."""
+        """Poses in the scene's frame, vertical angles for this client's window, and times if the path has them."""
         camera = self._client.camera
         size = (max(1, int(camera.image_width)), max(1, int(camera.image_height)))
         cameras = path.cameras(self._subject.frame, size, frames)
@@ -174,7 +174,7 @@ class PathPanel:
         return cameras.pose.double().numpy(), angles.tolist(), moments
 
     def _fill(self, at: int) -> None:
-        """Show the keyframes in the panel, number `at` chosen."""
+        """Show the keyframes in the panel, with number `at` selected."""
         self._filling = True
         try:
             seconds, names = 0.0, []
@@ -260,7 +260,7 @@ class PathPanel:
 
 
 def code(text: str) -> str:
-    """Text that Markdown shows as it is: between more backticks than it has in a row itself."""
+    """Text as a Markdown code span, with enough backticks around it."""
     fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
     return f"{fence} {text} {fence}" if "`" in text else f"`{text}`"
 
@@ -270,7 +270,7 @@ def source_from_scene(frame: Frame) -> Float[Tensor, "4 4"]:
 
 
 def moved(poses: Float[Tensor, "pose 3 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "pose 3 4"]:
-    """Camera-to-world poses in another frame, as `Camera.transformed` moves them."""
+    """Camera-to-world poses in another frame, as in `Camera.transformed`."""
     count = len(poses)
     lens, size = Pinhole(torch.ones(count, 2), torch.ones(count, 2)), torch.ones(count, 2, dtype=torch.long)
     return Camera(poses, lens, size).transformed(similarity).pose

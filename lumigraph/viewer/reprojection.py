@@ -1,5 +1,5 @@
-"""Reprojection: a small picture of a moving camera, with the detail of the last sharp one wherever both show the same
-surface (the reverse reprojection cache of Nehab 2007, with a small picture in place of the shader)."""
+"""Reprojection: a small picture of a moving camera, with the detail of the last sharp one on common visible surfaces
+(the reverse reprojection cache of Nehab 2007, with a small picture in place of the shader)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAST = {"cache": True, "fastmath": {"contract", "nsz"}, "error_model": "numpy"}
 
 @dataclass(frozen=True)
 class SharpPicture:
-    """A picture that was drawn at rest, its depth along rays, its camera, and all settings that it depends on."""
+    """A picture rendered at rest, its depth along rays, its camera, and its settings."""
 
     picture: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
@@ -35,10 +35,10 @@ class SharpPicture:
 def sharpened(
     small: Float[Tensor, "rows columns 3"], depth: Float[Tensor, "rows columns"], camera: Camera, sharp: SharpPicture
 ) -> Float[Tensor, "height width 3"]:
-    """Picture at the camera's own size from a smaller one of the same view and the sharp picture of another.
+    """Picture at the camera's full size from a smaller one of the same view and the sharp picture of another.
 
-    A pixel has the colour of the sharp picture where one of the four pixels around it in the small one lies on the same
-    surface, else the small picture's, interpolated.
+    A pixel has the colour of the sharp picture if one of the four small pixels around it shows the same surface, else
+    the small picture's, interpolated.
     """
     width, height = camera.size[0].tolist()
     found = torch.empty(height, width, 3)
@@ -49,7 +49,7 @@ def sharpened(
 
 
 def numbers(camera: Camera) -> tuple[Float[Tensor, "3 4"], Float[Tensor, " 4"]]:
-    """Pose, and focal lengths and centre, of one camera behind a pinhole."""
+    """Pose, focal lengths and centre of one pinhole camera."""
     lens = camera.lens
     assert isinstance(lens, Pinhole)
     return camera.pose[0].float(), torch.cat([lens.focal[0], lens.centre[0]]).float()
@@ -79,7 +79,7 @@ def _point(x, y, distance, pose, lens):
 
 @njit(inline="always")
 def _blend(picture, x, y, out):
-    """Bilinear interpolation at pixel coordinates (x, y), whose edges repeat."""
+    """Bilinear interpolation at pixel coordinates (x, y), clamped at the border."""
     height, width = picture.shape[:2]
     x, y = x - np.float32(0.5), y - np.float32(0.5)
     j, i = int(math.floor(x)), int(math.floor(y))
@@ -94,7 +94,9 @@ def _blend(picture, x, y, out):
 
 @njit(inline="always")
 def _found(x, y, distance, depth, sharp_pose, sharp_lens, pose, lens):
-    """Place in the sharp picture of the surface at a distance along the ray of (x, y), and True if it shows that."""
+    """Pixel coordinates in the sharp picture of the surface at a distance along the ray of (x, y), and True if it is
+    visible there.
+    """
     far = not distance < FAR
     point = _point(x, y, min(distance, FAR), pose, lens)
     u, v, z, expected = _seen_at(point, sharp_pose, sharp_lens)

@@ -1,4 +1,4 @@
-"""A client's tab `Measure`: distance of two points that are clicked, and the unit of exports by a known length."""
+"""Tab `Measure` of a client: distance of two clicked points, and the unit of exports by a known length."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MEASURE, FIRST, SECOND = "Measure", "Click the first point in the scene", "Click
 
 
 class RulerPanel:
-    """The contents of the tab.
+    """Contents of the tab.
 
-    locate: the point of the scene on a ray from an origin along a direction; None where nothing is
-    drawn:  called when points appear or go
-    notify: shows the client a title and a text
+    locate: first surface point along a ray from an origin in a direction; None for empty space
+    drawn:  called when points appear or disappear
+    notify: notifies the client with a title and a text
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class RulerPanel:
         self._show()
 
     def clicked(self, event: Any) -> None:
-        """Take a point where a click's ray meets the scene; the second one ends the measurement."""
+        """Add the surface point under a click; the second one completes the measurement."""
         found = self._locate(event.ray_origin, event.ray_direction)
         if found is None:
             self._notify("Nothing is there", "Click something solid")

@@ -1,4 +1,4 @@
-"""Scenery: the photographs' cameras and the sparse points, drawn beside the scene for all clients alike."""
+"""Scenery: the photographs' cameras and the sparse points, drawn for all clients."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ MIN_FRUSTUM_SHARE, MAX_FRUSTUM_SHARE = 0.03, 0.05  # of the distance to the midd
 
 
 class Scenery:
-    """Frusta of the cameras from the beginning; thumbnails and points once the photographs have been opened.
+    """Camera frusta, at first alone; thumbnails and points after the photographs are opened.
 
     server:   viser's
     cameras:  by split
-    clicked:  called with a client and the camera that it clicked on
+    clicked:  called with a client and the clicked camera
     """
 
     def __init__(self, server: Any, cameras: dict[str, Camera], clicked: Callable[[Any, Camera], None]):
@@ -50,7 +50,7 @@ class Scenery:
         self._positions = Camera.cat([group[::step] for group in cameras.values()]).position.cpu().double()
 
     def around(self, place: tuple[float, ...]) -> set[str]:
-        """Names of the frusta so near to a place that they would hide the view from it."""
+        """Names of the frusta so close to a position that they would occlude its view."""
         distance = (self._positions - torch.tensor(place, dtype=torch.double)).norm(dim=-1)
         return {self._names[i] for i in (distance < MIN_THUMBNAIL_DISTANCE * self.size).nonzero()[:, 0].tolist()}
 
@@ -73,7 +73,7 @@ class Scenery:
             self._frusta[int(camera.image_index[0])] = frustum
 
     def fill(self, open_scene: Callable[[], Scene], done: Callable[[str | None], None]) -> None:
-        """Open the photographs in the background and show them. done: called with the fault, or None."""
+        """Open the photographs in the background and show them. done: called with the fault, or None"""
 
         def work() -> None:
             try:
@@ -89,7 +89,7 @@ class Scenery:
         threading.Thread(target=work, name="photographs", daemon=True).start()
 
     def stop(self) -> None:
-        """Drop what is still being opened."""
+        """Cancel opening."""
         self._stopped = True
 
     def show(self, scene: Scene) -> None:
@@ -113,7 +113,7 @@ class Scenery:
 
 
 def frustum_size(cameras: Camera) -> float:
-    """Size of a frustum in scene units, at which neighbours do not cover each other."""
+    """Size of a frustum in scene units, without overlaps of neighbours."""
     position = cameras.position.cpu().double()
     distance = torch.cdist(position, position)
     spread = float((position - position.median(0).values).norm(dim=-1).median())
@@ -123,7 +123,7 @@ def frustum_size(cameras: Camera) -> float:
 
 
 def thumbnail(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "_ _ 3"]:
-    """A photograph at most THUMBNAIL pixels long, as bytes."""
+    """A photograph's thumbnail, at most THUMBNAIL pixels long, as bytes."""
     height, width, _ = rgb.shape
     share = min(1.0, THUMBNAIL / max(height, width))
     small = (max(1, round(share * height)), max(1, round(share * width)))

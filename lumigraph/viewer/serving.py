@@ -1,4 +1,4 @@
-"""viser's server behind a guard, which checks connections and messages."""
+"""viser's server behind a guard that checks connections and messages."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _patching = threading.Lock()
 
 
 def start_server(address: Address, title: str, page: Callable[[], bytes] | None = None) -> Any:
-    """viser's server, at this address and nowhere else. Raises LumigraphError if the port has just been taken.
+    """Start viser's server at exactly this address. Raises LumigraphError if the port is no longer free.
 
-    page: makes what is answered at PAGE
+    page: makes the response at PAGE
     """
     door = Door(address, page)
     with quiet(), door.built_in():
@@ -53,7 +53,7 @@ class Door:
 
     @contextlib.contextmanager
     def built_in(self) -> Iterator[None]:
-        """Inside this block a server of websockets that is started gets the door; one must be."""
+        """Block in which a started websocket server gets the guard; exactly one must be started."""
         module, built = websockets.asyncio.server, []
         begin = module.serve
 
@@ -101,13 +101,13 @@ class Door:
         return None
 
     def _swallow(self, loop: asyncio.AbstractEventLoop, fault: dict[str, Any]) -> None:
-        """Suppress the traceback of a client's fault, unless LUMIGRAPH_DEBUG is set."""
+        """Suppress the traceback of a client's error, unless LUMIGRAPH_DEBUG is set."""
         if os.environ.get("LUMIGRAPH_DEBUG"):
             loop.default_exception_handler(fault)
 
 
 def beside(answer: Answers, page: Callable[[], bytes] | None) -> Answers:
-    """viser's answers, and at PAGE a page that is made at the first request."""
+    """viser's responses, and at PAGE a page that is made on first request."""
     if page is None:
         return answer
     once = functools.cache(page)
@@ -133,7 +133,7 @@ def silent_logger() -> logging.Logger:
 
 
 class quiet:  # noqa: N801
-    """A block in which viser prints no greeting to stdout, where our results go."""
+    """Block in which viser prints no greeting to stdout, which is for our results."""
 
     def __enter__(self) -> None:
         self._before, rich.get_console().quiet = rich.get_console().quiet, True

@@ -1,4 +1,4 @@
-"""Subject: a scene as the viewer needs it. Shared: the state that all clients have in common."""
+"""Subject: the viewer's view of a scene. Shared: state common to all clients."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ExportOption:
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format: the usual ending of its files, its description, its options."""
+    """A format: the usual suffix of its files, its description, its options."""
 
     ending: str
     about: str
@@ -67,7 +67,7 @@ class Exporter:
 
     formats: by name
     command: command line of an export, from the format's name, the file's name, options and a client's view
-    run:     runs it, calls a function with each line of progress, and returns the result in words; it raises
+    run:     runs an export with a callback for lines of progress, and returns the result as text; it raises
              LumigraphError if the export fails
     """
 
@@ -78,21 +78,21 @@ class Exporter:
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene as the viewer needs it.
+    """A scene in the viewer.
 
     title:          shown above the controls
     cameras:        of the photographs, by split, in the scene's frame
-    paths:          folder that camera paths are saved in
+    paths:          folder of saved camera paths
     render_command: command line that renders films of the scene, without `--path`
-    open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
-    rows:           of metrics.jsonl, as far as the method has been trained
-    keep:           saves the cloud without some Gaussians under a name, and returns its path; None where nothing can be
+    open_scene:     opens the photographs, for thumbnails and sparse points; None without photographs
+    rows:           of metrics.jsonl, up to the trained step
+    keep:           saves the cloud without some Gaussians under a name, and returns its path; None if nothing can be
                     saved
-    part_ending:    of the name that is offered for a part: empty for a new run, which has cameras and background too
-    page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
-    behind:         colours and floor of a scene under the open sky
-    exporter:       exports the scene; None where nothing can be exported
-    set_scale:      remembers units of exports to a unit of the photographs' frame; None in training
+    part_ending:    suffix of the suggested name of a part: empty for a new run, which has cameras and background too
+    page:           makes a page (HTML) that renders the scene in the browser; None for server-side rendering only
+    behind:         sky colours and floor of an unbounded scene
+    exporter:       exports the scene; None if nothing can be exported
+    set_scale:      stores units of exports per unit of the photographs' frame; None in training
     """
 
     title: str
@@ -116,7 +116,7 @@ class Subject:
 
     @cached_property
     def opening(self) -> Opening:
-        """Camera that every client begins with, and the limits of its movement: those of `lumigraph export web`."""
+        """Initial camera of every client, and the limits of its movement: those of `lumigraph export web`."""
         return opening_of_scene(self.title, self.cameras["train"].to("cpu"), self.frame, behind=self.behind)
 
     def distance(self, camera: Camera) -> float:
@@ -127,12 +127,12 @@ class Subject:
 
 @dataclass
 class Shared:
-    """The method, the server, and what every client sees alike. The viewer makes it; each visitor reads it.
+    """State common to all clients: the method and the server. The viewer makes it; each visitor reads it.
 
     is_cloud:           whether the method has Gaussians
     server:             viser's
-    tabs:               by name, where each client's own controls go
-    step:               to which the method has been trained
+    tabs:               by name, for each client's own controls
+    step:               trained step of the method
     stopped:            whether the viewer has ended
     """
 
@@ -149,8 +149,8 @@ class Shared:
     _evidence: tuple[Any, FloaterEvidence] | None = None  # of the last cloud, in the same way
 
     def cloud(self, request: ViewRequest) -> Gaussians:
-        """Gaussians of the method with the controls, crop and cleaning of a client; floaters that are not left out are
-        coloured. Raises LumigraphError if it has none. Call it inside `turns.turn`."""
+        """Gaussians of the method with the controls, crop and cleaning of a client; visible floaters are coloured.
+        Raises LumigraphError without Gaussians. Call it inside `turns.turn`."""
         cloud = needs(self._given(request), HasGaussians).gaussians()
         if not request.part:
             return cloud
@@ -163,7 +163,7 @@ class Shared:
         return self._picked[1]
 
     def forget(self) -> None:
-        """Drop what was computed for clients, and give its memory back to the system."""
+        """Free the data cached for clients."""
         self._picked = self._evidence = None
         give_back_memory()
 
@@ -174,7 +174,9 @@ class Shared:
         return unwanted(cloud, request.crop, max_scale, self.floaters(request) if request.cleaned else None)
 
     def floaters(self, request: ViewRequest) -> Bool[Tensor, " gaussian"] | None:
-        """Mask of floaters at a client's strength; None at 0. Evidence takes seconds, once for each cloud."""
+        """Mask of floaters at a client's strength; None at 0. Evidence takes seconds, and is computed once for each
+        cloud.
+        """
         if not request.strength:
             return None
         wanted = self.step, request.settings
@@ -221,8 +223,8 @@ TOLERANCE = 0.01  # of the crop's size: an expected depth may lie so far outside
 def render_inside(method: Method, camera: Camera, crop: Crop) -> Rendering:
     """Rendering of the inside of a crop, for a method without Gaussians.
 
-    Rays of a RayMethod begin where they enter the crop, so nothing in front of it is seen. Pixels whose expected depth
-    lies behind the crop are removed; for all other methods, also those in front of it. Where something see-through
+    Rays of a RayMethod begin at their entry into the crop, so everything in front is hidden. Pixels with an expected
+    depth behind the crop are removed; for all other methods, also those in front of it. Where something translucent
     inside is in front of something solid outside, their mean depth decides.
     """
     frame = method.frame
@@ -246,7 +248,7 @@ def render_inside(method: Method, camera: Camera, crop: Crop) -> Rendering:
 
 
 def kept(values: Shaped[Tensor, "*all"], where: Bool[Tensor, "*pixels"]) -> Shaped[Tensor, "*all"]:
-    """An extra's values at the pixels of a mask, zeros elsewhere."""
+    """Values of an extra within a mask, zeros elsewhere."""
     where = where.reshape(*where.shape, *(1,) * (values.ndim - where.ndim))
     return torch.where(where, values, torch.zeros_like(values))
 

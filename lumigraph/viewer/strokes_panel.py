@@ -1,4 +1,4 @@
-"""A client's tab `Select`: strokes on the view mark a part of the scene, which is shown in colour and saved."""
+"""Tab `Select` of a client: strokes on the view select a part of the scene, which is coloured and saved."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ ABOUT = "Click along the object. Clicks of one stroke are joined; another kind, 
 
 
 class StrokesPanel:
-    """The contents of the tab.
+    """Contents of the tab.
 
     request: the client's current view
-    drawn:   called when the shown part changes
-    keep:    saves the cloud without some Gaussians under a name; None where nothing can be saved
-    notify:  shows the client a title and a text
+    drawn:   called when the selected part changes
+    keep:    saves the cloud without some Gaussians under a name; None if nothing can be saved
+    notify:  notifies the client with a title and a text
     """
 
     def __init__(
@@ -98,12 +98,12 @@ class StrokesPanel:
         return self._selection
 
     async def _queue_click(self, event: Any) -> None:
-        """Answer a click after those before it; viser would answer each in a thread of its own, in any order."""
+        """Process clicks in order; viser would handle each in a thread of its own, in any order."""
         async with self._clicks:
             await asyncio.to_thread(self.clicked, event)
 
     def clicked(self, event: Any) -> None:
-        """Add a click to the strokes: a dab, or the line from the last click of the same kind on the same view."""
+        """Add a click to the strokes: a dot, or a line from the last click of the same kind on the same view."""
         request, kind = self._request(), self._kind.value
         with self._working:
             try:
@@ -132,7 +132,7 @@ class StrokesPanel:
         return Strokes(request.camera((width, height)), stroke if wanted else none, none if wanted else stroke)
 
     def undo(self) -> None:
-        """Take the last click back."""
+        """Undo the last click."""
         with self._working:
             if self._selection is not None:
                 self._selection.undo()
@@ -140,7 +140,7 @@ class StrokesPanel:
                 self._update()
 
     def _update(self) -> None:
-        """Show the part as points."""
+        """Show the selected part as points."""
         assert self._selection is not None
         self._part = self._selection.chosen()
         self._undo.visible = len(self._selection) > 0

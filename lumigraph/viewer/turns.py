@@ -1,4 +1,4 @@
-"""Turns: renderings and training that share one method, one at a time."""
+"""Turns: mutual exclusion of renderings and training on one method."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ POLL_SECONDS = 0.1  # seconds between checks whether to stop waiting
 
 
 class NotWantedError(Exception):
-    """A rendering that was waiting or under way is not wanted any more."""
+    """A waiting or running rendering is obsolete."""
 
 
 class Turns:
-    """A queue of renderings, served in the order of requests. Training has the method by default and gives way between
-    steps, never so often that renderings take more than their share of the time.
+    """Fair queue of renderings. Training owns the method by default and yields between steps, so that renderings get at
+    most their share of the time.
 
-    training:   whether someone trains; `give_way` must then be called between steps, until `end_training`
-    idle_share: of the time that clients at rest may take from training: `Method.idle_render_share`
+    training:   whether training is in progress; `give_way` must then be called between steps, until `end_training`
+    idle_share: share of the time for clients at rest: `Method.idle_render_share`
     rendered:   seconds of all turns so far, without waiting for them
     """
 
@@ -38,7 +38,7 @@ class Turns:
 
     @contextlib.contextmanager
     def turn(self, wanted: Callable[[], bool] = lambda: True) -> Iterator[None]:
-        """Wait for the method and keep others from it. Raises NotWantedError once `wanted()` is false while waiting."""
+        """Wait for exclusive use of the method. Raises NotWantedError if `wanted()` becomes false while waiting."""
         ticket = object()
         with self._condition:
             self._waiting.append(ticket)
@@ -65,13 +65,13 @@ class Turns:
 
     @property
     def asked(self) -> bool:
-        """True if training must give way: a rendering waits and training had its share, or it is paused."""
+        """True if training must yield: a rendering waits and training had its share, or it is paused."""
         return self.paused or bool(self._waiting) and time.perf_counter() >= self._own_until
 
     def give_way(self, stopping: Callable[[], object] = lambda: False) -> None:
-        """Let the rendering that has waited longest have its turn; while paused, all of them. Called between two steps.
+        """Yield to the rendering that has waited longest; while paused, to all. Called between two steps.
 
-        stopping: whether training should not be held up any longer
+        stopping: true if training must not wait any longer
         """
         with self._condition:
             before, self._open = self._served, True
@@ -83,13 +83,13 @@ class Turns:
             self._open = False
 
     def end_training(self) -> None:
-        """Leave the method to renderings from now on."""
+        """End training; the method is free for renderings."""
         with self._condition:
             self.training = self.paused = False
             self._condition.notify_all()
 
     def claim_refresh(self) -> bool:
-        """True if a client at rest may render again after training steps; other clients then wait until `refreshed`."""
+        """True if a client at rest may refresh after training steps; other clients then wait until `refreshed`."""
         with self._condition:
             if self.training and not self.paused and time.perf_counter() < self._idle_until:
                 return False
@@ -97,11 +97,11 @@ class Turns:
             return True
 
     def refreshed(self, seconds: float) -> None:
-        """Take note of a refresh that is over, and of how long it rendered."""
+        """Record the end of a refresh, and its rendering time."""
         with self._condition:
             self._idle_until = time.perf_counter() + seconds / self._idle_share
 
     def until_refresh(self) -> float:
-        """Seconds after which a client at rest claims its next refresh."""
+        """Seconds until a client at rest may refresh again."""
         least, longest = REFRESH_SECONDS
         return min(max(self._idle_until - time.perf_counter(), least), longest)

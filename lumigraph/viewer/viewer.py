@@ -1,4 +1,4 @@
-"""Viewer: a server that shows a scene to any number of browsers. TrainingPanel: its tab of training."""
+"""Viewer: a server that shows a scene to any number of browsers. TrainingPanel: its training tab."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TITLES: dict[Measure, str] = {"psnr": "PSNR of training photographs", "loss": "L
 
 
 class TrainingPanel:
-    """The panel, made inside its tab. rows: of metrics.jsonl, from earlier sittings."""
+    """Training panel, made inside its tab. rows: of metrics.jsonl, from earlier sessions"""
 
     def __init__(self, server: Any, turns: Turns, rows: list[dict[str, Any]]):
         self._gui, self._turns = server.gui, turns
@@ -55,7 +55,7 @@ class TrainingPanel:
         self._button.on_click(lambda _: self._toggle())
 
     def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
-        """Take note of a step that is done. row: its line of metrics.jsonl, empty if it has none."""
+        """Record a completed step. row: its line of metrics.jsonl, empty if it has none"""
         if not row:
             return
         if not self._rows and self._measure != (measure := measure_of([row])):
@@ -68,7 +68,7 @@ class TrainingPanel:
             self._draw()
 
     def end(self) -> None:
-        """Show that training is over."""
+        """Show the end of training."""
         self._button.visible = False
         self._status.content = f"Done · {describe(self._rows)}" if self._rows else "Done"
         self._draw()
@@ -92,7 +92,7 @@ def measure_of(rows: list[dict[str, Any]]) -> Measure:
 
 
 def series(measure: Measure) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The axes of the plot, as uPlot takes them."""
+    """Axes of the plot for uPlot."""
     return {"label": "seconds"}, {"label": "dB" if measure == "psnr" else "loss", "stroke": INK, "width": 2}
 
 
@@ -104,7 +104,7 @@ def describe(rows: list[dict[str, Any]]) -> str:
 
 
 def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
-    """Seconds and PSNR or loss of the curve: means over stretches of steps, at most CURVE_POINTS of them."""
+    """Seconds and PSNR or loss of the curve: means over intervals of steps, at most CURVE_POINTS of them."""
     if not rows:
         return np.zeros(1), np.zeros(1)
     table = np.array(rows)
@@ -130,18 +130,18 @@ if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
 
 
 def prepare_window(gui: Any, title: str) -> None:
-    """Name the tab after the scene; fold the panel of small windows once, and make it as wide as they are.
+    """Set the title of the browser tab; collapse the panel in small windows once, and make it as wide as they are.
 
     gui: viser's, of the server
 
-    viser has no option for any of it. A hidden picture that fails to load runs a line of JavaScript instead.
+    viser has no option for this. A hidden picture that fails to load runs a line of JavaScript instead.
     """
     script = SCRIPT.format(title=json.dumps(title), narrow=NARROW_WINDOW_PIXELS)
     gui.add_html(f'<img hidden alt="" src="data:," onerror="{escape(script)}">', order=1e9)
 
 
 class Viewer:
-    """A server that answers from the moment it is made until `stop`, from threads of its own.
+    """Server that runs from construction until `stop`, in threads of its own.
 
     training: whether `fit(..., watch=viewer)` will train the method, taking turns with the clients
 
@@ -175,7 +175,7 @@ class Viewer:
             self._scenery.fill(subject.open_scene, self._filled)
 
     def _aim(self) -> None:
-        """Set the look of the page, and the camera that every client begins with."""
+        """Set the appearance of the page, and the initial camera of every client."""
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         prepare_window(server.gui, subject.title)
@@ -190,7 +190,7 @@ class Viewer:
 
     @property
     def asked(self) -> bool:
-        """True if training must give way to a rendering."""
+        """True if training must yield to a rendering."""
         return self.turns.asked
 
     def give_way(self, stopping: Callable[[], object]) -> None:
@@ -198,13 +198,13 @@ class Viewer:
         self.turns.give_way(stopping)
 
     def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
-        """Take note of a step that is done. row: its line of metrics.jsonl, empty if it has none."""
+        """Record a completed step. row: its line of metrics.jsonl, empty if it has none"""
         self._shared.step = step
         if self._panel is not None:
             self._panel.note(step, progress, row)
 
     def end_training(self) -> None:
-        """Take note that the method does not change any more."""
+        """End training; the method does not change any more."""
         self.turns.end_training()
         if self._panel is not None:
             self._panel.end()
@@ -256,7 +256,7 @@ class Viewer:
             visitor.stop()
 
     def _forget(self) -> None:
-        """Give back what was kept for clients, if there still is none."""
+        """Free the data cached for clients, if none is connected."""
         if not self._everyone():
             self._shared.forget()
 

@@ -57,7 +57,7 @@ Wanted = Callable[[], bool]
 
 
 class Visitor:
-    """A connected client: made when it has come, stopped when it has left."""
+    """A connected client: made on connection, stopped on disconnection."""
 
     def __init__(self, shared: Shared, client: Any):
         self._shared, self._client = shared, client
@@ -107,7 +107,7 @@ class Visitor:
             self._client.add_notification(title, text, auto_close_seconds=8.0)
 
     def offer_points(self) -> None:
-        """Offer the sparse points, once there are any, and let crops begin by them."""
+        """Offer the sparse points, once available, also for fitting crops."""
         if self._shared.scenery.points is not None:
             self.controls.offer_points()
             if self.crop.crop is None:
@@ -123,9 +123,9 @@ class Visitor:
         self.flight.fly(opening.pose, opening.distance, self._first_angle)
 
     def _return(self) -> None:
-        """Fly back to within the opening's limits from where a client has moved beyond them.
+        """Fly back within the opening's limits after a client has moved beyond them.
 
-        A camera that was placed beyond them, as at a photograph, may stay as far beyond.
+        A camera placed beyond them, as at a photograph, may stay as far beyond.
         """
         opening, camera = self._shared.subject.opening, self._client.camera
         if self.flight.flying or not (self._arrived and self.controls.stays and self._here):
@@ -141,12 +141,12 @@ class Visitor:
                 self.notify("Nothing was photographed from there", LIMIT_NOTE)
 
     def fly_to(self, camera: Camera, distance: float) -> None:
-        """Fly to where a photograph was taken, with an angle of view that shows all of it."""
+        """Fly to a photograph's camera, with an angle of view that contains all of it."""
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
 
     def _keep(self, name: str) -> str:
-        """Save what is left of the cloud. Raises LumigraphError if it cannot be."""
+        """Save the remaining cloud. Raises LumigraphError if that fails."""
         assert self._shared.subject.keep is not None
         with self._shared.turns.turn():
             return self._shared.subject.keep(name, self._shared.unwanted(self.request()))
@@ -156,7 +156,7 @@ class Visitor:
         return self._shared.connected(self._client)
 
     async def _moved(self, camera: Any) -> None:
-        """Request a picture from the camera's new position. It runs in the server's thread, so it must be quick."""
+        """Request a picture from the camera's new pose. It runs in the server's thread, so it must be fast."""
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
@@ -187,11 +187,11 @@ class Visitor:
 
     @property
     def selected(self) -> bool:
-        """True if a part that strokes select is shown."""
+        """True if a part selected by strokes is shown."""
         return self.strokes is not None and self.strokes.drawn
 
     def locate(self, origin: Vector, direction: Vector) -> Vector | None:
-        """The point of the visible scene that a ray meets first: the median depth of a few pixels around it."""
+        """First visible surface point along a ray: the median depth of a few pixels around it."""
         pose = look_at(torch.tensor([origin]), torch.tensor([direction]), torch.tensor([0.0, 0.01, 1.0]))
         request = self.request()
         focal = 0.5 * request.full[1] / math.tan(0.5 * request.angle)
@@ -206,7 +206,7 @@ class Visitor:
         return x, y, z
 
     def _draw(self, seconds: float, wanted: Wanted) -> bool:
-        """Show the best picture that can be drawn in a time; returns whether no better one is possible."""
+        """Show the best picture that can be rendered in a time; returns whether no better one is possible."""
         request = self.request()
         self._step_out(tuple(row[3] for row in request.pose))
         by_browser = self._shared.is_cloud and request.mode == "colour" and not request.exact
@@ -239,7 +239,7 @@ class Visitor:
     def _begins(self, request: ViewRequest) -> bool:
         """True until the client first moves or changes the scene, unless it is in training.
 
-        A slow browser draws its first splats after many seconds. Until then it shows our rendering behind them.
+        A slow browser takes many seconds to draw its first splats. Until then it shows our rendering behind them.
         """
         here = self._at_opening(request.pose)
         changed = request.part or bool(request.settings) or self._shared.turns.training
@@ -248,12 +248,12 @@ class Visitor:
         return here and not self._left
 
     def _at_opening(self, pose: tuple[tuple[float, ...], ...]) -> bool:
-        """True for the pose that every client begins with. A browser may report another one before it has that."""
+        """True for the initial pose of every client. A browser may report another one first."""
         return bool(np.abs(np.array(pose) - self._shared.subject.opening.pose).max() < PLACE_TOLERANCE)
 
     def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
-        """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon. A cloud is
-        drawn in one, because each would project all Gaussians."""
+        """A rendering and its camera, in bands so that others get turns and it can be cancelled soon. A cloud is
+        rendered in one, because each band would project all Gaussians."""
         camera, (width, height) = request.camera(size), size
         band = max(MIN_BAND_ROWS, int(self._bands.pixels(MOVING_SECONDS)) // width)
         band = height if self._shared.is_cloud or band >= 0.7 * height else band
@@ -289,8 +289,8 @@ class Visitor:
         request: ViewRequest,
         moving: bool,
     ) -> Float[Tensor, "rows columns 3"]:
-        """A moving picture, with the detail of the last one at rest if it is much smaller than that. One at rest is
-        kept for that."""
+        """A moving picture with reprojected detail of the last one at rest, if that is much larger. One at rest is
+        stored for that."""
         settings = self._shared.step, replace(request, pose=(), angle=0.0, depth=False)
         if not moving:
             self._sharp = SharpPicture(shown, depth, camera, settings)
@@ -305,7 +305,7 @@ class Visitor:
         self._client.scene.set_background_image(pixels, "jpeg", jpeg_quality=quality, depth=depth)
 
     def _draw_splats(self, request: ViewRequest, seconds: float, wanted: Wanted, still: bool) -> bool:
-        """Send the browser what it needs to draw the cloud itself; returns whether that is up to date.
+        """Send the browser the cloud for its own rendering; returns whether that is up to date.
 
         still: whether a rendering is the background, instead of a colour
         """
@@ -344,7 +344,7 @@ class Visitor:
         self._say(f"{len(cloud):,} Gaussians, drawn by the browser{found}")
 
     def _recolour(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
-        """Send the colours seen from where the eye rests now."""
+        """Send the view-dependent colours for the current eye at rest."""
         with self._shared.turns.turn(wanted):
             cloud = self._shared.cloud(request)
             if cloud.degree == 0 or len(cloud) > MAX_RECOLOURED_GAUSSIANS:
@@ -354,7 +354,7 @@ class Visitor:
             self._splats.rgbs = rgb
 
     def _step_out(self, eye: tuple[float, ...]) -> None:
-        """Hide frusta that the eye is in, from this client alone, by nodes of its own in the same places."""
+        """Hide frusta around the eye from this client alone, by nodes of its own at the same positions."""
         near = self._shared.scenery.around(eye) if self._here else set(self._hidden)
         for name in self._hidden.keys() - near:
             self._hidden.pop(name).remove()
@@ -381,7 +381,7 @@ MAX_SCALE = 250.0  # standard deviation in those units; its square still is a ha
 
 @dataclass(frozen=True)
 class BrowserSplats:
-    """Arrays that viser sends to the browser, with lengths multiplied by UNIT_SCALE."""
+    """Arrays for viser's splat renderer, with lengths multiplied by UNIT_SCALE."""
 
     centres: Float[np.ndarray, "gaussian 3"]
     covariances: Float[np.ndarray, "gaussian 3 3"]
@@ -391,7 +391,7 @@ class BrowserSplats:
 
 @torch.no_grad()
 def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> BrowserSplats:
-    """A cloud for the browser, coloured as seen from an eye; both in the scene's frame.
+    """A cloud for the browser, coloured for an eye; both in the scene's frame.
 
     The browser takes one colour for each Gaussian and no harmonics; `colours` are sent again when the camera rests.
     """
@@ -407,7 +407,7 @@ def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> BrowserSplats:
 
 @torch.no_grad()
 def colours(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Float[Tensor, "gaussian 3"]:
-    """Colour of each Gaussian seen from one place, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
+    """Colour of each Gaussian seen from one position, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
     directions = unit(cloud.means.detach() - eye.to(cloud.means))
     values = kernels.spherical_harmonics(directions, cloud.degree + 1)
     return (0.5 + torch.einsum("nk,nkc->nc", values, cloud.harmonics.detach())).clamp(0, 1)

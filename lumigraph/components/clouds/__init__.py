@@ -1,1 +1,1 @@
-"""Parts of methods whose scene is a cloud of Gaussians; dense points and flat views of photographs."""
+"""Parts of Gaussian splatting methods, and dense points from photographs."""

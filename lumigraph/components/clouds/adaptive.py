@@ -24,7 +24,7 @@ NEARLY_FULL = 0.99  # of the cap
 
 @dataclass(frozen=True)
 class AdaptiveNumbers:
-    """A Config's numbers of the strategy adaptive."""
+    """A Config's numbers of adaptive density control."""
 
     densify_grad_threshold: NonNegative = 2e-4  # positional gradient above which Gaussians are added, 5.2; lower: more
     opacity_reset_interval: Steps = 3000  # steps between opacity resets, section 5.2
@@ -53,7 +53,7 @@ class AdaptiveDensity(DensityControl):
         self.forget(len(cloud))
 
     def forget(self, count: int) -> None:
-        """Set the sums to zero, for a cloud of `count` Gaussians."""
+        """Reset the sums, for a cloud of `count` Gaussians."""
         for name in self.grows:
             setattr(self, name, getattr(self, name).new_zeros(count))
 
@@ -83,7 +83,7 @@ class AdaptiveDensity(DensityControl):
             self.reset_opacity(cloud)
 
     def current_cap(self, cloud: Cloud, progress: float, steps: float = 0.0) -> int:
-        """Cap at this share of a budget of so many steps: with `cap_ramp` it rises evenly until `refine_until`."""
+        """Cap at this share of a budget of `steps` steps: with `cap_ramp` it rises linearly until `refine_until`."""
         first, cap = int(self.initial_count), self.max_count(cloud, steps)
         if not self.refining.cap_ramp:
             return cap
@@ -94,14 +94,14 @@ class AdaptiveDensity(DensityControl):
     def record(
         self, gradient: Float[Tensor, "gaussian 2"], visible: Bool[Tensor, " gaussian"], size: tuple[int, int]
     ) -> None:
-        """Add one step's gradient in the footprints' centres, given per pixel."""
+        """Add one step's gradient of the footprints' centres, per pixel."""
         half = gradient.new_tensor(size) / 2
         self.positional_gradient_sum += (gradient * half).norm(dim=-1)
         self.visible_count += visible
 
     @torch.no_grad()
     def refine(self, cloud: Cloud, extent: float, cap: int, generator: torch.Generator) -> bool:
-        """Clone, split and prune. Returns whether the cap kept Gaussians from being cloned or split."""
+        """Clone, split and prune. Returns whether the cap prevented some clones or splits."""
         gradient = self.positional_gradient_sum / self.visible_count.clamp_min(1)
         wanted = (gradient > self.numbers.densify_grad_threshold).nonzero()[:, 0]
         faint = cloud.opacities.sigmoid() < PRUNE_OPACITY
@@ -135,7 +135,7 @@ class AdaptiveDensity(DensityControl):
 
 @torch.no_grad()
 def scatter(cloud: Cloud, split: Bool[Tensor, " gaussian"], generator: torch.Generator) -> None:
-    """Move the two halves of each split Gaussian to random places within it, 1.6 times smaller (section 5.2)."""
+    """Move the two halves of each split Gaussian to random samples of it, and scale them by 1 / 1.6 (section 5.2)."""
     some = cloud.gaussians()[split]
     offset = torch.randn(len(some), 3, generator=generator).to(some.means.device) * some.log_scales.exp()
     cloud.means[split] += (to_matrix(some.quaternions) @ offset[:, :, None])[:, :, 0]

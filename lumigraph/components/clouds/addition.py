@@ -1,4 +1,4 @@
-"""Addition: a part of splatting, with hooks between the cloud and the loss; Step, which it changes there."""
+"""Addition: a part of splatting methods with hooks in a training step; Step, the state of a step."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TrainingViews:
 
 @dataclass
 class Step:
-    """One training step on its way from the cloud to the loss.
+    """State of one training step between the cloud and the loss.
 
     chance:     random numbers of this step; refining: those of density control
     whole:      the cloud that is learnt, with filters
@@ -89,13 +89,13 @@ class Addition(Part):
     """A part that changes how a cloud is learnt or shown. All hooks do nothing by default, and are visited in the order
     in which parts were assigned.
 
-    base_colours: whether it keeps harmonics beyond the first at zero
+    base_colours: whether it keeps harmonics beyond degree 0 at zero
     """
 
     base_colours: bool = False
 
     def layers(self, data: Scene) -> tuple[str, ...]:
-        """Names of the layers that a step reads of its photograph."""
+        """Names of the layers of its photograph that a step reads."""
         return ()
 
     # The cloud
@@ -107,10 +107,10 @@ class Addition(Part):
         """Initialise from the photographs. sweep: gives points that plane sweeps find"""
 
     def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
-        """Follow a cloud of which the Gaussians of a mask, or of indices, are left."""
+        """Update after pruning to the Gaussians of a mask, or of indices."""
 
     def filtered(self, cloud: Gaussians) -> Gaussians:
-        """The cloud as it is rasterized, in training and rendering."""
+        """The cloud with filters, as it is rasterised in training and rendering."""
         return cloud
 
     # A training step

@@ -1,4 +1,4 @@
-"""Appearance of photographs: affine colours and a sky for each, where photographs are found to differ."""
+"""Appearance of photographs: affine colours and a sky for each, if photographs differ."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class AppearanceNumbers:
 
 
 class SplatAppearance(Addition):
-    """A code for each photograph: affine colours, then a sky in scenes without bounds.
+    """A code for each photograph: affine colours, then a sky in unbounded scenes.
 
-    differ: whether photographs are of different appearance; nothing is learnt where they are not
-    found:  code of a photograph that was given as evidence
+    differ: whether photographs differ in appearance; if not, nothing is trained
+    found:  code of a photograph given as evidence
     """
 
     differ: Tensor
@@ -67,7 +67,7 @@ class SplatAppearance(Addition):
 
     @torch.no_grad()
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        """Find out whether photographs differ, with the setting auto; begin with uniform skies."""
+        """Test whether photographs differ, with the setting auto; initialise uniform skies."""
         if self.numbers.appearance == "auto":
             stops = spread_of_light(data) or 0.0
             self.differ.fill_(stops > MIN_SPREAD)
@@ -92,7 +92,7 @@ class SplatAppearance(Addition):
         step.terms["appearance"] = APPEARANCE_REGULARIZATION * code[:COLOUR_NUMBERS].square().sum()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """One row a step has a gradient, as with Gaussians."""
+        """Optimizer in which one row a step has a gradient, as with Gaussians."""
         return [CloudAdam([{"name": "appearance", "params": [self.codes.codes], "lr": APPEARANCE_LR}])]
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
@@ -131,12 +131,12 @@ class SplatAppearance(Addition):
 
     @property
     def accepts(self) -> tuple[type, ...]:
-        """Photographs, where their colours were learnt to differ."""
+        """Photographs, if they differ in appearance."""
         return (Photograph,) if self.is_active else ()
 
     @torch.no_grad()
     def adapted(self, method: Any, evidence: Photograph) -> SplatAppearance:
-        """The part with the code that fits the trusted pixels of a photograph best; the average without any."""
+        """The part with the code fitted to the trusted pixels of a photograph; the average without any."""
         photograph, background = evidence.to(method.device), method.background[0]
         seen = method.rasterized(photograph.camera)
         target, trusted = photograph.before(background), photograph.mask
@@ -163,9 +163,9 @@ REST_PRIOR = 0.01  # weight of the squared change of the rest of a code, which m
 def recoloured(
     rgb: Float[Tensor, "*#row 3"], opacity: Float[Tensor, "*#row"], code: Float[Tensor, " number"]
 ) -> Float[Tensor, "*#row 3"]:
-    """Colours over black in a photograph's appearance: the map is of the scene, and not of its background.
+    """Colours over black in a photograph's appearance; the affine map applies to the scene only, not to the background.
 
-    rgb:     multiplied by the opacity, so that b is too
+    rgb:     premultiplied by opacity, so that b is multiplied by it too
     opacity: of each colour
     """
     matrix, offset = _map(code)
@@ -175,10 +175,10 @@ def recoloured(
 def recoloured_harmonics(
     harmonics: Float[Tensor, "gaussian coefficient 3"], code: Float[Tensor, " number"]
 ) -> Float[Tensor, "gaussian coefficient 3"]:
-    """Coefficients whose colours are those of others in a photograph's appearance, from every side.
+    """Spherical harmonics with a photograph's affine appearance, for all directions.
 
-    A colour is 1/2 + sum_k Y_k h_k, so that h_k' = (I + A) h_k, and the constant takes up what is left of 1/2 and b.
-    The same but where a colour is cut at 0, which comes after this and before `recoloured`.
+    A colour is 1/2 + sum_k Y_k h_k, so that h_k' = (I + A) h_k, and the constant takes up the rest of 1/2 and b. Exact
+    except for colours clamped at 0, which happens after this and before `recoloured`.
     """
     matrix, offset = _map(code)
     out = harmonics @ matrix.T
@@ -194,14 +194,14 @@ def fit_colours(
     target: Float[Tensor, "pixel 3"],
     behind: Float[Tensor, "pixel 9"] | None = None,
 ) -> Float[Tensor, " number"]:
-    """The code whose picture is closest to a photograph by mean absolute difference, which is robust to distractors.
+    """Fit a code to a photograph by mean absolute difference, which is robust to distractors.
 
-    The picture, rgb (I + A)^T + opacity b + (1 - opacity) behind s, is linear in all of it: so least squares whose
-    pixels weigh one over their last error, a few times over (Schlossmacher 1973), get there at once.
+    The picture, rgb (I + A)^T + opacity b + (1 - opacity) behind s, is linear in the code: so iteratively reweighted
+    least squares (Schlossmacher 1973) converge in a few iterations.
 
-    start:   what the code is drawn towards, and what comes back where there is no pixel
-    rgb:     of the scene over black;  target: the photograph, less a background of which nothing is to be found
-    behind:  harmonics of the directions, where a code holds a sky; it stays unless pixels say otherwise
+    start:   prior mean of the code, and the result without pixels
+    rgb:     of the scene over black;  target: the photograph, less a fixed background
+    behind:  harmonics of the directions, for a code with a sky; it is kept unless pixels determine it
     """
     few = slice(None, None, -(-len(target) // MAX_PIXELS) or 1)
     rgb, opacity, target = rgb[few].double(), opacity[few, None].double(), target[few].double()
@@ -221,13 +221,13 @@ def fit_colours(
 
 
 def _columns(code: Float[Tensor, " number"]) -> Float[Tensor, "row 3"]:
-    """(I + A)^T, b and the rest of a code, three colours a row."""
+    """(I + A)^T, b and the sky of a code, three colours a row."""
     matrix, offset = _map(code)
     return torch.cat([matrix.T, offset[None], code[COLOUR_NUMBERS:].view(-1, 3)])
 
 
 def _map(code: Float[Tensor, " number"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
-    """I + A, and b, with which a photograph's code begins."""
+    """I + A and b, the first numbers of a photograph's code."""
     return torch.eye(3, device=code.device) + code[:9].view(3, 3), code[9:COLOUR_NUMBERS]
 
 
@@ -250,8 +250,8 @@ def sky_harmonics(camera: Camera) -> Float[Tensor, "height width 9"]:
 def sky_loss(
     background: Float[Tensor, "height width 3"], photograph: Photograph, opacity: Float[Tensor, "height width"]
 ) -> Float[Tensor, ""]:
-    """Absolute error of a sky where pixels are masked out and nothing is opaque: a mask around an object says that its
-    surroundings are not to be learnt, not that they may have any colour."""
+    """Absolute error of a sky at masked transparent pixels: a mask around an object excludes its surroundings from
+    training, but must not let them have any colour."""
     if photograph.mask is None:
         return background.new_zeros(())
     counts = (1 - opacity.detach()) * ~photograph.mask

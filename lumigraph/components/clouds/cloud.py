@@ -1,4 +1,4 @@
-"""Cloud: the Gaussians as parameters whose number changes in training; CloudAdam, their optimizer."""
+"""Cloud: the Gaussians as parameters of varying number; CloudAdam, their optimizer."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Cloud(Part):
 
     view_bits: a bit for each photograph in which a Gaussian was visible, see `view_count`
     extent:    of the cameras, in scene units
-    optimizer: updates the parameters, and follows where these change in size; None before training
+    optimizer: updates the parameters, and is resized with them; None before training
     """
 
     grows: ClassVar[tuple[str, ...]] = (*NAMES, "view_bits")  # a saved one may be of another size
@@ -85,7 +85,7 @@ class Cloud(Part):
         return len(self.means)
 
     def gaussians(self) -> Gaussians:
-        """The cloud; gradients flow back into the parameters."""
+        """The cloud; differentiable in the parameters."""
         return Gaussians(**{name: getattr(self, name) for name in NAMES}, antialiased=self.antialiased)
 
     def set_extent(self, cameras: Camera) -> None:
@@ -116,7 +116,7 @@ class Cloud(Part):
 
     @torch.no_grad()
     def replace(self, gaussians: Gaussians) -> None:
-        """Put another cloud in this one's place, with fresh moments."""
+        """Replace the cloud, with fresh moments."""
         for name in NAMES:
             exchange(self, name, getattr(gaussians, name).detach().clone(), self.optimizer)
         self.view_bits = self.view_bits.new_zeros(len(gaussians))
@@ -125,7 +125,7 @@ class Cloud(Part):
     def rebuild(self, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
         """Make Gaussian i a copy of source[i]; the optimizer's moments of the fresh ones are zero.
 
-        One operation for all that density control does: a clone is a number twice, a pruned one a number left out.
+        One operation for all of density control: a clone is an index twice, a pruned Gaussian a missing index.
         """
         assert self.optimizer is not None
         for name in NAMES:
@@ -139,7 +139,7 @@ class Cloud(Part):
         self.view_bits = self.view_bits[source]
 
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
-        """Leave the Gaussians of a mask, with their moments."""
+        """Keep the Gaussians of a mask, with their moments."""
         source = keep.nonzero()[:, 0]
         self.rebuild(source, torch.zeros_like(source, dtype=torch.bool))
 
@@ -153,19 +153,19 @@ class Cloud(Part):
         return view_count(self.view_bits)
 
     def storage(self) -> dict[str, Stored]:
-        """Positions need the most bits; harmonics beyond the plain colour go by a codebook."""
+        """Storage: positions need the most bits; harmonics beyond degree 0 are vector-quantised."""
         scaled = dict.fromkeys(("quaternions", "log_scales", "opacities"), Stored("scaled"))
         harmonics = Stored("coded", plain=3)
         return {"means": Stored("scaled", 16), **scaled, "harmonics": harmonics, "view_bits": Stored("nothing")}
 
 
 class CloudAdam(RowOptimizer):
-    """Adam (Kingma and Ba 2015) that passes over a row while its whole gradient is exactly zero, and catches up later.
+    """Adam (Kingma and Ba 2015) that skips rows of exactly zero gradient, and catches up later.
 
-    Most Gaussians are not on most pictures. Adam would still move them, by what is left of their momentum, for steps
-    after each time they were seen; to leave that out (as LazyAdam does) makes those that few photographs show ten times
-    slower. Here a row that comes back after n steps has its moments decayed n times, and goes at once as far as its
-    momentum will carry it in the n steps that it is likely to stay away: (1 - b1^n) / (1 - b1) times a step.
+    Most Gaussians are not visible in most pictures. Adam would still move them, by their remaining momentum, for steps
+    after each time they were visible; skipping that (as LazyAdam does) makes those that few photographs show ten times
+    slower. Here a row that returns after n steps has its moments decayed n times, and takes at once the total step of
+    its momentum over the n steps of its expected absence: (1 - b1^n) / (1 - b1) times a step.
     Each group holds one parameter (row, ...); its "columns", if given, multiply the rate of each column.
     """
 
@@ -194,13 +194,13 @@ class CloudAdam(RowOptimizer):
 
 @lru_cache
 def _factors(device: torch.device, *columns: float) -> Float[Tensor, " column"]:
-    """Factors of the columns' rates, kept on their device."""
+    """Factors of the columns' rates, cached on their device."""
     return torch.tensor(columns, device=device)
 
 
 @lru_cache
 def _powers(base: float, count: int = 1 << 14) -> np.ndarray:
-    """A table of base^n for n from 0, quicker to read than a power; after its last entry a moment is nothing."""
+    """Table of base^n until it underflows, faster than a power."""
     return (base ** np.arange(count)).astype(np.float32)
 
 
@@ -231,12 +231,12 @@ MIN_VIEWS = {1: 3, 4: 6}  # index of a coefficient, and the view count from whic
 def with_view(
     bits: Int[Tensor, " gaussian"], image_index: Int[Tensor, " 1"], visible: Bool[Tensor, " gaussian"]
 ) -> Int[Tensor, " gaussian"]:
-    """View bits with those of one photograph. A row is a set: a bit for each photograph."""
+    """View bits with one more photograph. A row is a bit set over photographs."""
     return bits | visible.long() << image_index % VIEW_BITS
 
 
 def view_count(bits: Int[Tensor, " gaussian"]) -> Int[Tensor, " gaussian"]:
-    """Number of bits that are set: of 2, then 4, then 8 neighbours at once, and these summed by a multiplication."""
+    """Population count of the bits: of 2, then 4, then 8 neighbours at once, and these summed by a multiplication."""
     pairs = bits - (bits >> 1 & 0x5555555555555555)
     fours = (pairs & 0x3333333333333333) + (pairs >> 2 & 0x3333333333333333)
     eights = fours + (fours >> 4) & 0x0F0F0F0F0F0F0F0F
@@ -245,8 +245,8 @@ def view_count(bits: Int[Tensor, " gaussian"]) -> Int[Tensor, " gaussian"]:
 
 @torch.no_grad()
 def zero_unobserved_sh(harmonics: Float[Tensor, "gaussian coefficient 3"], bits: Int[Tensor, " gaussian"]) -> None:
-    """Set harmonics to zero, in place, for which a Gaussian's view count is too low: view dependence that few
-    directions determine may be anything from elsewhere."""
+    """Set harmonics to zero, in place, where a Gaussian's view count is too low to determine them: they would be
+    arbitrary in other directions."""
     if not harmonics.is_cuda:
         _zero_unobserved_cpu(harmonics.detach().numpy(), bits.numpy(), np.array([*MIN_VIEWS.items()]))
         return
@@ -267,7 +267,7 @@ def _zero_unobserved_cpu(harmonics, bits, limits):
 
 
 def picture_share(cloud: Gaussians, camera: Camera, near: float) -> Float[Tensor, " gaussian"]:
-    """Derivative of a picture's brightness in that of each Gaussian."""
+    """Derivative of a picture's brightness with respect to that of each Gaussian."""
     grey = torch.zeros(len(cloud), 1, 3, device=cloud.means.device, requires_grad=True)
     with torch.enable_grad():
         seen = splat(replace(cloud, harmonics=grey), view_of(camera, near), 1)
@@ -278,8 +278,8 @@ def picture_share(cloud: Gaussians, camera: Camera, near: float) -> Float[Tensor
 def thinned(
     cloud: Gaussians, importance: Float[Tensor, " gaussian"], share: float
 ) -> tuple[Gaussians, Int[Tensor, " kept"]]:
-    """The cloud without a share of its Gaussians, the least important ones, and indices of the others. They are in
-    Morton order, where neighbours are alike, and each rotation is the quaternion with w >= 0."""
+    """The cloud pruned by a share of its Gaussians, the least important ones, and indices of the others, in Morton
+    order, where neighbours are similar, with rotations as quaternions with w >= 0."""
     kept = most_important(importance, 1 - share).nonzero()[:, 0]
     kept = kept[torch.from_numpy(morton_order(cloud.means[kept].detach().cpu().numpy()))]
     upright = normalize(cloud.quaternions, dim=-1)

@@ -1,4 +1,4 @@
-"""CloudMethod: a method whose scene is a cloud of Gaussians that learns from one photograph a step (Kerbl 2023)."""
+"""CloudMethod: base class of Gaussian splatting methods, trained on one photograph a step (Kerbl 2023)."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ class CloudNumbers:
 
 
 class CloudMethod(Method, ABC):
-    """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
+    """A cloud of Gaussians trained on one photograph a step; `density_control` changes their number.
 
     Assign a DensityControl as `density_control`, a PoseRefinement or None as `poses`, and further `Addition`s. The
     Config has `cloud: CloudNumbers`, `initialization` and `seed`.
-    cameras:  of the photographs that are learnt from; None before training
+    cameras:  of the training photographs; None before training
     bands:    of the harmonics in use
     current:  the step between `loss` and `after_step`
-    drawn:    number of photographs that were learnt from
+    drawn:    number of training photographs sampled so far
     """
 
     ssim_weight: float = SSIM_WEIGHT
@@ -97,7 +97,7 @@ class CloudMethod(Method, ABC):
 
     @property
     def near_plane(self) -> float:
-        """Near plane for rasterization."""
+        """Near plane of rasterisation."""
         return NEAR_PLANE_SCALE * self.frame.near
 
     def growth_bytes(self) -> int:
@@ -118,14 +118,14 @@ class CloudMethod(Method, ABC):
         super().begin(data, seconds)
 
     def first_cloud(self, data: Scene, sweep: Callable[[], Points]) -> Gaussians:
-        """The cloud to begin with, of the photographs. sweep: gives points that plane sweeps find"""
+        """Initial cloud from the photographs. sweep: returns points of plane sweeps"""
         c, cap = self.config, self.density_control.max_count(self.cloud)
         counts = min(c.cloud.initial_gaussians, cap), cap
         return initial_cloud(data, c.initialization, *counts, c.cloud.sh_degree, self.random(1), sweep)
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Gaussians on the teacher's surfaces; a cloud is taken as it is."""
+        """Initialise with Gaussians on the teacher's surfaces; a cloud is copied."""
         degree, cap = self.numbers.sh_degree, self.density_control.max_count(self.cloud)
         found = cloud_of(teacher, cap, degree)
         if found is None:
@@ -134,7 +134,7 @@ class CloudMethod(Method, ABC):
         self.begin_with(found, cameras)
 
     def begin_with(self, gaussians: Gaussians, cameras: Camera) -> None:
-        """Begin with a cloud, to be learnt from photographs of these cameras."""
+        """Initialise with a cloud, for training on photographs of these cameras."""
         self.cloud.replace(gaussians)
         self.cloud.set_extent(cameras)
         self.cameras = cameras
@@ -144,7 +144,7 @@ class CloudMethod(Method, ABC):
     # Optimisation (section 5)
 
     def before_step(self, step: int, progress: float) -> None:
-        """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
+        """Add bands of harmonics one by one (section 7.1), but not while they would compensate wrong poses or depth."""
         super().before_step(step, progress)
         joined = intervals(step, progress, SH_DEGREE_INTERVAL, SH_DEGREE_INTERVAL_SHARE)
         coarse = self.moves_cameras and progress < COARSE_UNTIL
@@ -152,7 +152,7 @@ class CloudMethod(Method, ABC):
         self.bands = 1 if plain else 1 + min(int(joined), self.numbers.sh_degree)
 
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
-        """The next photograph: each once in a random order, then in another."""
+        """The next photograph, in random order without repetition within an epoch."""
         if self.cameras is None:  # in a run that was resumed
             self.cameras = data.cameras[data.splits["train"]]
         train = self.joined_photographs(data)
@@ -165,16 +165,16 @@ class CloudMethod(Method, ABC):
         return photograph.reduced(times).to(self.device)
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
-        """Photographs that are learnt from now; all of training by default."""
+        """Current training photographs; all by default."""
         return data.splits["train"]
 
     @property
     def least_pixels(self) -> int:
-        """Number of pixels of a photograph that is reduced, at least."""
+        """Least number of pixels of a downscaled photograph."""
         return LEAST_PIXELS
 
     def reduction(self, height: int, width: int) -> int:
-        """Factor by which photographs of a size, in pixels, are smaller now."""
+        """Current downscaling factor of photographs of a size, in pixels."""
         half = self.numbers.half_resolution_until or COARSE_UNTIL * self.moves_cameras
         times = 4 if self.progress < half / 4 else 2 if self.progress < half else 1
         while times > 1 and height * width < self.least_pixels * times**2:
@@ -245,7 +245,7 @@ class CloudMethod(Method, ABC):
 
     @torch.no_grad()
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
-        """Leave the Gaussians of a mask, with their moments in the optimizer."""
+        """Keep the Gaussians of a mask, with their moments in the optimizer."""
         self.cloud.prune(keep)
         for part in self.additions:
             part.prune(keep)
@@ -253,7 +253,7 @@ class CloudMethod(Method, ABC):
     # Rendering (section 6)
 
     def filtered(self) -> Gaussians:
-        """The cloud as it is rasterized, in no photograph's appearance."""
+        """The cloud with filters, without a photograph's appearance."""
         cloud = self.cloud.gaussians()
         for part in self.additions:
             cloud = part.filtered(cloud)
@@ -267,7 +267,7 @@ class CloudMethod(Method, ABC):
         return cloud
 
     def rasterized(self, camera: Camera) -> Rendering:
-        """Rendering over black, in no photograph's appearance."""
+        """Rendering over black, without a photograph's appearance."""
         return render(self.filtered(), camera, BLACK, self.near_plane)
 
     def render(self, camera: Camera) -> Rendering:
@@ -275,7 +275,7 @@ class CloudMethod(Method, ABC):
         return self.shown(self.rasterized(camera), camera)
 
     def shown(self, seen: Rendering, camera: Camera) -> Rendering:
-        """A rendering over black in the appearance of the settings, before the background."""
+        """A rendering over black in the appearance of the settings, and the background."""
         background = self.background[0]
         for part in self.additions:
             rgb, background = part.shown(self, seen, camera, background)
@@ -283,7 +283,7 @@ class CloudMethod(Method, ABC):
         return replace(seen, rgb=over(seen.rgb, seen.opacity, background)) if background.any() else seen
 
     def colour_pairs(self, photograph: Photograph) -> ColourPairs:
-        """Colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
+        """Rendered colours as a function of a photograph's pose at all of its trusted pixels; see `RefinesPoses`."""
         photograph, cloud = photograph.to(self.device), self.filtered()
         target = photograph.trusted(photograph.before(self.background[0]))
 
@@ -298,7 +298,7 @@ class CloudMethod(Method, ABC):
     # Compression
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """Gain of one picture's brightness where a Gaussian alone gets brighter."""
+        """Derivative of one picture's brightness with respect to each Gaussian's."""
         return {"cloud.harmonics": picture_share(self.gaussians(), camera.to(self.device), self.near_plane)}
 
     @torch.no_grad()

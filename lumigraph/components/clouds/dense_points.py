@@ -1,7 +1,7 @@
-"""A dense cloud of points from photographs with known cameras: plane sweeps, kept where neighbours agree.
+"""Dense point cloud from photographs with known cameras: plane sweeps with a consistency check.
 
-Each photograph is compared with some neighbours at many depths (Collins 1996); the depth of least cost stands where
-neighbours, swept by themselves, find the same place (Merrell 2007).
+Each photograph is swept against some neighbours at many depths (Collins 1996); the depth of least cost is kept if
+neighbours, swept themselves, have the same point (Merrell 2007).
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ WINDOW = 5  # pixels
 
 @dataclass(frozen=True)
 class Points:
-    """Places in the scene's frame, their colours in [0, 1], and how large a pixel is there.
+    """Points in the scene's frame, their colours in [0, 1], and the size of a pixel there.
 
     origins: positions of the cameras that found them
-    share:   of the swept pixels at which a point was found
+    share:   of the swept pixels with a point
     """
 
     positions: Float[Tensor, "point 3"]
@@ -49,10 +49,10 @@ class Points:
 
 @torch.no_grad()
 def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
-    """Points on what at least two or three of the training photographs see, a pixel or so apart; maybe none.
+    """Points visible in at least two or three of the training photographs, about a pixel apart; maybe none.
 
-    seconds: that sweeping may take, about; fewer photographs are asked where all would take longer
-    Depths are searched around the scene's sparse points; where there are none, around what smaller pictures tell.
+    seconds: time for sweeping, about; fewer photographs are used where all would take longer
+    Depths are searched around the scene's sparse points; without any, around the depths of smaller pictures.
     """
     chosen = evenly(scene.splits["train"].tolist(), MAX_VIEWS)
     views = [flat_view(scene.photograph(i), MAX_SIDE) for i in chosen]
@@ -66,13 +66,13 @@ def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
 
 
 def compile_sweep() -> None:
-    """Make the kernel ready, on one dark pixel, so that it takes no time of who calls `seen_points`."""
+    """Compile the kernel, on one dark pixel, so that it takes no time in `seen_points`."""
     dark, warp = torch.zeros(1, 1, 1), torch.eye(3, 4)[None]
     kernels.plane_sweep(dark[0], dark[0], dark, dark, warp, torch.ones(1), WINDOW, 1)
 
 
 def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str, seconds: float) -> Points:
-    """Points of the views where their neighbours agree; of as many views as can be swept in so many seconds."""
+    """Consistent points of the views; of as many views as the time allows."""
     if seconds < math.inf:
         some = evenly(list(range(len(views))), affordable(views, ranges, seconds))
         views, ranges = [views[i] for i in some], [ranges[i] for i in some]
@@ -99,7 +99,7 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
 
 
 def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
-    """Number of views that can be swept in so many seconds, by the time of one."""
+    """Number of views that can be swept in a time, measured by one."""
     begin, middle = time.perf_counter(), len(views) // 2
     positions = torch.stack([view.pose[:, 3] for view in views])
     sweep(
@@ -111,7 +111,7 @@ def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]],
 
 
 def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, float]) -> Float[Tensor, "height width"]:
-    """Depth along the axis of each pixel, 0 where none is sure."""
+    """Depth along the axis of each pixel, 0 for unreliable ones."""
     if not neighbours:
         return torch.zeros_like(view.trust)
     warps = torch.stack([view.warp_to(other) for other in neighbours])
@@ -131,7 +131,7 @@ def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, flo
 
 
 def disparity(view: FlatView, warps: Float[Tensor, "neighbour 3 4"], near: float, far: float) -> float:
-    """Pixels between the nearest and farthest hypothesis of a view's middle in its neighbours, within their width."""
+    """Disparity range of a view's centre in its neighbours, in pixels, clamped to their width."""
     height, width = view.trust.shape
     middle = torch.tensor([width / 2, height / 2, 1.0])
     places = [warps[:, :, :3] @ middle + h * warps[:, :, 3] for h in torch.linspace(far, near, 64).tolist()]
@@ -142,7 +142,7 @@ def disparity(view: FlatView, warps: Float[Tensor, "neighbour 3 4"], near: float
 
 
 def padded(pictures: Sequence[Float[Tensor, "_ _"]]) -> Float[Tensor, "picture height width"]:
-    """Pictures of any sizes as one tensor, zero beyond each."""
+    """Pictures of any sizes stacked in one tensor, padded with zeros."""
     size = torch.tensor([p.shape for p in pictures]).amax(0).tolist()
     out = torch.zeros(len(pictures), *size)
     for one, picture in zip(out, pictures, strict=True):
@@ -151,7 +151,7 @@ def padded(pictures: Sequence[Float[Tensor, "_ _"]]) -> Float[Tensor, "picture h
 
 
 def thinned(points: Points, spacing: float = 1.0) -> Points:
-    """The means of points that lie in one cell; cells are as large as `spacing` pixels there, to within a half."""
+    """Means of points in grid cells of about `spacing` pixels' size there, to within a half."""
     level = (points.sizes * spacing).log2().round().int()
     cell = (points.positions / torch.exp2(level)[:, None]).floor().long()
     key = torch.cat([level[:, None].long(), cell], 1)

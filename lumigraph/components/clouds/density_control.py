@@ -1,4 +1,4 @@
-"""Density control: a strategy that changes the number and the places of Gaussians after steps."""
+"""Density control: changes of the number and the positions of Gaussians after steps."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class RefineNumbers:
 
 
 class DensityControl(Addition, ABC):
-    """A strategy; it may `rebuild` the cloud after a step, and keeps in buffers what a resume needs.
+    """Strategy of density control; it may `rebuild` the cloud after a step, and has its state in buffers.
 
-    initial_count: number of Gaussians at first
+    initial_count: initial number of Gaussians
     """
 
     initial_count: Tensor
@@ -65,7 +65,7 @@ class DensityControl(Addition, ABC):
         return ended and intervals(step, progress, REFINE_FROM, REFINE_FROM_SHARE) >= 1
 
     def allowed(self, steps: float = 0.0) -> float:
-        """Gaussians that the numbers allow in a budget of so many steps; infinitely many without `max_gaussians`."""
+        """Maximum number of Gaussians by the Config in a budget of `steps` steps; infinite without `max_gaussians`."""
         n = self.refining
         by_budget = max(MIN_CAP, n.gaussians_per_step * steps) if n.gaussians_per_step else math.inf
         return min(n.max_gaussians or math.inf, by_budget)
@@ -76,7 +76,7 @@ class DensityControl(Addition, ABC):
         return int(min(self.allowed(steps), fit))
 
     def warn_full(self, cloud: Cloud, steps: float = 0.0) -> None:
-        """Warn, once, that the cloud has reached its cap."""
+        """Warn, once, of a cloud at its cap."""
         if not self.warned:
             self.warned = True
             allowed, why = self.allowed(steps), "memory is short"

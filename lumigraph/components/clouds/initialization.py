@@ -39,11 +39,11 @@ def initial_cloud(
     generator: torch.Generator,
     sweep: Callable[[], Points] | None = None,
 ) -> Gaussians:
-    """At most `max_count` Gaussians at the points that are known, or where there are none, `count` random ones.
+    """Initial cloud of at most `max_count` Gaussians at known points, or without any, `count` random ones.
 
-    initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
-                    points as they are, and swept ones of a place that has none, "random" takes neither
-    sweep:          gives points that plane sweeps find; `seen_points` by default
+    initialization: "dense" adds points of plane sweeps to the scene's sparse points, "sparse" takes only the sparse
+                    points, or plane sweeps without any, "random" takes neither
+    sweep:          returns points of plane sweeps; `seen_points` by default
     Random ones lie inside the silhouettes of photographs with alpha, otherwise inside the box of interest.
     """
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
@@ -60,7 +60,7 @@ def initial_cloud(
 
 
 def may_sweep(initialization: Initialization, frame: Frame) -> bool:
-    """True if a cloud may begin with points of plane sweeps: a dense one, or one of a place without sparse points."""
+    """True if an initial cloud may use plane sweeps: a dense one, or one without sparse points."""
     return initialization == "dense" or initialization == "sparse" and frame.is_open
 
 
@@ -86,7 +86,7 @@ def with_dense_points(
     generator: torch.Generator,
     found: Points,
 ) -> tuple[Tensor, Tensor]:
-    """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
+    """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing consistent."""
     inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
     if len(inside) < MIN_DENSE_POINTS:
         return means, colours
@@ -99,7 +99,7 @@ def with_dense_points(
 
 
 def backdrop(frame: Frame, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    """Random places outside the box of interest, at all distances up to the scene's end, evenly by their logarithm."""
+    """Random positions outside the box of interest, log-uniform in distance up to the scene's end."""
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     nearest = max(float(torch.tensor(frame.bounds).norm(dim=-1).max()), 0.1 * frame.reach)
     distances = torch.exp(math.log(frame.reach / nearest) * torch.rand(count, 1, generator=generator)) * nearest
@@ -126,7 +126,7 @@ def points_in_box(frame: Frame, count: int, generator: torch.Generator) -> Float
 
 
 def round_gaussians(means: Float[Tensor, "gaussian 3"], colours: Float[Tensor, "gaussian 3"], degree: int) -> Gaussians:
-    """Balls as large as the mean distance to their three nearest neighbours, of one colour from all sides."""
+    """Isotropic Gaussians of the mean distance to their three nearest neighbours, with view-independent colour."""
     count = len(means)
     scales = nearest_distance(means).clamp_min(1e-4)
     harmonics = torch.zeros(count, (degree + 1) ** 2, 3)
@@ -141,7 +141,7 @@ def round_gaussians(means: Float[Tensor, "gaussian 3"], colours: Float[Tensor, "
 
 
 def nearest_distance(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-    """Root mean square distance to the nearest other points (at most all of them); 1 for a point alone."""
+    """Root mean square distance to the nearest other points (at most all of them); 1 for a single point."""
     from scipy.spatial import KDTree
 
     known = min(NEIGHBOURS, len(points) - 1)
@@ -158,8 +158,8 @@ DISC_THICKNESS = 0.2  # of the width
 
 
 def surface_cloud(teacher: Teacher, max_count: int, degree: int, generator: torch.Generator) -> Gaussians:
-    """Discs on the surfaces that cameras see, across their normals, which reach one another, in the colours that
-    cameras see. Raises LumigraphError where there is no surface."""
+    """Overlapping discs on the surfaces seen by cameras, with their normals and colours. Raises LumigraphError without
+    a surface."""
     seen = teacher.surface
     seen = seen[torch.randperm(len(seen), generator=generator)[:max_count]]
     if len(seen) < 2:
@@ -176,7 +176,9 @@ def surface_cloud(teacher: Teacher, max_count: int, degree: int, generator: torc
 
 
 def cloud_of(teacher: object, max_count: int, degree: int) -> Gaussians | None:
-    """The teacher's largest, most opaque Gaussians, with harmonics of another degree; None where it has none."""
+    """The teacher's largest, most opaque Gaussians, with harmonics of another degree; None for a teacher without
+    Gaussians.
+    """
     if not can(teacher, HasGaussians):
         return None
     cloud: Gaussians = teacher.gaussians()  # type: ignore[attr-defined]
@@ -191,6 +193,6 @@ def cloud_of(teacher: object, max_count: int, degree: int) -> Gaussians | None:
 
 
 def rotation_to_normal(normals: Float[Tensor, "point 3"]) -> Float[Tensor, "point 4"]:
-    """Quaternions (w, x, y, z) of the smallest rotations that turn +z onto normals, or onto their opposites."""
+    """Quaternions (w, x, y, z) of the smallest rotations from +z to normals, or to their opposites."""
     x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(-1)
     return torch.nn.functional.normalize(torch.stack([1 + z, -y, x, torch.zeros_like(z)], -1), dim=-1)

@@ -1,4 +1,4 @@
-"""Pose refinement through a cloud: the pose's gradient, by way of the Gaussians."""
+"""Pose refinement through a cloud: gradient of the pose by the Gaussians."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from ..training.pose_refinement import PoseRefinement
 
 
 def seen_from(poses: PoseRefinement, cloud: Gaussians, camera: Camera) -> tuple[Gaussians, Camera]:
-    """The cloud and the refined camera of one photograph, so that a picture of the one through the other has a gradient
-    in `poses`.
+    """The cloud and the refined camera of one photograph, so that their rendering is differentiable in `poses`.
 
-    The projection has gradients in Gaussians and none in cameras. To move a camera one way is to move the cloud the
-    other: with the camera's rotation exp(omega) and shift s as they are, and R = exp(omega) exp(omega_0)^T, which is
-    the identity for omega = omega_0 and yet has a gradient,
+    The projection has gradients in Gaussians and none in cameras. To move a camera is to move the cloud inversely: with
+    the camera's rotation exp(omega) and shift s fixed, and R = exp(omega) exp(omega_0)^T, which is the identity for
+    omega = omega_0 and yet has a gradient,
 
         m' = eye + R^T (m - eye - (s - s_0))        q' = R^T q
 
-    Exact for centres and shapes. Harmonics are not turned along: their colour changes little over what a pose is off.
+    Exact for centres and shapes. Harmonics are not rotated: their colour changes little over a pose error.
     """
     if camera.image_index is None:
         return cloud, camera
@@ -38,5 +37,5 @@ def seen_from(poses: PoseRefinement, cloud: Gaussians, camera: Camera) -> tuple[
 
 
 def turn_of(omega: Tensor) -> Tensor:
-    """The rotation matrix of a rotation vector: its columns are where the axes go."""
+    """Rotation matrix of a rotation vector."""
     return rotated(torch.eye(3, device=omega.device), omega.expand(3, 3)).T

@@ -23,7 +23,7 @@ PASSES_BEFORE_PRUNING = 2  # times that each photograph is learnt from before Ga
 
 @dataclass(frozen=True)
 class TidyingNumbers:
-    """A Config's rules on Gaussians that few photographs determine. The paper has none of them."""
+    """A Config's rules on Gaussians determined by few photographs. The paper has none of them."""
 
     prune_near: bool = False  # prune Gaussians close to a camera; off: they may hang before a lens
     limit_scale: bool = False  # clamp scales to half the distance to the nearest camera; off: giants may stay
@@ -35,7 +35,7 @@ ALL_RULES = TidyingNumbers(prune_near=True, limit_scale=True, limit_anisotropy=T
 
 
 class Tidying(Addition):
-    """The rules of a Config, after each step or at density control."""
+    """The rules of a Config, applied after each step or at density control."""
 
     def __init__(self, rules: TidyingNumbers):
         super().__init__()
@@ -70,7 +70,7 @@ def near_camera(
     """Gaussians too close to a camera: within the near distance, or in the near zone with a low view count.
 
     distance: to the nearest camera
-    near:     distance within which nothing is, `Frame.near`
+    near:     near distance, `Frame.near`
     """
     return (distance < near) | ((distance < NEAR_ZONE * near) & (view_count < MIN_NEAR_VIEWS))
 

@@ -14,7 +14,6 @@ from ...method import Sampler
 from ..sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 from ..sampling.spaces import Space
-from ..training.schedules import RISE, held
 from .coordinate_field import CoordinateField, NetworkNumbers
 from .hash_field import HashField, HashNumbers
 
@@ -76,10 +75,3 @@ class BackboneNumbers:
             return [*own, *last.optimizers_at(self.learning_rate, groups=groups, **of_table)]
         every = [p for field in fields for p in field.parameters()] + [p for group in groups for p in group["params"]]
         return [torch.optim.Adam(every, self.learning_rate, eps=eps)]
-
-
-def backbone_decay(method: Any, step: int, progress: float) -> float:
-    """`Method.learning_rate` of a method with a backbone: held, then falling."""
-    b = method.config.backbone
-    rise = getattr(method.config, "warmup_steps", RISE)
-    return held(b.learning_rate, b.final_learning_rate, step, progress, b.decay_start, rise)

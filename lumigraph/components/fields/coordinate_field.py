@@ -54,6 +54,7 @@ class CoordinateField(Field):
     noise:      deviation of noise that is added to the output for density in training
     head:       channels of the hidden colour layers; one of half the width by default
     coarse:     field of the coarse pass; None for this one
+    latent:     width of a further input of the network, see `LatentField`
     """
 
     coarse: CoordinateField | None
@@ -70,13 +71,14 @@ class CoordinateField(Field):
         noise: float = 0.0,
         head: Sequence[int] = (),
         coarse: CoordinateField | None = None,
+        latent: int = 0,
     ):
         super().__init__()
         self.numbers, self.space, self.joining = numbers, space, joining
         self.activation, self.noise, self.coarse = activation, noise, coarse
         self.joint = not code  # type: ignore[misc]  # of an instance
         self.encode_position, self.encode_direction = self.encodings(keep_input)
-        inputs = self.encode_position.width, self.encode_direction.width + code
+        inputs = self.encode_position.width + latent, self.encode_direction.width + code  # type: ignore[operator]
         shape = numbers.depth, hidden_width, numbers.skip_layer
         self.network = CoordinateNetwork(*inputs, *shape, not numbers.bfloat16, head)  # type: ignore[arg-type]
 
@@ -186,6 +188,31 @@ class CoordinateField(Field):
 
     def _coloured(self, feature: Tensor, view: Tensor, *code: Tensor) -> Float[Tensor, "point 3"]:
         return self.activated(self.network.seen(feature, torch.cat([view, *code], -1)))
+
+
+class LatentField(CoordinateField):
+    """Density and colour under a latent code, which comes first in the code. latent: its width"""
+
+    deforms = True
+    density, forward = Field.density, Field.forward  # by `geometry`
+
+    def __init__(self, *arguments: Any, latent: int, **named: Any):
+        super().__init__(*arguments, **named | {"latent": latent})
+        self.latent, self.joint = latent, False  # type: ignore[misc]
+
+    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
+        assert code is not None
+
+        def answer(x: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
+            raw, feature = self.network.geometry(torch.cat([self.encode(x), latent], -1))
+            return self.activation(raw), feature
+
+        density, features = in_chunks(answer, self.space.warp(points), code[:, : self.latent])
+        return density * self.space.stretch(points), features
+
+    def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
+        assert code is not None
+        return in_chunks(lambda *x: (self._seen(*x),), features, directions, code[:, self.latent :])[0]
 
 
 POINT_VARIANCE = (2 / 128) ** 2 / 12  # of points, a cell's of a grid of 128: photographs show nothing smaller

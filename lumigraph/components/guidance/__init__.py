@@ -1,4 +1,4 @@
-"""Guidance by words: models that judge pictures by a prompt, and the part that leads a scene to it."""
+"""Text guidance: models that score pictures by a prompt, and the part that optimises a scene with them."""
 
 from .guides import DistillationNumbers as DistillationNumbers
 from .guides import Guide as Guide

@@ -95,7 +95,7 @@ class Attention(nn.Module):
 
 
 class AttentionBlock(nn.Module):
-    """Attention and perceptron, each normalised before and added."""
+    """Pre-norm residual block of attention and perceptron."""
 
     def __init__(self, s: TransformerSizes):
         super().__init__()
@@ -124,7 +124,7 @@ class Transformer(nn.Module):
 
 
 class VisionTransformer(nn.Module):
-    """Vision transformer (Dosovitskiy 2021) with a normalisation ahead of its blocks."""
+    """Vision transformer (Dosovitskiy 2021) with a layer normalisation before its blocks."""
 
     def __init__(self, s: VisionSizes, picture: int, embedding: int):
         super().__init__()
@@ -143,7 +143,7 @@ class VisionTransformer(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """Residual block that averages where others stride (Radford 2021, section 2.4)."""
+    """Residual block with average pooling instead of strides (Radford 2021, section 2.4)."""
 
     def __init__(self, inputs: int, planes: int, stride: int):
         super().__init__()
@@ -163,7 +163,7 @@ class Bottleneck(nn.Module):
 
 
 class AttentionPool(nn.Module):
-    """Attention of the mean to all places (Radford 2021, section 2.4)."""
+    """Attention pooling: attention of the mean to all positions (Radford 2021, section 2.4)."""
 
     def __init__(self, places: int, width: int, heads: int, embedding: int):
         super().__init__()
@@ -180,7 +180,7 @@ class AttentionPool(nn.Module):
 
 
 class ModifiedResnet(nn.Module):
-    """Residual network with averages for strides and pooling by attention (Radford 2021, section 2.4)."""
+    """Residual network with average pooling for strides and attention pooling (Radford 2021, section 2.4)."""
 
     def __init__(self, s: ResnetSizes, picture: int, embedding: int):
         super().__init__()
@@ -234,12 +234,12 @@ class Clip(TextTransformer):
         self.logit_scale = nn.Parameter(torch.tensor(INITIAL_SCALE))
 
     def of_pictures(self, rgb: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch embedding"]:
-        """Embeddings of sRGB pictures in [0, 1], which have the model's size."""
+        """Embeddings of sRGB pictures in [0, 1], of the model's input size."""
         mean, deviation = (rgb.new_tensor(x)[:, None, None] for x in (MEAN, DEVIATION))
         return normalize(self.visual((rgb - mean) / deviation), dim=-1)
 
     def of_captions(self, tokens: Int[Tensor, "batch token"]) -> Float[Tensor, "batch embedding"]:
-        """Embeddings of captions, read at their last token, whose number is the largest."""
+        """Embeddings of captions, at their end token, whose number is the largest."""
         last = self.states(tokens)[torch.arange(len(tokens), device=tokens.device), tokens.argmax(-1)]
         return normalize(last @ self.text_projection, dim=-1)
 

@@ -136,7 +136,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def named_as_here(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors with the names of open_clip, of either layout."""
+    """Tensors renamed from either layout to the names of open_clip."""
     found = dict[str, Tensor]()
     for name, x in tensors.items():
         x = x.T if name in PROJECTIONS else x
@@ -150,7 +150,7 @@ def named_as_here(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def sizes_of(tensors: dict[str, Tensor], record: ConfigRecord, path: Path) -> ClipSizes:
-    """Sizes that the tensors' shapes and the config say. Raises LumigraphError where these are of no CLIP."""
+    """Sizes from the tensors' shapes and the config. Raises LumigraphError for any other architecture."""
     remedy = "give a CLIP with a vision transformer or a residual network, such as ViT-B/32"
     with reading(path, "holds the weights of another architecture than CLIP's", remedy):
         text = tower_of(tensors, "transformer.", record, "text")
@@ -170,7 +170,7 @@ def sizes_of(tensors: dict[str, Tensor], record: ConfigRecord, path: Path) -> Cl
 
 
 def count(tensors: dict[str, Tensor], place: str) -> int:
-    """Number of blocks whose tensors have names that begin so."""
+    """Number of blocks whose tensors have a prefix."""
     return len({name.removeprefix(place).split(".")[0] for name in tensors if name.startswith(place)})
 
 
@@ -189,7 +189,7 @@ def tower_of(tensors: dict[str, Tensor], place: str, record: ConfigRecord, name:
 
 
 def load(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
-    """Give a network its tensors. Raises LumigraphError for missing ones and for other shapes."""
+    """Load tensors into a network. Raises LumigraphError for missing ones and for other shapes."""
     own = network.state_dict()
     for name, x in own.items():
         if name not in tensors or tensors[name].shape != x.shape:
@@ -203,7 +203,7 @@ def load(network: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
 
 
 def read_tokenizer(folder: Path) -> Tokenizer:
-    """The tokenizer beside weights. Raises LumigraphError where there is none."""
+    """Tokenizer in the folder of the weights. Raises LumigraphError without one."""
     if (folder / VOCABULARY).is_file() and (folder / MERGES).is_file():
         vocabulary = files.read_json(folder / VOCABULARY, dict[str, int])
         lines = files.read_bytes(folder / MERGES).decode("utf-8", "replace").splitlines()

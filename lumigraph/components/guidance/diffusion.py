@@ -2,7 +2,7 @@
 
     model_index.json · unet/ · scheduler/ · text_encoder/ · tokenizer/ · vae/    diffusers' folder; safetensors alone
 
-The text encoder is CLIP's, as in Stable Diffusion 1 and 2. A folder without vae/ is a model of pixels.
+The text encoder is CLIP's, as in Stable Diffusion 1 and 2. Without vae/ it is a pixel-space model.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class DiffusionGuide:
         return self.encoder.states(self.tokenizer([prompt]).to(self.kept.device))
 
     def latents(self, pictures: Pictures, generator: torch.Generator) -> Float[Tensor, "picture channel h w"]:
-        """Input of the model: pictures in [-1, 1], encoded where it has an encoder."""
+        """Latents of pictures: scaled to [-1, 1], encoded if the model has an encoder."""
         x = 2 * pictures - 1
         if self.vae is None:
             return x
@@ -82,7 +82,7 @@ class DiffusionGuide:
     def predicted(
         self, noisy: Float[Tensor, "picture channel h w"], time: Int[Tensor, " picture"], states: Tensor
     ) -> Float[Tensor, "picture channel h w"]:
-        """Noise that the model finds in noisy pictures."""
+        """Predicted noise of noisy pictures."""
         out = self.unet(noisy, time, encoder_hidden_states=states).sample
         if not self.velocity:
             return out
@@ -111,7 +111,7 @@ class DiffusionGuide:
     def loss(
         self, pictures: Pictures, prompts: tuple[str, ...], generator: torch.Generator, numbers: DistillationNumbers
     ) -> Tensor:
-        """Half the squared distance to the latents one gradient further: its gradient is that of eq. 3."""
+        """Half the squared distance to the latents after one gradient step: its gradient is that of eq. 3."""
         latents = self.latents(pictures, generator)
         goal = latents.detach() - self.gradient(latents.detach(), prompts, generator, numbers)
         return 0.5 * (latents - goal).square().sum() / len(latents)
@@ -131,7 +131,7 @@ class DiffusionGuide:
 
 
 def part_of(path: Path, name: str, kind: str) -> Any:
-    """A part of a folder of diffusers. Raises LumigraphError where it is not there or of another kind."""
+    """A part of a diffusers folder. Raises LumigraphError if it is missing or of another kind."""
     try:
         library = importlib.import_module("diffusers")
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Guides: models that judge pictures by a prompt; CLIP as one (Radford 2021)."""
+"""Guides: models that score pictures by a prompt; CLIP as one (Radford 2021)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,10 @@ class DistillationNumbers:
 
 @runtime_checkable
 class Guide(Protocol):
-    """pixels:   sides of the pictures that it judges
-    named_views: True if it follows prompts that name the view (Poole 2022, section 3.2)
+    """Model that scores pictures by a prompt.
+
+    pixels:      sides of its input pictures
+    named_views: True for prompts with the name of the view (Poole 2022, section 3.2)
     """
 
     pixels: int
@@ -39,7 +41,7 @@ class Guide(Protocol):
     def loss(
         self, pictures: Pictures, prompts: tuple[str, ...], generator: torch.Generator, numbers: DistillationNumbers
     ) -> Tensor:
-        """Scalar that falls where pictures, sRGB in [0, 1], come closer to their prompts."""
+        """Loss of pictures, sRGB in [0, 1], for their prompts."""
 
     def score(self, pictures: Pictures, prompt: str) -> Score:
         """Mean agreement of pictures with a prompt."""
@@ -65,7 +67,7 @@ class ClipGuide:
     def loss(
         self, pictures: Pictures, prompts: tuple[str, ...], generator: torch.Generator, numbers: DistillationNumbers
     ) -> Tensor:
-        """1 - g(I)^T h(y), averaged over pictures (Jain 2022, eq. 5, but for the constant)."""
+        """1 - g(I)^T h(y), averaged over pictures (Jain 2022, eq. 5, without the constant)."""
         return 1 - (self.network.of_pictures(pictures) * self.captions(prompts)).sum(-1).mean()
 
     @torch.no_grad()

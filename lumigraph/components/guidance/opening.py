@@ -14,9 +14,9 @@ from .guides import ClipGuide, Guide
 
 
 def open_guide(path: Path, device: torch.device) -> Guide:
-    """The model in a file or folder, kept open while the process runs.
+    """Open the model in a file or folder, cached for the process.
 
-    A folder of diffusers is a diffusion model, anything else CLIP. Raises LumigraphError for what is neither.
+    A folder of diffusers is a diffusion model, anything else CLIP. Raises LumigraphError for any other content.
     """
     return _open(path, device)
 

@@ -1,4 +1,4 @@
-"""Guidance: a part that leads a scene to a prompt through random views, by CLIP or by score distillation, with the
+"""Guidance: a part that optimises a scene for a prompt through random views, by CLIP or by score distillation, with the
 transmittance prior (Jain 2022, arXiv 2112.01455; Poole 2022, arXiv 2209.14988)."""
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CAMERA_DISTANCE = 4.0  # distance of cameras from the origin, in scene units
 
 @dataclass(frozen=True)
 class GuidanceNumbers:
-    """A Config's numbers of guidance by words: Jain 2022, section 4 and the released code."""
+    """A Config's numbers of text guidance: Jain 2022, section 4 and the released code."""
 
     render_width: Pixels = 168  # pixels a side of a training view; more show detail and cost time
     crop_share: PositiveShare = 154 / 168  # width of a random crop as a share of the view; less: stronger augmentation
@@ -66,9 +66,9 @@ TINY_GUIDANCE = GuidanceNumbers(
 
 
 class Guidance(Part):
-    """Loss terms of a scene's views under a prompt.
+    """Loss terms of a scene's views for a prompt.
 
-    origin: running mean of the scene's centre of mass, at which cameras look
+    origin: running mean of the scene's centre of mass, target of the cameras
     """
 
     origin: Tensor
@@ -80,14 +80,14 @@ class Guidance(Part):
         self.guide: Guide | None = None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Guidance:
-        """A copy with a buffer of its own; the guide is shared, for it learns nothing."""
+        """A copy with its own buffer; the guide, which is not trained, is shared."""
         copied = Guidance(self.numbers, self.distillation).train(self.training)
         copied.origin, copied.guide = self.origin.clone(), self.guide
         memo[id(self)] = copied
         return copied
 
     def views(self, words: Words, generator: torch.Generator) -> PromptedViews:
-        """Random cameras around the scene, with the prompts that name them. Raises LumigraphError without guidance."""
+        """Random cameras around the scene, with their prompts. Raises LumigraphError without guidance."""
         n = self.numbers
         if words.guidance is None:
             raise LumigraphError(
@@ -126,6 +126,6 @@ class Guidance(Part):
 
     @torch.no_grad()
     def follow(self, points: Float[Tensor, "ray 3"], opacity: Float[Tensor, " ray"]) -> None:
-        """Move the origin towards the centre of mass of a step's views. points: of rays, weighted by opacity"""
+        """Update the origin by the centre of mass of a step's views. points: of rays, weighted by opacity"""
         if (total := opacity.sum()) > 0:
             self.origin.lerp_((points.sum(0) / total).to(self.origin), 1 - self.numbers.origin_decay)

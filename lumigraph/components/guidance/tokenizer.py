@@ -1,4 +1,4 @@
-"""Tokenizer of CLIP: byte pairs of lower-case text (Radford 2021, section 2.4; Sennrich 2016)."""
+"""Tokenizer of CLIP: byte pair encoding of lower-case text (Radford 2021, section 2.4; Sennrich 2016)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ PIECES = re.compile(r"'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+", re.I
 
 
 class Tokenizer:
-    """Numbers of a caption's tokens between those of begin and end.
+    """Token numbers of captions, with begin and end tokens.
 
     vocabulary: number of each token
-    merges:     pairs of tokens that become one, the most frequent first
-    context:    tokens of a caption
-    padding:    token behind the end
+    merges:     pairs of tokens to merge, the most frequent first
+    context:    number of tokens of a caption
+    padding:    token after the end
     """
 
     def __init__(
@@ -36,7 +36,7 @@ class Tokenizer:
         self.ranks = {pair: rank for rank, pair in enumerate(merges)}
 
     def __call__(self, captions: Sequence[str]) -> Int[Tensor, "caption token"]:
-        """Tokens of captions. Raises LumigraphError for a caption with none, or in a script without tokens."""
+        """Tokens of captions. Raises LumigraphError for an empty caption, or a script without tokens."""
         rows = []
         for caption in captions:
             tokens = [number for piece in self.pieces(caption) for number in self.numbers(piece, caption)]
@@ -61,7 +61,7 @@ class Tokenizer:
         return [self.vocabulary[part] for part in parts]
 
     def merged(self, piece: str) -> list[str]:
-        """Tokens of a piece: its bytes, pairs of which are merged while there are merges."""
+        """Tokens of a piece: its bytes, merged pair by pair."""
         parts = [byte_names()[byte] for byte in piece.encode()]
         parts[-1] += WORD_END
         while len(parts) > 1:
@@ -79,7 +79,7 @@ class Tokenizer:
 
     @staticmethod
     def of_words(words: Iterable[str], context: int) -> Tokenizer:
-        """A tokenizer with one token for each of some words, and the letters they are made of."""
+        """A tokenizer with one token for each of some words, and for their letters."""
         names = dict.fromkeys(x for word in words for letter in word for x in (letter, letter + WORD_END))
         merges = dict[tuple[str, str], None]()
         for word in words:
@@ -92,7 +92,7 @@ class Tokenizer:
 
 @cache
 def byte_names() -> list[str]:
-    """A visible letter for each byte, as GPT-2's and CLIP's vocabularies write them."""
+    """Printable character for each byte, as in GPT-2's and CLIP's vocabularies."""
     shown = {*range(33, 127), *range(161, 173), *range(174, 256)}
     hidden = [byte for byte in range(256) if byte not in shown]
     return [chr(byte) if byte in shown else chr(256 + hidden.index(byte)) for byte in range(256)]

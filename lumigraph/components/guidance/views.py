@@ -1,4 +1,4 @@
-"""Views of a scene that is learnt from words: cameras around it, random crops, and random backgrounds."""
+"""Views for text guidance: cameras around a scene, random crops, and random backgrounds."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FRONT_DEGREES, OVERHEAD_DEGREES = 60.0, 60.0  # half-width of front and back vie
 
 @dataclass(frozen=True)
 class PromptedViews:
-    """Cameras around a scene, and the prompt of each."""
+    """Cameras around a scene, with a prompt each."""
 
     unit: ClassVar[str] = "views"
 
@@ -44,7 +44,7 @@ def camera_around(
     pixels: int,
     origin: Float[Tensor, " 3"],
 ) -> Camera:
-    """Cameras turned to an origin. Angles in degrees, the distance in scene units, the focal length in widths."""
+    """Cameras looking at an origin. Angles in degrees, the distance in scene units, the focal length in widths."""
     a, e = azimuth.deg2rad(), elevation.deg2rad()
     outward = torch.stack([e.cos() * a.cos(), e.cos() * a.sin(), e.sin()], -1).to(origin)
     pose = look_at(origin + distance * outward, -outward, origin.new_tensor([0.0, 0.0, 1.0]))
@@ -64,7 +64,7 @@ def named_view(azimuth: float, elevation: float) -> str:
 def cropped(
     rgba: Float[Tensor, "4 height width"], count: int, share: float, size: int, generator: torch.Generator
 ) -> Float[Tensor, "crop 4 size size"]:
-    """Random square crops of a premultiplied picture, as wide as a share of it, resized."""
+    """Random square crops of a premultiplied picture, of a share of its width, resized."""
     side = rgba.shape[-1]
     width = max(1, round(share * side))
     corners = torch.randint(side - width + 1, (count, 2), generator=generator).tolist()
@@ -75,7 +75,7 @@ def cropped(
 def before_backgrounds(
     rgba: Float[Tensor, "crop 4 size size"], generator: torch.Generator
 ) -> Float[Tensor, "crop 3 size size"]:
-    """Premultiplied pictures, each before a random background."""
+    """Premultiplied pictures composited over random backgrounds."""
     behind = backgrounds(len(rgba), rgba.shape[-1], generator).to(rgba)
     return over(rgba[:, :3].movedim(1, -1), rgba[:, 3], behind.movedim(1, -1)).movedim(-1, 1)
 
@@ -93,7 +93,7 @@ def backgrounds(count: int, size: int, generator: torch.Generator) -> Float[Tens
 
 
 def textures(count: int, size: int, generator: torch.Generator) -> Float[Tensor, "count 3 size size"]:
-    """Random textures whose amplitude falls with frequency (Mordvintsev 2018)."""
+    """Random textures with amplitude falling with frequency (Mordvintsev 2018)."""
     y, x = torch.fft.fftfreq(size)[:, None], torch.fft.rfftfreq(size)
     frequency = (x.square() + y.square()).sqrt().clamp_min(1 / size)
     spectrum = torch.randn(2, count, 3, size, size // 2 + 1, generator=generator)
@@ -121,7 +121,7 @@ def degrees_between(low: float, high: float, count: int, generator: torch.Genera
 
 
 def opacity_target(start: float, end: float, steps: int, step: int, focal: float, distance: float) -> float:
-    """Mean opacity of a picture that the transmittance prior asks for: falling exponentially, in proportion to the area
-    that a scene has in the picture (Jain 2022, section 4.2 and released code)."""
+    """Target of a picture's mean opacity in the transmittance prior: falling exponentially, proportional to the scene's
+    area in the picture (Jain 2022, section 4.2 and released code)."""
     share = min(step / steps, 1.0) if steps else 1.0
     return min(1.0, start * math.pow(end / start, share) * focal**2 / (distance / 4) ** 2 / 1.2)

@@ -1,1 +1,1 @@
-"""Image-based rendering: photographs that a method keeps, a depth map of each, and the surface seen by a new camera."""
+"""Image-based rendering: stored photographs with depth maps, and the surface visible in a new camera."""

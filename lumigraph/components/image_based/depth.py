@@ -1,4 +1,4 @@
-"""A depth map of every photograph, without gaps: by multi-view stereo, as measured, from a hull, a mesh, or a plane."""
+"""Complete depth maps of photographs: by multi-view stereo, measurement, a visual hull, a mesh, or a plane."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ OPAQUE = 0.5  # alpha above which a pixel shows a surface
 class CompleteDepth:
     """Depth at every pixel of a grid over a photograph, through its own lens.
 
-    distance:   along rays, scene units; infinity where nothing is, NaN where the photograph is not to be trusted
+    distance:   along rays, scene units; infinity for empty space, NaN for untrusted pixels
     confidence: in [0, 1]
     """
 
@@ -59,7 +59,7 @@ class CompleteDepth:
 def complete_depths(
     scene: Scene, photographs: Sequence[Photograph], geometry: Geometry, size: int, mesh_file: str, seconds: float
 ) -> list[CompleteDepth]:
-    """Depth of the training photographs. size: pixels along the longer side at most; seconds: for stereo, about."""
+    """Depth of the training photographs. size: largest longer side in pixels; seconds: time for stereo, about"""
     grids = [depth_camera(photograph.camera, size) for photograph in photographs]
     found: list[Float[Tensor, "height width"]]
     if geometry == "stereo":
@@ -96,7 +96,7 @@ def depth_camera(camera: Camera, size: int) -> Camera:
 
 
 def flattened(photograph: Photograph) -> Photograph:
-    """A photograph through a lens that `kernels.blend_views` knows: others are resampled to a pinhole."""
+    """A photograph through a lens that `kernels.blend_views` supports: others are resampled to a pinhole."""
     if type(photograph.camera.lens) in (Pinhole, OpenCV):
         return photograph
     view = flat_view(photograph, max(photograph.rgb.shape[:2]))
@@ -107,7 +107,7 @@ def flattened(photograph: Photograph) -> Photograph:
 
 
 def _stereo(scene: Scene, grids: Sequence[Camera], size: int, seconds: float) -> list[Float[Tensor, "height width"]]:
-    """Depth on which neighbouring photographs agree, NaN elsewhere."""
+    """Consistent depth of neighbouring photographs, NaN elsewhere."""
     if len(grids) < 2:
         raise LumigraphError(
             f"{scene.source} has {len(grids)} photograph to learn from, and stereo needs two; add photographs, or "
@@ -143,14 +143,14 @@ def _stereo(scene: Scene, grids: Sequence[Camera], size: int, seconds: float) ->
 
 
 def resampled(seen: DepthMap, grid: Camera) -> Float[Tensor, "height width"]:
-    """A depth map of the same place through another lens: the nearest pixel's distance; NaN outside."""
+    """A depth map of the same position resampled to another lens: the nearest pixel's distance; NaN outside."""
     pixels, valid = seen.camera.project(grid.rays(grid.pixels()).at(torch.ones(int(grid.size.prod()))))
     inside = seen.inside(pixels, valid)
     return torch.where(inside, seen.at_pixels(seen.depth, pixels), torch.nan).view(shape(grid))
 
 
 def _measured(photograph: Photograph, grid: Camera) -> Float[Tensor, "height width"]:
-    """A photograph's layer of depth at the pixels of its depth map, each the nearest one's."""
+    """A photograph's depth layer, resampled to its depth map's pixels, each by the nearest."""
     depth = photograph.extra["depth"]
     return interpolate(depth[None, None], shape(grid), mode="nearest-exact")[0, 0]
 
@@ -195,7 +195,7 @@ def mesh_distance(vertices: Tensor, faces: Tensor, camera: Camera) -> Float[Tens
 def typical_inverse_depth(
     scene: Scene, grids: Sequence[Camera], found: Sequence[Float[Tensor, "height width"]]
 ) -> float:
-    """Optimum of a single plane, 1 / z = (1 / near + 1 / far) / 2 (Chai 2000, eq. 10), over known depth."""
+    """Optimal single plane, 1 / z = (1 / near + 1 / far) / 2 (Chai 2000, eq. 10), over known depth."""
     known = [
         grid.cosines()[depth.isfinite()] * depth[depth.isfinite()] for depth, grid in zip(found, grids, strict=True)
     ]
@@ -217,7 +217,7 @@ def completed(
         sum_known (s - s_0)^2 + sum_neighbours w (s - s')^2,    w = exp(-(grey - grey')^2 / 2 0.06^2)
 
     of s = 1 / z, which is linear in the pixel on a plane (as Levin 2004 for colours).
-    alone: 1 / z of a photograph of which nothing is known
+    alone: 1 / z of a photograph without known depth
     """
     picture = torch.cat([photograph.rgb, photograph.rgb.new_ones(*photograph.rgb.shape[:2], 2)], -1)
     if photograph.alpha is not None:
@@ -260,7 +260,7 @@ def _filled(inverse: Tensor, known: Bool[Tensor, "height width"], solid: Tensor,
 
 
 def links(grey: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights w between pixels and their right neighbours, and those below."""
+    """Weights w of pixels with their right neighbours, and with those below."""
 
     def between(a: Tensor, b: Tensor, both: Tensor) -> Tensor:
         return (torch.exp(-((a - b) ** 2) / (2 * COLOUR_DEVIATION**2)) + MIN_LINK) * both
@@ -270,7 +270,7 @@ def links(grey: Tensor, solid: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def relaxed(values: Tensor, known: Tensor, right: Tensor, down: Tensor) -> Tensor:
-    """Sweeps of Jacobi: unknown values become the weighted means of their neighbours."""
+    """Jacobi sweeps: unknown values become the weighted means of their neighbours."""
     total = torch.full_like(values, 1e-9)
     total[:, 1:] += right
     total[:, :-1] += right

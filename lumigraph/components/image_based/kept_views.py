@@ -1,4 +1,4 @@
-"""Photographs that a method keeps as bytes, with a depth map of each."""
+"""Photographs stored in a method as bytes, with a depth map of each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FLAT_LIMIT = math.tan(math.radians(89.0))
 
 @dataclass(frozen=True)
 class DepthGrid:
-    """The surface that one photograph sees, as triangles between the pixels of its depth map.
+    """Visible surface of one photograph, as triangles between the pixels of its depth map.
 
     faces: of neighbouring pixels at about the same distance
     """
@@ -38,9 +38,9 @@ class DepthGrid:
 
 @dataclass
 class ViewTables:
-    """Photographs as `kernels.blend_views` takes them.
+    """Photographs as input of `kernels.blend_views`.
 
-    pictures: colours before the background, and alpha where photographs have it
+    pictures: colours over the background, and alpha if photographs have it
     """
 
     cameras: Camera
@@ -53,7 +53,7 @@ class ViewTables:
     grids: dict[int, DepthGrid] = field(default_factory=dict)
 
     def nearest(self, camera: Camera, count: int) -> list[int]:
-        """Photographs by the distance of their places from a camera, in depths of the scene, and the turn between."""
+        """Photographs sorted by distance from a camera, in depths of the scene, and rotation between."""
         apart = (self.cameras.position - camera.position).norm(dim=-1) / self.middle
         if isinstance(camera.lens, Pinhole | OpenCV):
             apart = apart + TURN_WEIGHT * (1 - self.cameras.forward @ camera.forward[0])
@@ -63,7 +63,7 @@ class ViewTables:
 class KeptViews(nn.Module):
     """Photographs as bytes, cameras, and two numbers for each pixel of their depth maps: distance and confidence.
 
-    depth_size: pixels along the longer side of a depth map at most
+    depth_size: largest longer side of a depth map, pixels
     """
 
     def __init__(self, depth_size: int):
@@ -77,7 +77,7 @@ class KeptViews(nn.Module):
         return bool(self.photographs)
 
     def keep(self, scene: Scene, geometry: Geometry, mesh_file: str, background: Vector, seconds: float) -> None:
-        """Take over the training photographs, and find their depth."""
+        """Store the training photographs, and compute their depth."""
         taken = [flattened(scene.photograph(int(i))) for i in scene.splits["train"]]
         depths = complete_depths(scene, taken, geometry, self.depth_size, mesh_file, seconds)
         device = self.photographs.pixels.rows.device
@@ -91,7 +91,7 @@ class KeptViews(nn.Module):
 
     @property
     def tables(self) -> ViewTables:
-        """Tables made of what is kept, on its device."""
+        """Tables of the stored photographs, on their device."""
         kept = self.photographs
         if self._tables is None or self._tables.pictures.device != kept.pixels.rows.device:
             self._tables = self._made()
@@ -121,7 +121,7 @@ class KeptViews(nn.Module):
         return ViewTables(cameras.to(device), pixels, depths, sizes, poses, lenses, middle)
 
     def grid(self, i: int) -> DepthGrid:
-        """The surface that one photograph sees."""
+        """Visible surface of one photograph."""
         tables = self.tables
         if i not in tables.grids:
             width, height = tables.sizes[i, 2:].tolist()
@@ -133,7 +133,7 @@ class KeptViews(nn.Module):
 
 
 def depth_grid(camera: Camera, distance: Float[Tensor, "height width"], confidence: Tensor) -> DepthGrid:
-    """Two triangles between any four neighbouring pixels that see one surface."""
+    """Two triangles between any four neighbouring pixels on one surface."""
     height, width = distance.shape
     distance = continued(distance)
     places = camera.rays(camera.pixels()).at(distance.flatten().nan_to_num(0.0, 0.0))
@@ -146,7 +146,9 @@ def depth_grid(camera: Camera, distance: Float[Tensor, "height width"], confiden
 
 
 def continued(distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Distances of a surface continued by one pixel to where nothing is: photographs' alpha knows its edge better."""
+    """Distances of a surface extrapolated by one pixel into empty space: photographs' alpha has its edge more
+    exactly.
+    """
     there = distance.isfinite()
     stacked = torch.stack([torch.where(there, distance, 0), there.float()])[None]
     total, share = avg_pool2d(stacked, 3, 1, 1)[0]
@@ -154,7 +156,7 @@ def continued(distance: Float[Tensor, "height width"]) -> Float[Tensor, "height 
 
 
 def lens_row(camera: Camera) -> Float[Tensor, " 13"]:
-    """Numbers of a flat lens for `kernels.blend_views`."""
+    """Parameters of a flat lens for `kernels.blend_views`."""
     lens = camera.lens
     if isinstance(lens, OpenCV):
         return torch.cat([lens.focal[0], lens.centre[0], lens.distortion[0], lens.fold[0]])
@@ -162,6 +164,6 @@ def lens_row(camera: Camera) -> Float[Tensor, " 13"]:
 
 
 def focal_length(camera: Camera) -> float:
-    """Focal length in the middle of a picture, in pixels: the inverse of the angle that a pixel sees."""
+    """Focal length at the centre of a picture, in pixels: the inverse of the angle of a pixel."""
     middle = camera.rays(camera.size[:1].float() / 2)
     return PIXEL_RADIUS / float(middle.radius[0])

@@ -1,4 +1,4 @@
-"""ImageBasedMethod: a method whose state is its photographs, with a depth map of each; nothing is learnt."""
+"""ImageBasedMethod: a method of stored photographs, with a depth map of each, without training."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ STEREO_SHARE = 0.8  # of a budget in seconds, for depth
 
 
 class ImageBasedMethod(Method):
-    """Photographs are kept in `begin`, by `keep`; a picture is made of them.
+    """Image-based method: `begin` stores photographs, by `keep`; pictures are rendered from them.
 
-    views: what is kept; config has `depth_size`
+    views: stored photographs; config has `depth_size`
     """
 
     any_lens: ClassVar[bool] = True
@@ -27,22 +27,22 @@ class ImageBasedMethod(Method):
         self.views = KeptViews(config.depth_size)
 
     def keep(self, data: Scene, geometry: Geometry, seconds: float, mesh_file: str = "") -> None:
-        """Take over the training photographs, and find their depth. seconds: the whole budget"""
+        """Store the training photographs, and compute their depth. seconds: the whole budget"""
         self.views.keep(data, geometry, mesh_file, self.frame.background, STEREO_SHARE * seconds)
 
     @property
     def complete(self) -> bool:
-        """True once the photographs are kept."""
+        """True after the photographs are stored."""
         return bool(self.views)
 
     def steps_for(self, quality: Any, data: Any) -> int:
-        """One, in which nothing happens."""
+        """One step, which does nothing."""
         return 1
 
     def batch(self, data: Scene, generator: Any) -> Photograph:
-        """The first photograph, for the trainer to count."""
+        """The first photograph, since the trainer needs a batch."""
         return data.photograph(int(data.splits["train"][0]))
 
     def step(self, batch: Photograph, step: int, descend: Descend) -> dict[str, Tensor]:
-        """Nothing is left to learn once `begin` has kept the photographs."""
+        """Do nothing: `begin` has stored the photographs."""
         return {}

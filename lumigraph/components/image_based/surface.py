@@ -1,4 +1,4 @@
-"""The surface that a new camera sees, from depth maps of photographs around it."""
+"""Visible surface of a new camera, from depth maps of photographs around it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EDGE_REACH = 0.5  # pixels of a depth map, by which a surface is continued beyon
 
 
 def warped(grid: DepthGrid, camera: Camera) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width"]]:
-    """Distance and confidence of one photograph's surface in a new camera; 0 confidence where it has none."""
+    """Distance and confidence of one photograph's surface in a new camera; confidence 0 without a surface."""
     height, width = shape(camera)
     pixels, valid = camera.project(grid.vertices)
     away = (grid.vertices - camera.position).norm(dim=-1)
@@ -42,13 +42,13 @@ def warped(grid: DepthGrid, camera: Camera) -> tuple[Float[Tensor, "height width
 def surface_seen(
     views: KeptViews, chosen: Sequence[int], camera: Camera, closed: bool
 ) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """Distance to the surface at each pixel, and whether any photograph has one there.
+    """Distance to the surface at each pixel, and a mask of pixels with a surface in any photograph.
 
-    The nearest surface counts that has MIN_SUPPORT of the confidence of the best supported one; its distance is the
-    mean over all that agree. Nearer photographs count more: at a photograph's place its own depth alone.
+    The nearest surface with MIN_SUPPORT of the highest confidence is used; its distance is the mean of all that agree.
+    Nearer photographs have more weight: at a photograph's position only its own depth counts.
     chosen: numbers of photographs, nearest first
-    closed: fill in all pixels without any, from what is around, farther surfaces first; else those beside a surface
-            alone, where alpha shows its edge more finely than the depth maps
+    closed: fill in all pixels without a surface from around, farther surfaces first; else only pixels beside a surface,
+            where alpha shows its edge more finely than the depth maps
     """
     maps = [warped(views.grid(i), camera) for i in chosen]
     near = nearness(views, chosen, camera)
@@ -75,7 +75,7 @@ def nearness(views: KeptViews, chosen: Sequence[int], camera: Camera) -> list[fl
 def consensus(
     distance: Float[Tensor, "map height width"], weight: Float[Tensor, "map height width"]
 ) -> Float[Tensor, "height width"]:
-    """Distance of the nearest well supported surface; 0 where there is none."""
+    """Distance of the nearest well supported surface; 0 without one."""
     support = [(weight * ((distance - one).abs() < AGREEMENT * one)).sum(0) for one in distance]
     best = MIN_SUPPORT * torch.stack(support).amax(0)
     nearest = torch.full_like(distance[0], torch.inf)

@@ -1,4 +1,4 @@
-"""Forward warping: points splatted softly into a picture, and its holes filled."""
+"""Forward warping: soft splatting of points into a picture, and hole filling."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def soft_splat(
     size: tuple[int, int],
     footprint: float,
 ) -> tuple[Float[Tensor, "height width channel"], Float[Tensor, "height width"]]:
-    """Softmax splatting (Niklaus and Liu 2020, eq. 11): points add to the four pixels around their places with weights
+    """Softmax splatting (Niklaus and Liu 2020, eq. 11): points add to the four pixels around them with weights
 
         w = b exp(Z),    value = sum w v / sum w
 
-    with the bilinear b of each pixel and importance Z: of two points at one pixel the more important one counts. Also
-    returns sum b, the cover. `importance` is first made relative to the largest around each pixel, so that exp neither
-    overflows nor vanishes.
-    footprint: pixels between neighbouring points, about; where more than one, points are as wide
+    with the bilinear b of each pixel and importance Z: of two points at one pixel the more important one dominates.
+    Also returns sum b, the coverage. `importance` is first made relative to the largest around each pixel, so that exp
+    neither overflows nor vanishes.
+    footprint: pixels between neighbouring points, about; above one, points are enlarged to it
     """
     height, width = size
     reach = max(1, min(MAX_FOOTPRINT, math.ceil(footprint)))
@@ -78,7 +78,7 @@ def behind(
     distance: Float[Tensor, "height width"],
     known: Bool[Tensor, "height width"],
 ) -> Float[Tensor, "height width channel"]:
-    """Fill in unknown values from farther surfaces around them: what comes into view beside an edge is background."""
+    """Fill in unknown values from farther surfaces around them: disocclusions show background."""
     if known.all():
         return values
     farthest = max_pool2d((distance * known)[None], 2 * HOLE_RADIUS + 1, 1, HOLE_RADIUS)[0]

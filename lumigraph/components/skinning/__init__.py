@@ -1,1 +1,1 @@
-"""Skinning: bones at moments with learnt corrections, weights of bones as a volume, and the poses of a user."""
+"""Skinning: bones over time with learnt corrections, a volume of skinning weights, and poses of a user."""

@@ -1,4 +1,4 @@
-"""Articulated: what methods of bodies on bones share, their moment and a user's poses."""
+"""Articulated: common part of methods of bodies on bones: time and a user's poses."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class Articulated(Method):
     bones: BoneMotion
 
     def moment_of(self, camera: Camera | None = None) -> float:
-        """The shown moment: of the settings, else of the camera, else the first."""
+        """Current time: of the settings, else of the camera, else the first."""
         if "time" not in self.settings and camera is not None and camera.time is not None:
             return float(camera.time[0])
         first, _ = self.frame.times or (0.0, 0.0)
         return float(self.settings.get("time", first))
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
-        """The same in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError
-        for a file that holds none of this character."""
+        """The method in other poses: `pose` names a bones.json, joint angles or a glTF animation. Raises LumigraphError
+        for a file without poses of this character."""
         told = super().given(*evidence, **controls)
         if (path := str(controls.get("pose", CAPTURED))) not in (CAPTURED, AT_REST):
             clip_of(path, self.frame)

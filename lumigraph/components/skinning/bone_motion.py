@@ -1,4 +1,4 @@
-"""Bones of a character at any moment, with learnt corrections of its pose (Weng 2022, section 3.2)."""
+"""Bones of a character at any time, with learnt corrections of its pose (Weng 2022, section 3.2)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SMOOTHINGS = 10  # over the budget
 
 @dataclass(frozen=True)
 class BoneNumbers:
-    """A Config's numbers of the corrections of poses."""
+    """A Config's numbers of pose correction."""
 
     pose_correction: Literal["no", "table", "network"] = "network"  # corrections of joints: none, of each moment, a MLP
     pose_lr: LearningRate = 5e-5  # learning rate of the corrections; of a table in radians a step
@@ -48,14 +48,14 @@ class BoneNumbers:
 
 
 class BoneMotion(Part):
-    """Transforms of bones from rest to a moment: M_k = G_k G_k(rest)^-1.
+    """Transforms of bones from rest to a time: M_k = G_k G_k(rest)^-1.
 
     Every joint turns in its parent by the capture's rotation and a learnt one (Weng 2022, eq. 6); lengths of bones
-    stay. Between two moments of the capture joints are interpolated.
+    stay. Between two times of the capture joints are interpolated.
     quaternions: given rotations of joints in their parents; with `pose_smoothing` after it
-    seen:     moments with photographs, which are smoothed;  smoothings: number of them that were due so far
-    turns:    learnt rotation vectors of each moment's joints, radians, one after another, with "table"
-    network:  angles of all joints to these, with "network"
+    seen:     times with photographs, which are smoothed;  smoothings: number of completed smoothings
+    turns:    learnt rotation vectors of each time's joints, radians, one after another, with "table"
+    network:  maps angles of all joints to these, with "network"
     """
 
     times: Tensor
@@ -111,7 +111,7 @@ class BoneMotion(Part):
 
     @torch.no_grad()
     def smooth(self) -> None:
-        """Smooth the poses of photographs with their corrections so far, each joint over time. A network's corrections
+        """Smooth the poses of photographs with their current corrections, each joint over time. A network's corrections
         follow from the given poses, so those are smoothed once."""
         if self.seen.any() and (self.network is None or not self.smoothings):
             self.quaternions[self.seen] = smoothed(self.corrected()[self.seen], self.times[self.seen])
@@ -124,14 +124,14 @@ class BoneMotion(Part):
         return self.angles_of(self.quaternions)
 
     def angles_of(self, turns: Float[Tensor, "moment bone 4"]) -> Float[Tensor, "moment angle"]:
-        """Omega: rotation vectors of joints in their parents from their pose at rest, radians, but for roots."""
+        """Omega: rotation vectors of joints in their parents from the rest pose, radians, without roots."""
         moved = multiply(self.back.expand_as(turns).flatten(0, 1), turns.flatten(0, 1))
         vectors = rotation_vectors(moved).view(len(turns), -1, 3)
         return vectors[:, [parent >= 0 for parent in self.skeleton.parents]].flatten(1)
 
     def corrections(self) -> Float[Tensor, "moment bone 3"] | None:
-        """Learnt rotation vectors of all joints, radians; None without any. Those of a table have no mean over learnt
-        moments, for it would be another body at rest."""
+        """Learnt rotation vectors of all joints, radians; None without any. Those of a table have zero mean over
+        training times, which would change the rest pose."""
         if self.turns is not None:
             turns = self.turns.view(len(self.times), -1, 3)
             learnt = (turns.detach() != 0).any(-1, keepdim=True)
@@ -149,7 +149,7 @@ class BoneMotion(Part):
     # At moments
 
     def local(self, times: Float[Tensor, " time"]) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
-        """Rotations and positions of joints in their parents at moments of the capture."""
+        """Rotations and positions of joints in their parents at times of the capture."""
         before, after, share = between_moments(self.times, times.to(self.times))
         turns, share = self.corrected(), share[:, None, None]
         first, second = turns[before], turns[after]
@@ -176,7 +176,7 @@ class BoneMotion(Part):
     def transforms(
         self, turns: Float[Tensor, "time bone 4"], places: Float[Tensor, "time bone 3"]
     ) -> Float[Tensor, "time bone 3 4"]:
-        """Transforms of the bones from rest to poses that are given in their parents."""
+        """Transforms of the bones from rest to poses relative to their parents."""
         matrices = to_matrix(turns.flatten(0, 1)).view(len(turns), -1, 3, 3)
         joints = posed(self.skeleton.parents, torch.cat([matrices, places[..., None]], -1))
         return rigid_product(joints, self.home.expand_as(joints))
@@ -223,16 +223,16 @@ def _clip(path: Path, changed: int, frame: Frame) -> BoneMotion:
 
 
 def clip_of(path: str, frame: Frame) -> BoneMotion:
-    """Poses in a file for the bones of a scene, at its moments. Raises LumigraphError for a file without any."""
+    """Poses in a file for the bones of a scene, at its times. Raises LumigraphError for a file without any."""
     file = Path(path).expanduser()
     return _clip(file, file.stat().st_mtime_ns if file.is_file() else 0, frame)
 
 
 def smoothed(turns: Float[Tensor, "moment bone 4"], times: Float[Tensor, " moment"]) -> Float[Tensor, "moment bone 4"]:
-    """Unit quaternions on smoothing splines over time, one for each number of each joint.
+    """Unit quaternions smoothed by splines over time, one for each component of each joint.
 
-    The weight of a spline's curvature is that of least generalised cross-validation (Wahba 1990, section 4.3): large
-    for errors that differ from moment to moment, and next to none for exact poses of a smooth motion.
+    The smoothing weight minimises generalised cross-validation (Wahba 1990, section 4.3): large for errors that are
+    independent over time, and close to zero for exact poses of a smooth motion.
     """
     flips = torch.where((turns[1:] * turns[:-1]).sum(-1, keepdim=True) < 0, -1.0, 1.0).cumprod(0)
     even = torch.cat([turns[:1], turns[1:] * flips]).flatten(1).cpu().double().numpy()
@@ -248,7 +248,7 @@ def exponential(omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 4"]:
 
 
 def rotation_vectors(quaternions: Float[Tensor, "row 4"]) -> Float[Tensor, "row 3"]:
-    """Rotation vectors of unit quaternions, at most half a turn."""
+    """Rotation vectors of unit quaternions, of angles up to 180 degrees."""
     upright = torch.where(quaternions[:, :1] < 0, -quaternions, quaternions)
     sine = upright[:, 1:].norm(dim=-1, keepdim=True)
     return 2 * torch.atan2(sine, upright[:, :1]) * upright[:, 1:] / sine.clamp_min(1e-12)

@@ -1,4 +1,4 @@
-"""Weights of bones at places of the body at rest, as a learnt volume (Weng 2022, section 3.2 and its supplement)."""
+"""Skinning weights at points of the body at rest, as a learnt volume (Weng 2022, section 3.2 and its supplement)."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class WeightNumbers:
 
 
 class WeightVolume(Part):
-    """Shares w_c of bones, and of what is no body, in a box around the body at rest: the softmax of a learnt volume and
-    the logarithm of a prior, Gaussians around the bones.
+    """Skinning weights w_c, and that of empty space, in a box around the body at rest: the softmax of a learnt volume
+    plus the logarithm of a prior, Gaussians around the bones.
 
     box: lowest and highest corner of the volume
     """
@@ -76,7 +76,7 @@ class WeightVolume(Part):
             self.volume = nn.Parameter(torch.zeros_like(self.prior))
 
     def weights(self) -> Float[Tensor, "channel z y x"]:
-        """Shares of the bones and, as last channel, of no body."""
+        """Weights of the bones and, as last channel, of empty space."""
         if self.volume is not None:
             learnt = self.volume
         else:
@@ -85,11 +85,11 @@ class WeightVolume(Part):
         return torch.softmax(self.prior + learnt, 0)
 
     def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Points as `grid_sample` reads them."""
+        """Points in the coordinates of `grid_sample`."""
         return 2 * (points - self.box[0]) / (self.box[1] - self.box[0]) - 1
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point bone"]:
-        """Shares of the bones at places of the body at rest; they sum to 1."""
+        """Skinning weights at points of the body at rest; they sum to 1."""
         seen = grid_sample(
             self.weights()[None], self.coordinates(points)[None, None, None], padding_mode="border", align_corners=True
         )
@@ -99,7 +99,7 @@ class WeightVolume(Part):
     def of_each(
         self, points: Float[Tensor, "bone point 3"], weights: Float[Tensor, "channel z y x"]
     ) -> Float[Tensor, "bone point"]:
-        """Share of each bone at points of its own; 0 outside the box."""
+        """Weight of each bone at points of its own; 0 outside the box."""
         at = self.coordinates(points)[:, None, None]
         return grid_sample(weights[:-1, None], at, padding_mode="zeros", align_corners=True)[:, 0, 0, 0]
 
@@ -113,7 +113,9 @@ class WeightVolume(Part):
 def segments(
     parents: tuple[int, ...], joints: Float[Tensor, "bone 3"]
 ) -> list[tuple[Float[Tensor, "segment 3"], Float[Tensor, "segment 3"]]]:
-    """Each bone as segments from its joint to those of its children; a bone without any goes on as its parent's did."""
+    """Bones as segments from their joint to those of their children; a bone without children extends its parent's
+    direction.
+    """
     found = []
     for number, parent in enumerate(parents):
         children = [child for child, own in enumerate(parents) if own == number]
@@ -137,9 +139,9 @@ def distance(
 
 
 def shares(away: Float[Tensor, "bone point"]) -> Float[Tensor, "channel point"]:
-    """Logarithm of first shares of bones, and of no body. away: distances to the bones, in their deviations
+    """Log prior of bones, and of empty space. away: distances to the bones, in their deviations
 
-    Near the body it is Gaussians around bones, which share it where they overlap, and farther out the nearest bone's.
+    Near the body it is Gaussians around bones, shared where they overlap, and farther out the nearest bone's.
     """
     body = torch.exp(-0.5 * away.square()).amax(0)
     each = torch.softmax(-0.5 * away.square(), 0).clamp_min(MIN_PRIOR) * body.clamp_min(MIN_PRIOR)

@@ -1,1 +1,1 @@
-"""Tracking: poses of a moving depth camera that are found beside the map."""
+"""Tracking: pose estimation of a moving depth camera, simultaneous with mapping."""

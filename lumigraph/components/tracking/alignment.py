@@ -28,7 +28,7 @@ SMALL_TURN, SMALL_SHIFT = 1e-5, 1e-5  # radians and scene units of a last step
 
 @dataclass(frozen=True)
 class Aligned:
-    """A pose, and the share of the points that lie within half the field's truncation."""
+    """A pose, and the share of inliers: points within half the field's truncation."""
 
     pose: Pose
     share: float
@@ -47,15 +47,15 @@ def aligned(
     unit: float,
     iterations: int,
 ) -> Aligned:
-    """The pose at which points lie on the field's surface.
+    """Pose that aligns points with the field's surface.
 
     field:     signed distance over the truncation, and sRGB-encoded colour, at points of the world
     points:    in the camera's frame
     deviation: standard deviation of each point's distance, over the truncation
     colour_deviation: of luminance; 0: distance alone
     unit:      scene units of a metre
-    Luminance is compared after a gain and an offset by least squares, for the camera's exposure changes. A prior keeps
-    the pose near the first one in directions that points and colours do not determine, as along a bare wall.
+    Luminance is compared after a least-squares gain and offset, for the camera's exposure changes. A prior keeps the
+    pose near the first one in directions that points and colours do not determine, as along a bare wall.
     """
     grey, share = rgb @ rgb.new_tensor(GREY), 0.0
     turn, shift = MOTION_DEVIATION
@@ -95,7 +95,7 @@ def normal_equations(residual: Tensor, slope: Tensor, arm: Tensor, band: Tensor)
     """J^T W J and J^T W r in double precision. J = (arm x slope, slope) of rotation about the camera and shift; W are
     Huber's weights.
 
-    residual: in deviations; slope: of it by the point; arm: from the camera to the point; band: points that count
+    residual: in deviations; slope: its derivative by the point; arm: from the camera to the point; band: valid points
     """
     weight = (HUBER / residual.abs().clamp_min(1e-9)).clamp(max=1) * band
     jacobian = torch.cat([torch.linalg.cross(arm, slope), slope], -1).double()
@@ -104,7 +104,7 @@ def normal_equations(residual: Tensor, slope: Tensor, arm: Tensor, band: Tensor)
 
 
 def exposed(seen: Tensor, target: Tensor, band: Tensor) -> tuple[Tensor, Tensor]:
-    """Gain, and what luminance differs by, after the gain and the offset of least squares."""
+    """Gain, and residual of luminance after least-squares gain and offset."""
     a, b = seen - seen[band].mean(), target - target[band].mean()
     gain = ((a * b)[band].sum() / a[band].square().sum().clamp_min(1e-6)).clamp(0.5, 2.0)
     return gain, gain * a - b

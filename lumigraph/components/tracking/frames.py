@@ -1,4 +1,4 @@
-"""Frames of a depth camera as tracking needs them: rays in the camera's frame, colour and distance of each pixel."""
+"""Frames of a depth camera for tracking: rays in the camera's frame, colour and distance of each pixel."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ...datasets.scene import Scene
 class DepthFrame:
     """One frame. Rays are those of a camera at the origin; pixels are row by row.
 
-    depth: distance along the ray, scene units; NaN where nothing was measured, or the scene has no depth
-    alpha: opacity, where photographs have it
+    depth: distance along the ray, scene units; NaN for unmeasured, or without depth
+    alpha: opacity, for photographs with alpha
     size:  (width, height) of the picture
     """
 
@@ -33,8 +33,8 @@ class DepthFrame:
 
     @staticmethod
     def of(scene: Scene, index: int, device: torch.device, like: DepthFrame | None = None, side: int = 0) -> DepthFrame:
-        """like: another frame, whose rays are taken where the lens is the same; side: pixels of the frame's longer
-        side, about, to which a larger photograph is reduced by a whole number; 0 for the photograph as it is"""
+        """Load a frame. like: another frame, whose rays are reused for the same lens; side: longer side in pixels,
+        about, to which a larger photograph is reduced by an integer; 0 for the photograph's own size"""
         layers = ["depth"] if "depth" in scene.layers else []
         photograph = scene.photograph(index, layers)
         reduction = max(1, round(int(photograph.camera.size.max()) / side)) if side else 1
@@ -52,7 +52,7 @@ class DepthFrame:
         return self.depth.isfinite()
 
     def drawn(self, count: int, generator: torch.Generator, measured: bool = False) -> Int[Tensor, " chosen"]:
-        """Random pixels, of those with depth alone if `measured`."""
+        """Random pixels; with `measured`, among those with depth."""
         if not measured:
             return torch.randint(len(self.depth), (count,), generator=generator).to(self.depth.device)
         there = self.measured.nonzero()[:, 0]
@@ -61,10 +61,10 @@ class DepthFrame:
 
 @dataclass(frozen=True)
 class Moment:
-    """Input of one step: the frame that is next, and the scene for frames of earlier steps.
+    """Input of one step: the next frame, and the scene for earlier frames.
 
     frame:  None after the last one
-    before: images of the frames before, in order
+    before: images of the previous frames, in order
     """
 
     unit: ClassVar[str] = "frames"
@@ -82,5 +82,5 @@ def same_lens(a: Camera, b: Camera) -> bool:
 
 
 def order_of(cameras: Camera) -> Int[Tensor, " frame"]:
-    """Numbers of images in the order in which they were taken: by time, else as they are."""
+    """Image numbers in order of time, else of their numbers."""
     return torch.arange(len(cameras)) if cameras.time is None else cameras.time.cpu().argsort(stable=True)

@@ -1,8 +1,8 @@
-"""Loops: places that a camera comes back to are recognised, and a pose graph spreads the drift over the path.
+"""Loop closure: recognition of revisited places, and pose graph optimisation.
 
-Keyframes that look alike are candidates. Features that both show, with their depth, give a rigid motion between them by
-RANSAC, which is the proof. Poses then minimise the error of motions between neighbours and across loops
-(Grisetti et al. 2010, eq. 7), with a robust loss by SciPy: COLMAP's pose graph holds pairs of views and optimises none.
+Similar keyframes are candidates. Their matched features with depth give a rigid motion by RANSAC, which verifies the
+loop. Poses then minimise the error of motions between neighbours and across loops (Grisetti et al. 2010, eq. 7), with a
+robust loss by SciPy: COLMAP's pose graph stores pairs of views and optimises none.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DEVIATION = 0.01, 0.01  # radians and metres, of the motion from one keyframe to
 
 @dataclass(frozen=True)
 class KeyframePlace:
-    """A keyframe as it is recognised. points: of its features, camera's frame, NaN where nothing was measured"""
+    """Features of a keyframe for place recognition. points: of its features, camera's frame, NaN for unmeasured"""
 
     seen: Seen
     points: Float[Tensor, "feature 3"]
@@ -58,7 +58,7 @@ class KeyframePlace:
 
 
 class Loops(Part):
-    """Loops that were found: pairs of images, the earlier one first, and the pose of the later one in its frame."""
+    """Detected loops: pairs of images, the earlier one first, and the pose of the later one in its frame."""
 
     grows: ClassVar[tuple[str, ...]] = ("pairs", "motions")
     pairs: Tensor
@@ -77,7 +77,7 @@ class Loops(Part):
         return self._places[frame.index]
 
     def find(self, frame: DepthFrame, older: list[DepthFrame], chance: torch.Generator) -> bool:
-        """Look for the place of a new keyframe among older ones; True if it is one of theirs."""
+        """Search the place of a new keyframe among older ones; True if found."""
         own, others = self.place(frame), [self.place(other) for other in older[:-MIN_AGE]]
         if not others:
             return False
@@ -94,7 +94,7 @@ class Loops(Part):
         return False
 
     def closed(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> Float[Tensor, "keyframe 3 4"]:
-        """Poses of keyframes with all loops closed; the first one stays."""
+        """Poses of keyframes optimised with all loops; the first one is fixed."""
         number = {image: i for i, image in enumerate(keyframes)}
         neighbours = torch.arange(len(poses) - 1)
         loops = torch.tensor([[number[a], number[b]] for a, b in self.pairs.tolist()])
@@ -113,7 +113,9 @@ def motion(first: Pose, second: Pose) -> Pose:
 def motion_between(
     first: KeyframePlace, second: KeyframePlace, tolerance: float, chance: torch.Generator
 ) -> Pose | None:
-    """Pose of the second place's camera in the frame of the first, if enough matched points agree on one."""
+    """Pose of the second place's camera in the frame of the first, by RANSAC over matched points; None for too few
+    inliers.
+    """
     pairs = matched(first.seen, second.seen)
     a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]
     known = (a.isfinite() & b.isfinite()).all(-1)

@@ -25,7 +25,7 @@ ALIGNMENT_ITERATIONS = 12  # Gauss-Newton steps of that
 
 @dataclass(frozen=True)
 class TrackingNumbers:
-    """A Config's numbers of tracking that methods share."""
+    """A Config's tracking numbers, shared by methods."""
 
     track: bool = False  # find the poses of frames in order, as `lumigraph track` does; else they are those given
     first_estimate: Literal["velocity", "surface"] = "velocity"  # first pose: by velocity, or aligned with the map
@@ -34,11 +34,11 @@ class TrackingNumbers:
 
 
 class Tracker(Part):
-    """Follows the frames of a recording one after another.
+    """Tracks the frames of a recording one after another.
 
     unit:        scene units of a metre
-    side:        pixels of the longer side of frames, about; 0 for that of photographs
-    turn:        number of frames that were followed
+    side:        longer side of frames in pixels, about; 0 for that of photographs
+    turn:        number of tracked frames
     is_keyframe: of each image
     """
 
@@ -62,24 +62,24 @@ class Tracker(Part):
             )
 
     def sequence(self, data: Scene) -> list[int]:
-        """Images in the order of their exposure: all where poses are to be found, else those to learn from."""
+        """Images in order of exposure: all if poses are unknown, else the training ones."""
         order, learnt = order_of(data.cameras).tolist(), set(data.splits["train"].tolist())
         return order if self.numbers.track else [i for i in order if i in learnt]
 
     def moment(self, data: Scene) -> Moment:
-        """The frame that is next, and the scene."""
+        """The next frame, and the scene."""
         sequence, turn = self.sequence(data), int(self.turn)
         return Moment(data, self.frame(data, sequence[turn]) if turn < len(sequence) else None, sequence[:turn])
 
     def frame(self, data: Scene, index: int) -> DepthFrame:
-        """A frame, which is read unless it is a keyframe that is held."""
+        """Load a frame, from memory for a stored keyframe."""
         if index not in self._held:
             like = next(iter(self._held.values()), None)
             return DepthFrame.of(data, index, self.turn.device, like, self.side)
         return self._held[index]
 
     def held(self, data: Scene, index: int) -> DepthFrame:
-        """A keyframe, which is kept."""
+        """Load a keyframe and store it."""
         if index not in self._held:
             self._held[index] = self.frame(data, index)
         return self._held[index]
@@ -91,7 +91,7 @@ class Tracker(Part):
 
     @torch.no_grad()
     def close_loop(self, frame: DepthFrame, data: Scene, chance: torch.Generator) -> bool:
-        """Recognise the place of the latest keyframe, and correct the path if it was seen before. True if it was."""
+        """Search a loop for the latest keyframe, and correct the trajectory. True if one was found."""
         keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
         older = [self.held(data, i) for i in keyframes if i != frame.index]
         if self.loops is None or not self.loops.find(frame, older, chance):
@@ -101,7 +101,7 @@ class Tracker(Part):
 
     @property
     def keyframes(self) -> list[int]:
-        """Images that are keyframes, in the order of their exposure if their numbers are."""
+        """Image numbers of keyframes, in order of exposure if their numbers are."""
         return self.is_keyframe.nonzero()[:, 0].tolist()
 
     def follow(
@@ -111,8 +111,8 @@ class Tracker(Part):
         find: Callable[[DepthFrame, Pose], Pose],
         explained: Callable[[DepthFrame, Pose], float],
     ) -> float | None:
-        """Find the pose of the next frame, from constant velocity, then from the last known pose. Gives the share of
-        its pixels that the map explains, or None if tracking is lost: the last known pose is kept for it then.
+        """Track the next frame, initialised by constant velocity, then by the last known pose. Returns the share of its
+        pixels explained by the map, or None if tracking is lost: it then keeps the last known pose.
 
         find: a frame's pose from a first estimate; explained: its share of explained pixels at a pose
         """
@@ -135,7 +135,7 @@ class Tracker(Part):
         return None
 
     def plausible(self, last: Pose, pose: Pose) -> bool:
-        """True for a motion that a hand can make between two frames."""
+        """True for a motion plausible for a hand-held camera between two frames."""
         turn, shift = relative(last, pose)
         angle = torch.arccos(((turn.trace() - 1) / 2).clamp(-1, 1))
         return float(shift.norm()) < MAX_STEP[0] * self.unit and float(angle) < MAX_STEP[1]

@@ -1,4 +1,4 @@
-"""Trajectory: the pose of each frame of a moving camera, and which of them are known."""
+"""Trajectory: the pose of each frame of a moving camera, and its tracking state."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ Twist = Float[Tensor, "pose 6"]  # rotation vector in the world's axes about the
 class Trajectory(Part):
     """Poses of all frames, camera-to-world, scene units, by their image number.
 
-    state:  UNKNOWN before a frame's turn, LOST where tracking failed, KNOWN
-    anchor: keyframe that a frame was tracked beside: it moves along when the keyframe's pose is corrected
-    tracks: whether poses are found; otherwise they are those of the cameras
+    state:  UNKNOWN before tracking, LOST where tracking failed, KNOWN
+    anchor: keyframe beside which a frame was tracked: the frame moves with corrections of the keyframe's pose
+    tracks: whether poses are estimated; otherwise they are those of the cameras
     """
 
     moves_cameras: ClassVar[bool] = True
@@ -60,12 +60,12 @@ class Trajectory(Part):
         return torch.cat([last[:, :3] @ turn, (last[:, :3] @ shift + last[:, 3])[:, None]], -1)
 
     def correct(self, keyframes: Int[Tensor, " keyframe"], twists: Twist) -> None:
-        """Move keyframes by twists, and with each the frames that were tracked beside it."""
+        """Correct keyframes by twists, and the frames anchored to them."""
         self.place(keyframes.tolist(), moved(self.poses[keyframes], twists))
 
     @torch.no_grad()
     def place(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> None:
-        """Put keyframes at other poses, and with each the frames that were tracked beside it."""
+        """Set poses of keyframes, and move the frames anchored to them."""
         for keyframe, pose in zip(keyframes, rigid(poses), strict=True):
             beside = self.anchor == keyframe
             turn, shift = relative(self.poses[keyframe], self.poses[beside])
@@ -75,7 +75,7 @@ class Trajectory(Part):
 
     @torch.no_grad()
     def refined(self, cameras: Camera) -> Camera:
-        """Cameras of frames at the poses that were found; others stay."""
+        """Cameras of frames with estimated poses; others stay."""
         if cameras.image_index is None:
             return cameras
         index = cameras.image_index.to(self.poses.device)

@@ -1,1 +1,1 @@
-"""Training: optimizers, schedules, losses, refinement of poses, exposures of photographs."""
+"""Training: optimizers, schedules, losses, pose refinement, exposures of photographs."""

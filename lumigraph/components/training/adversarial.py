@@ -1,4 +1,4 @@
-"""Adversarial learning: non-saturating loss, R1, and the discriminator of StyleGAN2 (Karras et al. 2020, arXiv
+"""Adversarial training: non-saturating loss, R1, and the discriminator of StyleGAN2 (Karras et al. 2020, arXiv
 1912.04958), with the layers of equalised learning rate that its generator has as well."""
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ Logits = Float[Tensor, " picture"]
 
 
 def generator_loss(fake: Float[Tensor, "*logits"]) -> Tensor:
-    """-log sigmoid(D(G(z))), the non-saturating loss (Goodfellow 2014, section 3). fake: logits of made pictures"""
+    """-log sigmoid(D(G(z))), the non-saturating loss (Goodfellow 2014, section 3). fake: logits of generated
+    pictures
+    """
     return softplus(-fake).mean()
 
 
@@ -37,14 +39,14 @@ def discriminator_loss(real: Float[Tensor, "*real"], fake: Float[Tensor, "*fake"
 def r1_penalty(logits: Float[Tensor, "*logits"], pictures: Sequence[Tensor]) -> Tensor:
     """Half the squared gradient of the logits by real pictures, on average (Mescheder 2018, eq. 9, with gamma 1).
 
-    pictures: (picture, ...) each, that require gradients and that the logits were made of
+    pictures: (picture, ...) each, inputs of the logits that require gradients
     """
     gradients = torch.autograd.grad(logits.sum(), pictures, create_graph=True)
     return 0.5 * torch.stack([x.square().flatten(1).sum(1) for x in gradients]).sum(0).mean()
 
 
 def lazy_adam(parameters: Iterable[nn.Parameter], rate: float, interval: int, **options) -> torch.optim.Adam:
-    """Adam for parameters of which a term is taken every `interval` steps alone (Karras 2020, appendix B).
+    """Adam for lazy regularisation with a term every `interval` steps (Karras 2020, appendix B).
 
     Its rate is multiplied by c = n / (n + 1), its betas are (0, 0.99^c).
     """
@@ -54,7 +56,7 @@ def lazy_adam(parameters: Iterable[nn.Parameter], rate: float, interval: int, **
 
 @torch.no_grad()
 def follow(average: nn.Module, network: nn.Module, keep: float) -> None:
-    """Moving average of a network's parameters, of which a step keeps a share; buffers are copied."""
+    """Exponential moving average of a network's parameters. keep: share kept in a step; buffers are copied"""
     for a, p in zip(average.parameters(), network.parameters(), strict=True):
         a.lerp_(p, 1 - keep)
     for mine, theirs in zip(average.buffers(), network.buffers(), strict=True):
@@ -67,8 +69,8 @@ def follow(average: nn.Module, network: nn.Module, keep: float) -> None:
 class EqualisedLinear(nn.Module):
     """y = c W x + b with W of the standard normal distribution and c = rate / sqrt(inputs) (Karras 2018, section 4.1).
 
-    rate: of learning, times that of other layers
-    bias: its value at first
+    rate: relative learning rate
+    bias: its initial value
     """
 
     def __init__(self, inputs: int, outputs: int, rate: float = 1.0, bias: float = 0.0):
@@ -82,7 +84,7 @@ class EqualisedLinear(nn.Module):
 
 
 class EqualisedConvolution(nn.Module):
-    """Convolution with the border padded by zeros, and weights as those of `EqualisedLinear`."""
+    """Zero-padded convolution with weights as those of `EqualisedLinear`."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, bias: bool = True):
         super().__init__()
@@ -95,7 +97,7 @@ class EqualisedConvolution(nn.Module):
 
 
 def rectified(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """sqrt(2) times the leaky rectifier of x."""
+    """Leaky ReLU of x times sqrt(2)."""
     return GAIN * leaky_relu(x, SLOPE)
 
 
@@ -107,8 +109,7 @@ def halved(x: Pictures) -> Pictures:
 
 
 def doubled(x: Pictures) -> Pictures:
-    """Pictures of twice the size, by the separable filter 1 3 3 1 (Karras 2020): each pixel becomes four, of which each
-    sees three neighbours."""
+    """Pictures of twice the size, by the separable filter 1 3 3 1 (Karras 2020)."""
     lines = x.new_tensor([[1.0, 3.0, 0.0], [0.0, 3.0, 1.0]]) / 4
     weights = torch.einsum("ay,bx->abyx", lines, lines).reshape(1, 4, 1, 3, 3)
     weights = weights.expand(x.shape[1], 4, 1, 3, 3).flatten(0, 1)
@@ -119,7 +120,7 @@ def doubled(x: Pictures) -> Pictures:
 
 
 class DiscriminatorBlock(nn.Module):
-    """Two convolutions, the second at half the size, beside a 1x1 convolution (Karras 2020, figure 7c)."""
+    """Residual block of two convolutions, the second at half the size (Karras 2020, figure 7c)."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
@@ -133,7 +134,7 @@ class DiscriminatorBlock(nn.Module):
 
 
 def with_deviation(x: Pictures, group: int = DEVIATION_GROUP) -> Pictures:
-    """One more channel: the mean deviation of features within groups of pictures (Karras 2018, section 3).
+    """Minibatch deviation channel: the mean deviation of features within groups of pictures (Karras 2018, section 3).
 
     Groups are as large as divides the number of pictures.
     """
@@ -145,11 +146,12 @@ def with_deviation(x: Pictures, group: int = DEVIATION_GROUP) -> Pictures:
 
 
 class Mapping(nn.Module):
-    """Fully connected layers from normalised codes and labels (Karras 2020; labels as Karras 2020b, ADA, has them).
+    """Mapping network: fully connected layers from normalised codes and labels (Karras 2020; labels as in Karras 2020b,
+                     ADA).
 
     code:  numbers of a code; 0 for none
     label: numbers of a label, embedded in `width` numbers; 0 for none
-    rate:  of learning, times that of other layers
+    rate:  relative learning rate
     """
 
     def __init__(self, code: int, label: int, width: int, layers: int, rate: float = 0.01):
@@ -208,5 +210,5 @@ class Discriminator(nn.Module):
 
 
 def widths_of(size: int, base: int, most: int) -> list[int]:
-    """Channels at each size from `size` pixels down to 4x4: base / size, and no more than `most` (Karras 2020)."""
+    """Channels at each size from `size` pixels down to 4x4: base / size, at most `most` (Karras 2020)."""
     return [min(base // n, most) for n in (size >> k for k in range(int(math.log2(size // MIN_PICTURE_SIDE)) + 1))]

@@ -1,4 +1,4 @@
-"""Bundle adjustment: cameras and points that agree best with where photographs show the points (Triggs 2000)."""
+"""Bundle adjustment of cameras and points (Triggs 2000)."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ REACH = 4.0  # scene units, the deviation of a point's step: one that nothing te
 
 
 def adjusted(cameras: Camera, seen: Sequence[Seen], matches: Matches, extent: float, error: float) -> Camera:
-    """Cameras that agree with points that photographs share; those that share none stay where they are.
+    """Cameras adjusted to points shared between photographs; those without shared points stay.
 
         min over poses and points of  sum rho(|T y / |y||^2) + |omega|^2 / TURN^2 + |s|^2 / (SHIFT extent)^2
 
-    y is a point in its camera's frame, T two axes across the direction in which the photograph shows it, omega and s
-    how far a pose is from the given one, and rho the estimator of Geman and McClure (1987), whose scale falls from
-    step to step to `error`: wrong matches let go.
+    y is a point in its camera's frame, T two axes orthogonal to its observed direction, omega and s the correction of a
+    pose, and rho the estimator of Geman and McClure (1987), whose scale falls from step to step to `error`, which
+    rejects wrong matches.
 
     extent: longest side of the box of interest, scene units
-    error:  of a feature's place, radians
+    error:  of a feature's position, radians
     """
     given = cameras.pose.double().cpu()
     pose, trust = given, torch.tensor([1 / TURN] * 3 + [1 / (SHIFT * extent)] * 3).double().square()
@@ -57,7 +57,7 @@ def agreeing(
     m: Int[Tensor, "match 2"],
     gate: float,
 ) -> Tensor:
-    """Mask of the matches of two views that lie near their epipolar lines."""
+    """Mask of inlier matches of two views, near their epipolar lines."""
     i, j = pair
     a = seen[i].bearings[m[:, 0]].double() @ pose[i, :, :3].T
     b = seen[j].bearings[m[:, 1]].double() @ pose[j, :, :3].T
@@ -66,7 +66,7 @@ def agreeing(
 
 
 def middles(pose: Float[Tensor, "camera 3 4"], shared: Tracks) -> Float[Tensor, "point 3"]:
-    """The points nearest to the rays that see them."""
+    """Points closest to all rays that observe them."""
     eyes, turns = pose[shared.view, :, 3], pose[shared.view, :, :3]
     along = (turns @ shared.bearing.double()[:, :, None])[..., 0]
     across = torch.eye(3).double() - along[:, :, None] * along[:, None]
@@ -128,12 +128,12 @@ def sparse(rows: Float[Tensor, "row 2 n"], of: Int[Tensor, " row"], count: int) 
 
 
 def smallest_axis(vectors: Float[Tensor, "row 3"]) -> Float[Tensor, "row 3"]:
-    """The axis of the frame that each vector is farthest from."""
+    """Coordinate axis most orthogonal to each vector."""
     return torch.nn.functional.one_hot(vectors.abs().argmin(-1), 3).to(vectors)
 
 
 def rotation_vector(rotation: Float[Tensor, "camera 3 3"]) -> Float[Tensor, "camera 3"]:
-    """The axis of each rotation, as long as its angle, up to a right angle."""
+    """Rotation vector of each rotation, up to a right angle."""
     r = rotation
     axis = torch.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], -1) / 2
     sine = axis.norm(dim=-1, keepdim=True).clamp(1e-12, 1)
@@ -141,5 +141,5 @@ def rotation_vector(rotation: Float[Tensor, "camera 3 3"]) -> Float[Tensor, "cam
 
 
 def pixel_angle(camera: Camera) -> float:
-    """Radians that a pixel in the middle of one camera's picture spans."""
+    """Angle in radians of a pixel at the centre of one camera's picture."""
     return float(camera.rays(camera.size / 2).radius[0]) / PIXEL_RADIUS

@@ -1,4 +1,4 @@
-"""Colours against photographs: backdrops, residuals, the spread of light, a gain for each photograph."""
+"""Photometric differences between scene and photographs: backdrops, residuals, variation of light, exposure gains."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ MAX_SCATTER = 1.1  # stops by which ratios of one pair deviate (median); beyond,
 
 @torch.no_grad()
 def spread_of_light(scene: Scene) -> float | None:
-    """Difference of neighbouring photographs' exposure and colour at the same places, in stops of linear light: the
-    root mean square over photographs and channels of the median log2 ratio. None where there are no points to compare.
+    """Variation of light between neighbouring photographs, in stops of linear light: the root mean square over
+    photographs and channels of the median log2 ratio at common points. None without common points.
 
-    Neighbours see about the same side of things and the same things before others, so that what is left is the light
-    and the camera's reading of it. Of a sparse capture even neighbours may not: pairs with directions more than
-    MAX_ANGLE apart, or with ratios that scatter by more than MAX_SCATTER, do not count.
+    Neighbours have similar views and occlusions, so that the rest is light and exposure. In a sparse capture they may
+    not: pairs with directions more than MAX_ANGLE apart, or with ratios that scatter by more than MAX_SCATTER, are
+         excluded.
     """
     if scene.points is None or len(train := scene.splits["train"]) < 2:
         return None
@@ -51,8 +51,8 @@ def spread_of_light(scene: Scene) -> float | None:
 
 
 def spread_of_exposure(scene: Scene) -> float:
-    """The same, and without points the deviation of the exposures that photographs state (`Scene.about`), in stops. 0
-    where nothing is known. Those developed from raw files are as bright as `brightness` made them."""
+    """Variation of light, or without common points the deviation of stated exposures (`Scene.about`), in stops. 0 if
+    unknown. Photographs developed from raw files are normalised by `brightness`."""
     measured = spread_of_light(scene)
     if measured is not None:
         return measured
@@ -65,8 +65,8 @@ def spread_of_exposure(scene: Scene) -> float:
 
 
 def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
-    """For each camera the one that stands nearest and looks most alike: their distance, over how far all of them are
-    apart, plus one minus the cosine between them."""
+    """Nearest neighbour of each camera: distance relative to the extent of all, plus one minus the cosine of
+    directions."""
     position, forward = cameras.position, cameras.forward
     apart = torch.cdist(position, position)
     unlike = apart / apart.amax().clamp_min(1e-9) + 1 - forward @ forward.T
@@ -74,8 +74,8 @@ def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
 
 
 def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, " 3"] | None:
-    """Stops of linear light by which one picture shows points brighter than another, for each channel; None if they
-    share too few, or differ by more than light and exposure."""
+    """Stops of linear light by which one picture is brighter than another at common points, for each channel; None for
+    too few points, or differences beyond light and exposure."""
     colours, known = [], torch.ones(len(points), dtype=torch.bool)
     for view in (one, other):
         seen, row, column, _ = view.sees(points)
@@ -102,14 +102,14 @@ SCENE = "scene"  # beside photographs and their average: a gain of 1
 
 
 class Exposure(Part):
-    """A gain per photograph and colour channel, 1 at first; photographs that were not trained on keep it.
+    """A gain per photograph and colour channel, initially 1; photographs outside of training keep it.
 
-    A gain multiplies sRGB-encoded colours, as a photograph has them: photograph = gain x scene. The control `exposure`
-    multiplies linear light, as in all methods.
+    A gain multiplies sRGB-encoded colours: photograph = gain x scene. The control `exposure` multiplies linear light,
+    as in all methods.
 
-    differ: whether photographs are of different exposure; nothing is learnt where they are not
-    found:  gain of a photograph that was given as evidence
-    rate:   name of the learning rate that the gains follow
+    differ: whether photographs differ in exposure; if not, nothing is trained
+    found:  gain of a photograph given as evidence
+    rate:   name of the gains' learning rate
     """
 
     differ: Tensor
@@ -122,7 +122,7 @@ class Exposure(Part):
         self.register_buffer("differ", torch.tensor(setting == "yes"))
 
     def begin(self, method: Any, data: Scene, seconds: float) -> None:
-        """Find out whether photographs differ, with the setting auto."""
+        """Test whether photographs differ, with the setting auto."""
         if self.setting != "auto":
             return
         stops = spread_of_exposure(data)
@@ -136,7 +136,7 @@ class Exposure(Part):
             )
 
     def forward(self, rgb: Float[Tensor, "ray 3"], image_index: Int[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
-        """Colours of the scene as photographs have them; unchanged where photographs do not differ."""
+        """Colours of the scene with the photographs' gains; unchanged if photographs do not differ."""
         return rgb * self.log_gain[image_index].exp() if bool(self.differ) else rgb
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -147,8 +147,8 @@ class Exposure(Part):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Brightness in stops, and the photograph whose exposure they count from. By default they count from the scene
-        as it was learnt, which is arbitrary: a gain that all photographs share can be the scene's own."""
+        """Brightness in stops, and the reference photograph. By default stops are relative to the trained scene, whose
+        overall gain is arbitrary."""
         if not bool(self.differ):
             return ()
         photographs = tuple(str(i) for i in range(len(self.log_gain)))
@@ -161,7 +161,7 @@ class Exposure(Part):
 
     @property
     def accepts(self) -> tuple[type, ...]:
-        """Photographs, where their exposures were learnt to differ."""
+        """Photographs, if they differ in exposure."""
         return (Photograph,) if bool(self.differ) else ()
 
     def recoloured(self, method: Any, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
@@ -174,7 +174,7 @@ class Exposure(Part):
         return encoded(2**stops * decoded(rgb)) if stops else rgb
 
     def gain(self, told: dict[str, Value]) -> Float[Tensor, " 3"]:
-        """Factor on colours of the photograph that settings choose: 1 without any."""
+        """Gain of the photograph that settings choose: 1 without any."""
         whose = told.get("exposed_as", SCENE)
         if whose == SCENE:
             log_gain = torch.zeros_like(self.log_gain[0])
@@ -187,7 +187,7 @@ class Exposure(Part):
 
     @torch.no_grad()
     def adapted(self, method: Any, evidence: Photograph) -> Exposure:
-        """The part with the gain of a photograph, found from its trusted pixels."""
+        """The part with the gain of a photograph, fitted to its trusted pixels."""
         batch = evidence.sample_rays(GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
         method.settings.pop("exposed_as", None)
         adapted = copy.copy(self)
@@ -206,8 +206,8 @@ class Exposure(Part):
 
 @torch.no_grad()
 def gain_between(rgb: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"]) -> Float[Tensor, " 3"]:
-    """Gain that turns colours into a photograph's: the median ratio of each channel, over pixels that are neither too
-    dark nor too bright; 1 where there are none."""
+    """Gain from colours to a photograph's: the median ratio of each channel, over pixels that are neither too dark nor
+    too bright; 1 without any."""
     inside = ((rgb > MIN_COLOUR) & (target > MIN_COLOUR) & (target < MAX_COLOUR)).all(-1)
     return (target[inside] / rgb[inside]).median(0).values if inside.any() else torch.ones_like(target[:1].sum(0))
 
@@ -215,11 +215,11 @@ def gain_between(rgb: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"]
 def backdrop(
     batch: Batch, background: Float[Tensor, "1 3"], generator: torch.Generator, opaque: bool = False
 ) -> Float[Tensor, "#ray 3"]:
-    """The colours behind a batch's rays: the scene's own, or where photographs have alpha a random one for each ray, so
-    that only opacity can imitate opacity.
+    """Background colours of a batch's rays: the scene's own, or for photographs with alpha a random one for each ray,
+    so that colour cannot replace opacity.
 
-    opaque: every ray ends at something. Random colours behind it then keep thin fog before black from passing for what
-            is dark, and before white for what is bright
+    opaque: every ray ends at a surface. Random colours then keep thin fog over black from imitating dark surfaces, and
+            over white bright ones
     """
     if batch.alpha is None and not opaque:
         return background
@@ -229,11 +229,11 @@ def backdrop(
 def residuals(
     rendering: Rendering, batch: Batch, background: Float[Tensor, "#ray 3"], exposure: Exposure | None = None
 ) -> tuple[Float[Tensor, "row 3"], float]:
-    """Differences of a rendering before a background from photographs, and their mean square.
+    """Differences of a composited rendering from photographs, and their mean square.
 
-    Where photographs have alpha, as many rows again say the same before the opposite colours, 1 - background, where
-    only what opacity lacks looks different; they are not in the mean.
-    exposure: gains of the photographs, which are the scene's and not the background's
+    With alpha, as many rows again are composited over the opposite colours, 1 - background, which shows only errors of
+    opacity; they are not in the mean.
+    exposure: gains of the photographs, which apply to the scene and not to the background
     """
     rgb = rendering.rgb
     if exposure and batch.rays.image_index is not None:

@@ -1,4 +1,4 @@
-"""Poses that are learnt beside the scene: a small turn and shift of each photograph's camera."""
+"""Pose refinement: a learnt small rotation and shift of each photograph's camera."""
 
 from __future__ import annotations
 
@@ -39,23 +39,25 @@ class PoseNumbers:
 
 
 def poses_for(frame: Frame, numbers: PoseNumbers) -> PoseRefinement | None:
-    """A `PoseRefinement` where the numbers ask for one."""
+    """A `PoseRefinement`, if enabled by the numbers."""
     if not numbers.refine_cameras:
         return None
     return PoseRefinement(frame.image_count, numbers.pose_learning_rate, numbers.match_photographs)
 
 
 class PoseRefinement(Part):
-    """A small rotation (radians) and shift (scene units) of each photograph's camera, in the world's frame, 0 at first.
+    """A small rotation (radians) and shift (scene units) of each photograph's camera, in the world's frame, initially
+    0.
 
-    The rotation is about the camera's own place: the exponential map of so(3) by Rodrigues' formula (Lin 2021, BARF,
-    section 3.3). What is learnt, `twist`, are coordinates in which a step of any direction moves the picture equally
-    far, by radians (Park 2023, CamP): `axes` leads from these to rotation and shift. Without `begin` they are the same.
+    The rotation is about the camera's own position: the exponential map of so(3) by Rodrigues' formula (Lin 2021, BARF,
+    section 3.3). The parameters `twist` are preconditioned coordinates in which a unit step of any direction moves the
+    picture equally far, by radians (Park 2023, CamP): `axes` maps them to rotation and shift. Without `begin` it is the
+    identity.
 
-    learning_rate: radians that a step moves a picture by, at most
-    progress:      share of the budget spent, by which `weights` lets bands of an encoding join
-    found:         whether points that photographs share told the poses to begin at, see `find`
-    matching:      whether `begin` matches features that photographs share
+    learning_rate: largest movement of a picture in a step, radians
+    progress:      spent share of the budget, by which `weights` adds bands of an encoding
+    found:         whether initial poses come from shared points, see `find`
+    matching:      whether `begin` matches features between photographs
     """
 
     moves_cameras: ClassVar[bool] = True
@@ -78,14 +80,16 @@ class PoseRefinement(Part):
         self.progress.fill_(progress)
 
     def choose_axes(self, cameras: Camera, frame: Frame) -> None:
-        """Choose the coordinates by what each camera sees. cameras: of photographs, by their `image_index`"""
+        """Choose the preconditioner by each camera's view. cameras: of photographs, by their `image_index`"""
         if cameras.image_index is not None:
             for i, image in enumerate(cameras.image_index.tolist()):
                 self.axes[image] = whitening(cameras[i], frame)
 
     @torch.no_grad()
     def find(self, scene: Scene, matching: bool = True) -> None:
-        """Begin at the given poses or, with matching and enough shared points, at adjusted ones; see `adjusted`."""
+        """Initialise with the given poses or, with matching and enough shared points, with adjusted ones; see
+        `adjusted`.
+        """
         self.choose_axes(scene.cameras, scene.frame)
         if not matching:
             return
@@ -118,7 +122,7 @@ class PoseRefinement(Part):
 
     @torch.no_grad()
     def refined(self, cameras: Camera) -> Camera:
-        """Cameras with the corrections of the photographs that they took; those that were not trained on have none."""
+        """Cameras with the corrections of their photographs; photographs outside of training have none."""
         if cameras.image_index is None:
             return cameras
         omega, shift = self.moves[cameras.image_index.to(self.twist.device)].to(cameras.pose).split(3, -1)
@@ -126,7 +130,7 @@ class PoseRefinement(Part):
         return replace(cameras, pose=torch.stack([*axes, cameras.position + shift], -1))
 
     def weights(self, bands: int) -> Float[Tensor, " band"] | None:
-        """Weights of an encoding's bands at this share of the budget; None once all count fully."""
+        """Weights of an encoding's bands at this share of the budget; None when all are 1."""
         progress = float(self.progress)
         return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
 
@@ -143,11 +147,12 @@ class PoseRefinement(Part):
 
 
 def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:
-    """(Sigma + lambda diag(Sigma) + mu I)^(-1/2), Sigma the mean of J^T J over what one camera sees (Park 2023, eq. 9).
+    """Preconditioner (Sigma + lambda diag(Sigma) + mu I)^(-1/2), Sigma the mean of J^T J over one camera's view (Park
+    2023, eq. 9).
 
-    J is how the direction towards a point of the scene, seen from the camera, follows rotation and shift: omega x d and
-    the part of the shift across d over the distance. In whitened coordinates a step along any axis moves the picture
-    equally far, so that turning and shifting, which look nearly the same, are told apart.
+    J is the derivative of a point's direction in the camera by rotation and shift: omega x d, and the part of the shift
+    across d over the distance. In whitened coordinates a step along any axis moves the picture equally far, so that
+    rotation and shift, which look nearly the same, are separated.
     """
     rays, t = seen_places(camera, frame)
     d, eye = rays.directions.double(), torch.eye(3, dtype=torch.float64, device=t.device)
@@ -161,8 +166,8 @@ def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:
 
 
 def seen_places(camera: Camera, frame: Frame) -> tuple[Rays, Float[Tensor, "ray depth"]]:
-    """Rays over a camera's picture and distances along them: evenly through the box of interest where that holds all,
-    else evenly by their logarithm as far as the scene reaches."""
+    """Rays over a camera's picture and distances along them: uniform within the box of interest of a bounded scene,
+    else log-uniform up to the scene's reach."""
     width, height = camera.size[0].tolist()
     x, y = ((torch.arange(PLACES, device=camera.pose.device) + 0.5) * n / PLACES for n in (width, height))
     rays = camera.rays(torch.cartesian_prod(x, y).to(camera.pose))
@@ -184,9 +189,9 @@ def seen_places(camera: Camera, frame: Frame) -> tuple[Rays, Float[Tensor, "ray 
 class PoseAdam(RowOptimizer):
     """Adam (Kingma and Ba 2015) with one second moment for each row, that of its gradient's length.
 
-    So a row moves as its gradient points, as far as `lr` at most. Adam's own second moments, one for each number, would
-    move directions that little is known of as fast as those that the photographs tell clearly. A row whose gradient is
-    all zero was not looked at: it stays, and its moments are those of the steps that did.
+    So a row moves along its gradient, at most by `lr`. Adam's own second moments, one for each number, would move
+    undetermined directions as fast as well-determined ones. A row of zero gradient was not sampled: it stays, and its
+    moments are kept.
     """
 
     def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.95)):

@@ -1,4 +1,4 @@
-"""Regularizers: against fog before cameras, and for patches of pictures that nobody took."""
+"""Regularizers: against fog near cameras, and on patches of unobserved views."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from ...kernels import distortion
 
 
 def normalized_distance(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Distances t as t / (1 + t): what is near counts for more than what is far, and the horizon is at 1."""
+    """Normalised distances t / (1 + t): near ones get more weight than far ones, and the horizon is at 1."""
     return t / (1 + t)
 
 
 def distortion_loss(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
-    """Spread of weights along each ray, mean of all rays (Barron 2022, eq. 15)."""
+    """Distortion loss of weights along each ray, mean of all rays (Barron 2022, eq. 15)."""
     start, end = normalized_distance(samples.t_start), normalized_distance(samples.t_end)
     return distortion(weights, 0.5 * (start + end), end - start, samples.ray_starts).mean()
 
@@ -29,11 +29,11 @@ def distortion_loss(samples: Samples, weights: Float[Tensor, " sample"]) -> Floa
 def depth_loss(
     samples: Samples, weights: Float[Tensor, " sample"], distance: Float[Tensor, " ray"], margin: float
 ) -> Float[Tensor, ""]:
-    """The share of rays that does not end where something is known to be, mean of all rays: light that is stopped too
-    early or too late, or not at all (as Deng 2022 supervises depth; linear, for what is known may be wrong).
+    """Depth loss: share of each ray's light that does not end at its known distance, mean of all rays (as Deng 2022
+    supervises depth; linear, since known distances may be wrong).
 
-    distance: along each ray to what is known to be there
-    margin:   how far off counts as there, in normalized_distance distances, beside half a sample's own length
+    distance: known distance along each ray
+    margin:   tolerance in normalised distances, besides half a sample's own length
     """
     start, end = normalized_distance(samples.t_start), normalized_distance(samples.t_end)
     known = normalized_distance(distance)[samples.ray_index]
@@ -44,8 +44,8 @@ def depth_loss(
 def near_thickness(
     samples: Samples, density: Float[Tensor, " sample"], until: Float[Tensor, " ray"]
 ) -> Float[Tensor, " ray"]:
-    """Optical thickness of what lies on each ray before a distance. Yang 2023, eq. 5, has the mean density of a ray's
-    first samples instead, which depends on how finely it is sampled."""
+    """Optical thickness of each ray up to a distance. Yang 2023, eq. 5, has the mean density of a ray's first samples
+    instead, which depends on the sampling density."""
     ray = samples.ray_index
     thickness = density * ((until[ray] - samples.t_start).clamp_min(0)).minimum(samples.length)
     return torch.zeros_like(until).index_add(0, ray, thickness)
@@ -64,10 +64,10 @@ class _Scaled(torch.autograd.Function):
 
 
 def scale_gradients(t: Float[Tensor, " sample"], *values: Float[Tensor, sample * _]) -> tuple[Tensor, ...]:
-    """The same values of samples at distances t, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
+    """The same values of samples at distances t, with gradients scaled by min(1, t^2) (Philip 2023, eq. 7).
 
-    As many rays pass a place near a camera as the inverse square of its distance says, and all of one photograph:
-    without this, learning would be fastest where least is known.
+    The density of rays near a camera is the inverse square of the distance, and all are of one photograph: without
+    scaling, learning would be fastest where least is known.
     """
     return _Scaled.apply(t.square().clamp(max=1), *values)
 
@@ -78,7 +78,7 @@ def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
 
 
 def opacity_entropy(opacity: Float[Tensor, " ray"]) -> Float[Tensor, ""]:
-    """Binary entropy of each ray's opacity, mean of all (Sun 2022, eq. 13): 0 where rays pass or end."""
+    """Binary entropy of each ray's opacity, mean of all (Sun 2022, eq. 13): 0 for empty and for opaque rays."""
     a = opacity.clamp(1e-6, 1 - 1e-6)
     return -(a * a.log() + (1 - a) * (1 - a).log()).mean()
 
@@ -87,8 +87,8 @@ ASTRAY = 0.125  # deviation of the point that an unseen camera looks at, of the 
 
 
 def unseen_cameras(cameras: Camera, count: int, generator: torch.Generator) -> Camera:
-    """Cameras that stand anywhere in the box around the given ones, upright as these are on average, and look at about
-    the point that all of these look at, through the lens of one of them."""
+    """Random cameras in the box around the given ones, with their mean up, looking at about their common point of
+    interest, with the lens of one of them."""
     position, forward = cameras.position.cpu(), cameras.forward.cpu()
     low, high = position.amin(0), position.amax(0)
     focus = nearest_to_lines(position.double(), forward.double(), (position + forward).mean(0).double()).float()
@@ -105,8 +105,8 @@ SIDEWAYS = 0.1  # deviation of a camera between two others, of their distance
 
 
 def camera_between(cameras: Camera, generator: torch.Generator) -> Camera:
-    """A camera between one of the given ones and one of the nearest to it, and a little aside; through the lens of the
-    first, turned from one to the other in the same share."""
+    """A camera interpolated between one of the given ones and one of its nearest neighbours, with a small offset, with
+    the lens of the first."""
     poses = cameras.pose.cpu()
     position = poses[:, :, 3]
     first = int(torch.randint(len(poses), (1,), generator=generator))
@@ -124,7 +124,7 @@ def camera_between(cameras: Camera, generator: torch.Generator) -> Camera:
 def places_between(
     places: Float[Tensor, "point 3"], stands: Float[Tensor, "camera 3"], generator: torch.Generator
 ) -> Float[Tensor, "point 3"]:
-    """Places anywhere between each of the given ones and one of the cameras nearest to it."""
+    """Random points between each given point and one of its nearest cameras."""
     near = torch.cdist(places, stands).argsort(1)[:, 1 : NEAREST_VIEWS + 1]
     if not near.shape[1]:
         return places
@@ -136,7 +136,7 @@ def places_between(
 def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch.Generator) -> Rays:
     """Rays of one square patch of each camera, row by row: side * side of them.
 
-    strides: pixels between two rays of a patch; each patch has one of them, no larger than the picture allows
+    strides: pixels between neighbouring rays of a patch, one chosen for each, limited by the picture
     """
     count, sizes = len(cameras), cameras.size.cpu()
     chosen = torch.tensor(strides)[torch.randint(len(strides), (count,), generator=generator)]
@@ -154,8 +154,8 @@ def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch
 def roughness(
     depth: Float[Tensor, "patch row column"], opacity: Float[Tensor, "patch row column"]
 ) -> Float[Tensor, ""]:
-    """Squared differences of each depth of a patch from its neighbours to the right and below, where both are opaque,
-    mean of all (Niemeyer 2022, eq. 6, which has no opacity: there everything is opaque)."""
+    """Depth smoothness: squared differences of neighbouring depths of a patch, where both are opaque, mean of all
+    (Niemeyer 2022, eq. 6, without opacity there)."""
     counts = opacity.detach()
     across = (depth[:, :, 1:] - depth[:, :, :-1]).square() * counts[:, :, 1:] * counts[:, :, :-1]
     down = (depth[:, 1:] - depth[:, :-1]).square() * counts[:, 1:] * counts[:, :-1]

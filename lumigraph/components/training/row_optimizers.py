@@ -1,4 +1,4 @@
-"""Optimizers for tables of which a step touches some rows, and the exchange of a table for one of another size."""
+"""Optimizers for tables with sparse row gradients, and replacement of a table by one of another size."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from ...kernels._lanes import LANES, fetch, put, root, some, where
 
 
 class RowOptimizer(torch.optim.Optimizer):
-    """Optimizer whose parameters are tables (row, ...), and which leaves alone what has no gradient, moments and all.
+    """Optimizer of tables (row, ...) that skips rows without a gradient, moments included.
 
-    A kind of it writes `moments` and `update`; `exchange` puts a table of other rows into a table's place.
+    Subclasses write `moments` and `update`; `exchange` replaces a table by one with other rows.
     """
 
     @abstractmethod
     def moments(self, p: Tensor) -> dict[str, Tensor]:
-        """Moments of a parameter before its first step."""
+        """Initial moments of a parameter."""
 
     @abstractmethod
     def update(self, p: Tensor, grad: Tensor, state: dict[str, Tensor], group: dict[str, Any]) -> None:
@@ -41,12 +41,12 @@ class RowOptimizer(torch.optim.Optimizer):
 
 
 def adam_moments(p: Tensor) -> dict[str, Tensor]:
-    """Adam's moments before the first step: steps taken, means of the gradient and of its square."""
+    """Adam's initial moments: step count, means of the gradient and of its square."""
     return {"step": torch.zeros(()), "mean": torch.zeros_like(p), "square": torch.zeros_like(p)}
 
 
 def adam_rate(group: dict[str, Any], steps: float) -> float:
-    """Learning rate times both bias corrections of Adam; epsilon is far below anything that they could change."""
+    """Learning rate times both bias corrections of Adam; epsilon is negligible in them."""
     b1, b2 = group["betas"]
     return group["lr"] * math.sqrt(1 - b2**steps) / (1 - b1**steps)
 
@@ -58,10 +58,10 @@ def exchange(
     optimizer: torch.optim.Optimizer | None,
     state: dict[str, Any] | None = None,
 ) -> None:
-    """A new parameter for a module's old one, whose size the graph of the last step still remembers.
+    """Replace a module's parameter by a new one of another size; the last step's graph still refers to the old one.
 
-    optimizer: updates the new one from now on; None where there is none yet
-    state:     what it remembers of the new one; nothing by default, so that its moments begin at zero
+    optimizer: updates the new one from now on; None before training
+    state:     its state for the new one; by default none, so that moments are zero
     """
     old = getattr(module, name)
     new = nn.Parameter(values.to(old.device))
@@ -78,10 +78,10 @@ CHUNK = 1 << 12  # elements that a thread takes at a time
 
 
 class LazyAdam(RowOptimizer):
-    """Adam (Kingma and Ba 2015) that leaves an element alone, moments and all, where its gradient is exactly zero.
+    """Adam (Kingma and Ba 2015) that skips elements of exactly zero gradient, moments included.
 
     So a hash table's entries that no sample touched do not drift (Müller 2022, section 4). Defaults are that paper's.
-    weight_decay: decoupled (Loshchilov and Hutter 2019): each step takes lr * weight_decay of what it touches
+    weight_decay: decoupled (Loshchilov and Hutter 2019): each step takes lr * weight_decay of the updated elements
     A group's "rates", if given, multiply the rate of each row of its parameters.
     """
 
@@ -156,13 +156,13 @@ def _touched_rows_cpu(p, grad, mean, square, rates, rate, b1, b2, eps, keep):
 
 
 class LazyRMSprop(RowOptimizer):
-    """RMSprop (Hinton 2012) that looks at no row but those that a sparse gradient names:
+    """RMSprop (Hinton 2012) that updates only the rows of a sparse gradient:
 
         s = beta s + (1 - beta) g^2,    p = p - lr g / (sqrt(s) + eps)
 
-    An element's first gradient begins its mean: s = g^2, as in the release of Fridovich-Keil and Yu (2022), whose
-    numbers the defaults are. Each parameter is a table (row, column). A sparse gradient names each row once, as that of
-    `torch.nn.functional.embedding(rows, table, sparse=True)` with rows that all differ; of a dense one all rows count.
+    An element's first gradient initialises its mean: s = g^2, as in the release of Fridovich-Keil and Yu (2022), the
+    source of the defaults. Each parameter is a table (row, column). A sparse gradient names each row once, as that of
+    `torch.nn.functional.embedding(rows, table, sparse=True)` with distinct rows; of a dense one all rows count.
     """
 
     def __init__(self, params, lr: float = 1e-2, beta: float = 0.95, eps: float = 1e-8):

@@ -1,4 +1,4 @@
-"""Schedules over the budget: learning rates, and bands of an encoding that join from coarse to fine."""
+"""Schedules over the budget: learning rates, and coarse-to-fine weights of an encoding's bands."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ RISE = 20  # steps in which a rate that is held rises, unless a Config says othe
 
 
 def falling(first: float, last: float, progress: float, warmup: float = 0.0) -> float:
-    """The learning rate that falls from first to last exponentially, after growing for a share `warmup` of the budget.
+    """Learning rate that decays exponentially from first to last, after a warm-up over a share of the budget.
 
-    progress: share of the budget that is spent, in [0, 1]
+    progress: spent share of the budget, in [0, 1]
     """
     rate = first * (last / first) ** progress if first else 0.0
     return rate * (FIRST_SHARE + (1 - FIRST_SHARE) * min(1.0, progress / warmup) if warmup else 1.0)
 
 
 def held(first: float, last: float, step: int, progress: float, start: float, rise: int = RISE) -> float:
-    """The learning rate that rises for some steps, is constant until a share `start` of the budget is spent, and falls
-    to `last` exponentially.
+    """Learning rate with a warm-up of some steps, constant until a share `start` of the budget is spent, then decaying
+    exponentially to `last`.
 
-    progress: share of the budget that is spent, in [0, 1]
+    progress: spent share of the budget, in [0, 1]
     rise:     steps of the warm-up
     """
     fall = max(0.0, progress - start) / (1 - start)
@@ -43,9 +43,8 @@ def exponential_decay(method: Any, step: int, progress: float) -> float:
 
 
 def held_decay(method: Any, step: int, progress: float) -> float:
-    """`Method.learning_rate` that is `held`, by the numbers of the Config."""
-    c = method.config
-    rise = getattr(c, "warmup_steps", RISE)
+    """`Method.learning_rate` that is `held`, by the numbers of the Config or of its backbone."""
+    c, rise = getattr(method.config, "backbone", method.config), getattr(method.config, "warmup_steps", RISE)
     return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start, rise)
 
 
@@ -54,13 +53,13 @@ BEGINS, ENDS = 0.05, 0.4  # shares of the budget between which the others join
 
 
 def band_weights(count: int, progress: float, begins: float = BEGINS, ends: float = ENDS) -> Float[Tensor, " band"]:
-    """Weights in [0, 1] of an encoding's bands, the coarsest first (Lin 2021, BARF, eq. 14).
+    """Coarse-to-fine weights in [0, 1] of an encoding's bands, the coarsest first (Lin 2021, BARF, eq. 14).
 
         w_k = 0 for alpha < k,  (1 - cos((alpha - k) pi)) / 2 for alpha - k in [0, 1),  1 beyond
 
-    count:    of bands: octaves of waves, levels of a hash table
-    progress: share of the budget that is spent; alpha grows evenly with it, from INITIAL_BANDS of them to all,
-              between the shares `begins` and `ends`
+    count:    number of bands: octaves of waves, levels of a hash table
+    progress: spent share of the budget; alpha grows linearly with it, from INITIAL_BANDS of them to all, between the
+              shares `begins` and `ends`
     """
     grown = min(max((progress - begins) / (ends - begins), 0.0), 1.0)
     first = max(1.0, INITIAL_BANDS * count)
@@ -69,9 +68,9 @@ def band_weights(count: int, progress: float, begins: float = BEGINS, ends: floa
 
 
 class BandSchedule(Part):
-    """Bands of an encoding that join the coarsest over a share of the budget (Yang 2023, eq. 2).
+    """Coarse-to-fine schedule of an encoding's bands over a share of the budget (Yang 2023, eq. 2).
 
-    joined: how far they have joined; it is saved, because a run that stopped early renders as it learnt
+    joined: its progress, saved because a run that stopped early renders as it was trained
     """
 
     joined: Tensor
@@ -85,11 +84,11 @@ class BandSchedule(Part):
         self.joined.fill_(max(float(self.joined), min(progress / self.share, 1.0)))
 
     def weights(self, bands: int) -> Float[Tensor, " band"] | None:
-        """Weights of so many bands; None once all count fully."""
+        """Weights of `bands` bands; None when all are 1."""
         joined = float(self.joined)
         return band_weights(bands, joined, 0.0, 1.0).to(self.joined.device) if joined < 1 else None
 
 
 def joining_of(*schedules: Any) -> Callable[[int], Float[Tensor, " band"] | None] | None:
-    """Weights of bands by the first part there is that has a schedule of them; None without one."""
+    """Weights of bands by the first part with a schedule of them; None without one."""
     return next((part.weights for part in schedules if part), None)

@@ -17,7 +17,7 @@ MEMBER_SEEDS = 1_000_003  # from the seed of one member's points to that of the 
 
 @dataclass(frozen=True)
 class PointNumbers:
-    """A Config's numbers of sampled points. Those that are not close to the surface lie evenly in [-1, 1]^3."""
+    """A Config's numbers of sampled points. Those that are not close to the surface are uniform in [-1, 1]^3."""
 
     pool_points: Annotated[int, between(64, 1 << 26)] = 500_000  # points sampled of each shape; more cost memory
     near_share: Share = 0.94  # share of the points close to the surface; more sharpen it, and leave space unsure
@@ -26,7 +26,7 @@ class PointNumbers:
 
 
 class PointPools:
-    """Pools of points of each training member, sampled when a step first asks for them.
+    """Pools of points of each training member, sampled on first use.
 
     learner: the method's name, for faults
     """
@@ -44,7 +44,7 @@ class PointPools:
         return pool[torch.randint(len(pool), (count,), generator=generator)]
 
     def lesson(self, shapes: Shapes, members: int, count: int, generator: torch.Generator) -> PointBatch:
-        """Points of so many random training members, `count` of each, one member's after the other's."""
+        """Points of random training members, `count` of each, member after member."""
         there = shapes.splits["train"]
         drawn = there[torch.randint(len(there), (members,), generator=generator)].tolist()
         return PointBatch.cat([self.draw(shapes, number, count, generator) for number in drawn])

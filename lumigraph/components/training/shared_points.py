@@ -1,4 +1,4 @@
-"""Points that photographs share: SIFT features, matched, and kept where one motion of two views explains them."""
+"""Points shared by photographs: matched SIFT features, verified by two-view geometry."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ class Seen:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Points that several photographs show, an observation to a row.
+    """Tracks of points in several photographs, an observation to a row.
 
     point, view: numbers of the point and of the photograph
-    bearing:     where the photograph shows it, a unit direction in its camera's own frame
+    bearing:     observed unit direction in the photograph's camera frame
     """
 
     point: Int[Tensor, " row"]
@@ -67,7 +67,7 @@ Matches = dict[tuple[int, int], Int[Tensor, "match 2"]]  # features of both, by 
 
 @cache
 def finder() -> Any:
-    """COLMAP's finder of features on a CPU, silent, for pictures in memory."""
+    """COLMAP's feature extractor on a CPU, silent, for pictures in memory."""
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads, options.sift.max_num_features = False, 1, FEATURES
     options.sift.peak_threshold, pycolmap.logging.minloglevel = CONTRAST, 1
@@ -77,7 +77,7 @@ def finder() -> Any:
 
 
 def features(photograph: Photograph) -> Seen:
-    """Scale-invariant features (Lowe 2004) of a photograph's trusted pixels, enlarged where it is small."""
+    """Scale-invariant features (Lowe 2004) of a photograph's trusted pixels, upscaled if it is small."""
     photograph = photograph.to("cpu")
     camera, mask = photograph.camera, photograph.mask
     grey = (photograph.before(torch.full((3,), 0.5)) @ torch.tensor([0.299, 0.587, 0.114]))[None, None]
@@ -97,7 +97,7 @@ def features(photograph: Photograph) -> Seen:
 
 
 def matched(a: Seen, b: Seen) -> Int[Tensor, "match 2"]:
-    """Features of two photographs that are each other's best, and clearly better than the second."""
+    """Mutual nearest features of two photographs that pass the ratio test."""
     none = torch.empty(0, 2, dtype=torch.int64)
     if min(len(a.bearings), len(b.bearings)) < 2:
         return none
@@ -111,8 +111,8 @@ def matched(a: Seen, b: Seen) -> Int[Tensor, "match 2"]:
 
 
 def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "kept 2"]:
-    """The matches that one motion between two views explains (RANSAC on the essential matrix, Nister 2004); none where
-    they are so few that chance explains them too."""
+    """Inlier matches of two-view geometry (RANSAC on the essential matrix, Nister 2004); none if too few to exclude
+    chance."""
     ends = a.bearings[pairs[:, 0]], b.bearings[pairs[:, 1]]
     ahead = (ends[0][:, 2] > FLAT) & (ends[1][:, 2] > FLAT)
     pairs, (first, second) = pairs[ahead], [(FOCAL * end[:, :2] / end[:, 2:])[ahead].double().numpy() for end in ends]
@@ -127,7 +127,7 @@ def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "
 
 
 def neighbours(cameras: Camera) -> list[tuple[int, int]]:
-    """Pairs of views that should show the same, by their poses: alike in direction, then in place."""
+    """Pairs of views with expected overlap, by their poses: similar in direction, then in position."""
     forward, apart = cameras.forward, torch.cdist(cameras.position, cameras.position)
     turned = forward @ forward.T
     alike = (turned - 0.1 * apart / apart.median().clamp_min(1e-9)).fill_diagonal_(-math.inf)
@@ -137,8 +137,8 @@ def neighbours(cameras: Camera) -> list[tuple[int, int]]:
 
 
 def shared_points(scene: Scene) -> tuple[list[Seen], Matches]:
-    """Features of the photographs to learn from, in the order of the split, and which of them are the same by pairs of
-    photographs. Poses say only which to compare."""
+    """Features of the training photographs, in the order of the split, and their matches by pairs of photographs. Poses
+    only select the pairs."""
     learnt = scene.splits["train"].tolist()
     cameras = scene.cameras[scene.splits["train"]].to("cpu")
     seen = [
@@ -151,7 +151,7 @@ def shared_points(scene: Scene) -> tuple[list[Seen], Matches]:
 
 
 def tracks(seen: Sequence[Seen], matches: Matches) -> Tracks:
-    """Matches, joined to points; one that a photograph shows in two places is none."""
+    """Tracks from matches; a point with two features in one photograph is dropped."""
     first = np.cumsum([0, *(len(one.bearings) for one in seen)])
     ends = [(first[i] + m[:, 0].numpy(), first[j] + m[:, 1].numpy()) for (i, j), m in matches.items()]
     rows, columns = (np.concatenate([end[k] for end in ends] or [np.zeros(0, int)]) for k in range(2))

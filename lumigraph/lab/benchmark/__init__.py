@@ -1,9 +1,9 @@
-"""Methods side by side: cells that train in processes of their own, tables, charts.
+"""Benchmark of methods: cells that train in separate processes, tables, charts.
 
 OUTPUT/
-├── settings.json   what all cells share
+├── settings.json   common settings of all cells
 ├── runs/           a run's folder for each cell, and its log beside
 ├── results.json    all figures
 ├── results.md      the same as tables, with the charts
-└── *.svg, *.png    charts, and one held-out view as every method shows it
+└── *.svg, *.png    charts, and one held-out view rendered by every method
 """

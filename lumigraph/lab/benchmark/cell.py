@@ -1,4 +1,4 @@
-"""A cell of a benchmark: one training and its evaluation, as commands that a user could type; its results as a row."""
+"""Cell of a benchmark: one training and its evaluation, as commands that a user could type; its results as a row."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CellSettings:
     """Settings of all cells of a benchmark: the command line's options of the same names.
 
     eval_views: number of held-out views to compare; `None` for all
-    lpips:      files with the weights of LPIPS; empty for none
+    lpips:      weight files of LPIPS; empty for none
     """
 
     downscale: int | None = None
@@ -63,13 +63,13 @@ class CellSettings:
 
 @dataclass(frozen=True)
 class Cell:
-    """A method, what it learns, and for how long: seconds or steps.
+    """A method, its data, and its budget: seconds or steps.
 
     scene:      its short name, the same for all cells of the scene
-    views:      photographs to learn from; None for all
-    collection: the name of the one whose member the scene is, with which it is averaged
-    prior:      the run that makes the cell's out of so many photographs, which learns nothing; its budget is then that
-                of the cells beside it
+    views:      number of training photographs; None for all
+    collection: name of the scene's collection, over which results are averaged
+    prior:      the run that infers the cell's run from so many photographs without training; its budget is then that of
+                the cells beside it
     further:    other options of `lumigraph train`
     """
 
@@ -85,7 +85,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """The cell's name for folders, unique among cells that share their settings."""
+        """The cell's folder name, unique among cells with common settings."""
         views = "" if self.views is None else f"-{self.views}views"
         if self.prior:
             return f"{self.scene}-{self.method}{views}-by-{Path(self.prior).name}"
@@ -98,7 +98,7 @@ class Cell:
 
     @property
     def title(self) -> str:
-        """The cell's name for people."""
+        """The cell's display name."""
         views = "" if self.views is None else f" from {self.views} views"
         if self.prior:
             return f"{self.method} on {self.scene}{views}, by {Path(self.prior).name}"
@@ -140,9 +140,9 @@ def reduced(source: str, downscale: int | None) -> int | None:
 
 
 def evaluation(folder: Path, settings: CellSettings, halves: bool = False) -> list[str]:
-    """Arguments of `lumigraph` that evaluate a cell; empty if that is done.
+    """Arguments of `lumigraph` that evaluate a cell; empty if it is evaluated.
 
-    halves: compare right halves alone, because another method of the scene is judged by them
+    halves: compare only right halves, because another method of the scene is evaluated on them
     """
     if evaluated(folder, settings, halves):
         return []
@@ -152,7 +152,7 @@ def evaluation(folder: Path, settings: CellSettings, halves: bool = False) -> li
 
 
 def options(told: dict[str, Any]) -> list[str]:
-    """Options as words; those that stand as they would anyway are left out."""
+    """Command line words of options, without defaults."""
     given = {name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in told.items() if x not in (None, "auto")}
     return [word for option in given.items() for word in option]
 
@@ -189,8 +189,8 @@ class Claim:
 
 
 def claim(output: Path, cells: Sequence[Cell], settings: CellSettings) -> None:
-    """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far, or
-    if somebody else's files lie where the results go."""
+    """Write the common settings to the output's folder. Raises LumigraphError if earlier ones differ, or for foreign
+    files at the paths of results."""
     path = output / "settings.json"
     shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
     known = asdict(files.read_json(path, Claim) if path.exists() else Claim(shared, {}))
@@ -249,13 +249,13 @@ class Measured:
 
 @dataclass(frozen=True)
 class Results:
-    """And of all of them."""
+    """Contents of results.json."""
 
     cells: list[Row] = field(default_factory=list)
 
 
 def row_of(cell: Cell, output: Path, settings: CellSettings, failure: str | None) -> Row:
-    """A cell's figures out of its run's folder, under the names that eval.json has for them; or why there are none."""
+    """A cell's figures from its run's folder, under their names in eval.json; or the reason for none."""
     folder, file = output / "runs" / cell.name, methods.file_of(methods.find(cell.method))
     own = [methods.METHOD_FILE, Path(file).name] if file else []
     row: Row = {
@@ -283,7 +283,7 @@ def row_of(cell: Cell, output: Path, settings: CellSettings, failure: str | None
 
 
 def scored(run: Run, settings: CellSettings) -> Row:
-    """Columns of a row that its evaluation gives."""
+    """Columns of a row from its evaluation."""
     result = run.evaluation() or {}
     row = {name: result[name] for name in (*MEASURED, "by_resolution", "by_held_out") if name in result}
     if (views := result.get("views")) and "members" not in result["protocol"]:
@@ -292,13 +292,13 @@ def scored(run: Run, settings: CellSettings) -> Row:
 
 
 def public(cell: Cell) -> Cell:
-    """A cell without the places where its scene and its prior lie on this machine."""
+    """The cell without local paths of its scene and its prior."""
     source = cell.scene if Path(cell.source).exists() else cell.source
     return replace(cell, source=source, prior=cell.prior and Path(cell.prior).name)
 
 
 def read_rows(output: Path) -> dict[str, Row]:
-    """The rows so far by their runs, earlier commands' among them."""
+    """Rows so far by run, those of earlier commands included."""
     path = output / "results.json"
     if not path.exists():
         return {}
@@ -311,7 +311,7 @@ def read_rows(output: Path) -> dict[str, Row]:
 
 @dataclass(frozen=True)
 class Published:
-    """Held-out PSNR in dB of one scene, at what resolution, and who says so."""
+    """Published held-out PSNR in dB of one scene, with resolution and source."""
 
     psnr: float
     resolution: str
@@ -331,11 +331,11 @@ FIGURES: dict[tuple[str, str], Published] = {
 
 @dataclass(frozen=True)
 class Few:
-    """Held-out PSNR in dB from few photographs, the mean of several scenes.
+    """Published held-out PSNR in dB from few photographs, the mean of several scenes.
 
-    views: photographs that were learnt from
-    protocol: the scenes, and the pixels that were compared
-    source: who measured it, and where it is published
+    views: number of training photographs
+    protocol: the scenes, and the compared pixels
+    source: publication
     """
 
     method: str

@@ -1,5 +1,5 @@
-"""Train and evaluate the cells of a benchmark, each in a process of its own, so that neither memory nor a fault of one
-affects another; after each, write the table and charts."""
+"""Train and evaluate the cells of a benchmark, each in a separate process, so that memory and faults are isolated;
+update the table and charts after each."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ POLL_SECONDS = 0.2  # seconds between looks at whether to stop
 
 
 def launch(arguments: Sequence[str], log: Path) -> int:
-    """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count. Files of
-    methods that were loaded here are loaded there.
+    """Run `lumigraph ARGUMENTS`, with its output appended to a log. Returns its exit code, as in shells. Loaded files
+    of external methods are loaded there too.
 
-    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It does so too
-    when this process is killed. It stands apart from the terminal, which would send it Ctrl-C a second time.
+    Ctrl-C and SIGTERM are forwarded, and the command saves its state and ends; also when this process is killed. It is
+    detached from the terminal, which would send Ctrl-C a second time.
     """
     arguments = [*arguments, *(word for file in methods.loaded_here() for word in (methods.METHOD_FILE, file))]
     with files.explained(log):
@@ -83,8 +83,9 @@ def conduct(
 ) -> int:
     """Train and evaluate all cells, and write results.json, results.md and pictures to `output`.
 
-    Cells that are done are kept, half-trained ones go on, failed ones are tried again. A cell that fails is a row that
-    says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
+    Finished cells are kept, interrupted ones continue, failed ones are tried again. A failed cell is a row with the
+    reason.
+    tell: called with the title of the next cell. Returns the signal's exit code if one stopped it, otherwise 0.
     """
     check_place(output)
     for cell in cells:
@@ -97,7 +98,7 @@ def conduct(
 def carry_on(
     cells: Sequence[Cell], settings: CellSettings, output: Path, tell: Callable[[str], object], launch: Launch
 ) -> int:
-    """All cells, one after the other, in a folder that is ours alone."""
+    """Process all cells, one after the other, in a locked folder."""
     rows, patience = read_rows(output), Patience()
     for number, cell in enumerate(cells, 1):
         halved = by_halves(rows)
@@ -135,7 +136,7 @@ def write(rows: dict[str, Row], output: Path, settings: CellSettings) -> None:
 def carry_out(
     cell: Cell, output: Path, settings: CellSettings, halved: set[str], launch: Launch
 ) -> tuple[int, str | None]:
-    """Train and evaluate a cell as far as that is not done. Returns the last exit code, and why it failed if it did."""
+    """Train and evaluate a cell unless finished. Returns the last exit code, and the reason of a failure."""
     folder, log = output / "runs" / cell.name, log_of(cell, output)
     for task in tasks(cell, folder, settings, halved):
         try:
@@ -149,22 +150,22 @@ def carry_out(
 
 
 def tasks(cell: Cell, folder: Path, settings: CellSettings, halved: set[str]) -> list[Callable[[], list[str]]]:
-    """Functions that give the commands of a cell: its training, then its evaluation."""
+    """Functions that return the commands of a cell: its training, then its evaluation."""
     halves = (cell.collection or cell.scene) in halved
     return [partial(training, cell, folder, settings), partial(evaluation, folder, settings, halves)]
 
 
 def by_halves(rows: dict[str, Row]) -> set[str]:
-    """Scenes and collections of which some cell was judged by halves of photographs."""
+    """Scenes and collections with a cell evaluated on halves of photographs."""
     return {together(row) for row in rows.values() if not row["failed"] and row["protocol"].get("halves")}
 
 
 def compare_alike(
     rows: dict[str, Row], output: Path, settings: CellSettings, tell: Callable[[str], object], launch: Launch
 ) -> int:
-    """Evaluate cells again whose scenes are judged by halves since, earlier commands' among them, so that all methods
-    of a scene are compared on the same pixels. Changes the rows. Returns the signal's exit code if one stopped it,
-    otherwise 0."""
+    """Evaluate cells again, those of earlier commands included, if their scene is now evaluated on halves, so that all
+    methods of a scene are compared on the same pixels. Changes the rows. Returns the signal's exit code if one stopped
+    it, otherwise 0."""
     halved = by_halves(rows)
     for name, row in rows.items():
         whole = not row["failed"] and "views" in row["protocol"] and not row["protocol"].get("halves")
@@ -209,14 +210,14 @@ class Patience:
 
 
 def claim_log(log: Path) -> None:
-    """Raise LumigraphError unless lines may be added to a log: it is a benchmark's, or not there."""
+    """Raise LumigraphError unless a log is new or a benchmark's."""
     with files.explained(log):
         if os.path.lexists(log) and (log.is_symlink() or log.read_bytes()[: len(PROMPT)] != PROMPT):
             raise LumigraphError(f"{log} is no log of a benchmark; move it away, or choose another --output")
 
 
 def reason(log: Path, code: int) -> str:
-    """Why a command failed: the sentence it said last."""
+    """Reason of a failed command: its last sentence in the log."""
     if code > 128:
         return f"ended by signal {code - 128}" + (", perhaps because memory was short" if code == 137 else "")
     lines = [line for line in log.read_text("utf-8", errors="replace").splitlines() if line.strip()]
@@ -224,7 +225,7 @@ def reason(log: Path, code: int) -> str:
 
 
 def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
-    """Draw what the rows have at least two points of. Returns the names of the files."""
+    """Draw all charts with at least two points. Returns the names of the files."""
     drawn = []
     for place, found in places([row for row in rows if not row["failed"]]):
         seconds = {row["budget"].get("seconds") for row in found if row["views"] is None}
@@ -251,7 +252,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
 
 
 def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
-    """One held-out view of each scene as its photograph and as every method shows it, after its longest training."""
+    """One held-out view of each scene, photographed and rendered by every method after its longest training."""
     measured = [row for row in rows if not row["failed"] and "shown" in row]
     best: dict[tuple[str, str, int], dict[str, Row]] = {}
     for row in sorted(measured, key=lambda row: (*row["budget"].values(), -row["seed"])):
@@ -275,7 +276,7 @@ def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
 
 
 def rendering(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
-    """A run's rendering of a view, as the evaluation kept it."""
+    """A run's stored rendering of a view."""
     path = output / row["run"] / "eval" / f"{file_name(row['shown']['name'])}.png"
     with readable(path), Image.open(path) as image:
         return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255

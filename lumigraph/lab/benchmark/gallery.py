@@ -1,8 +1,8 @@
-"""The gallery: every method on the smallest data that it is meant for, on one page.
+"""Gallery: every method on the smallest suitable data, on one page.
 
 OUTPUT/
 ├── gallery.html    pictures, scores, times, published figures
-├── data/           a mesh, a picture and a model of captions, which some methods learn from
+├── data/           a mesh, a picture and a model of captions, training data of some methods
 └── runs/, results.json, results.md    as of every benchmark
 """
 
@@ -37,8 +37,8 @@ CAPTION_NUMBERS = ("--pictures", "600", "--steps", "300")  # a minute of one pro
 
 @dataclass(frozen=True)
 class Showpiece:
-    """A method's entry. source: smallest data that it is meant for; idea: its contribution in a line; known: published
-    figure with its protocol; options: further ones of `lumigraph train`; views: photographs to learn from"""
+    """A method's entry. source: smallest suitable data; idea: its contribution in a line; known: published figure with
+    its protocol; options: further ones of `lumigraph train`; views: training photographs"""
 
     source: str
     idea: str
@@ -193,7 +193,7 @@ def gallery(
     tell: Callable[[str], object] = print,
     launch: Launch = launch,
 ) -> int:
-    """Train and evaluate methods, and write the page. What is done is kept. Returns the signal's exit code if one
+    """Train and evaluate methods, and write the page. Finished ones are kept. Returns the signal's exit code if one
     stopped it, otherwise 0.
 
     names: of methods; those without a Showpiece are refused
@@ -214,7 +214,7 @@ def gallery(
 
 
 def cell_of(name: str, seconds: float, output: Path) -> Cell:
-    """The cell of a method's Showpiece. Its own data are those of `prepare`."""
+    """Cell of a method's Showpiece. Data files are those of `prepare`."""
     piece = SHOWPIECES[name]
     here = piece.source in (MESH, PICTURE)
     source = str((output / piece.source).resolve()) if here else piece.source
@@ -224,7 +224,7 @@ def cell_of(name: str, seconds: float, output: Path) -> Cell:
 
 
 def prepare(sources: set[str], guided: bool, output: Path, tell: Callable[[str], object], launch: Launch) -> int:
-    """Make the data of methods that learn from files, where they are not there yet. Returns the exit code."""
+    """Make the data of methods that train on files, unless they exist. Returns the exit code."""
     if MESH in sources and not (output / MESH).exists():
         import trimesh
 
@@ -246,7 +246,7 @@ def prepare(sources: set[str], guided: bool, output: Path, tell: Callable[[str],
 
 
 def write_gallery(cells: Sequence[Cell], output: Path) -> None:
-    """The page of what these cells have measured, whatever else the output holds."""
+    """Write the page of these cells, whatever else the output has."""
     rows = read_rows(output)
     found = {cell.method: rows[f"runs/{cell.name}"] for cell in cells if f"runs/{cell.name}" in rows}
     body = "<header><h1>Gallery</h1><p>Every method on the smallest data that it is meant for</p></header>"
@@ -276,7 +276,7 @@ def card(name: str, piece: Showpiece, row: Row, output: Path) -> str:
 
 
 def picture_of(row: Row, output: Path) -> Path | None:
-    """A held-out view as the evaluation kept it, else the latest preview of training."""
+    """Stored rendering of a held-out view, else the latest training preview."""
     run = output / row["run"]
     if "shown" in row and (path := run / "eval" / f"{file_name(row['shown']['name'])}.png").exists():
         return path

@@ -1,4 +1,4 @@
-"""Shapes side by side: scores of each run at each level of detail, and completions of held-out members.
+"""Benchmark of shapes: scores of each run at each level of detail, and completions of held-out members.
 
 OUTPUT/shapes.json has all figures, OUTPUT/shapes.md the same as tables.
 """
@@ -49,7 +49,9 @@ class Held:
 def measure(
     runs: Sequence[Path], members: int, points: int, cells: int, output: Path, tell: Callable[[str], object]
 ) -> None:
-    """Measure trained runs of shapes, and write the tables. members: held-out members of a collection at most"""
+    """Measure trained runs of shapes, and write the tables. members: largest number of held-out members of a
+    collection
+    """
     held, completed = list[Held](), dict[str, list[Completed]]()
     together: dict[str, list[tuple[str, Method]]] = {}
     opened: dict[str, Shapes] = {}
@@ -90,7 +92,7 @@ def levels_of(run: Run, shapes: Shapes, points: int, cells: int) -> Iterable[Hel
 
 
 def frame_time(method: Method, shapes: Shapes) -> float:
-    """Seconds that a picture takes: the least of some, after a first one that compiles."""
+    """Rendering time of a picture in seconds: the least of some, after a first one that compiles."""
     camera = ring(shapes.frame.bounds, size=FRAME_SIZE)[1].to(method.device)
     taken = []
     for _ in range(FRAMES + 1):

@@ -1,9 +1,9 @@
-"""One training step taken apart: time of each kernel and PyTorch operation, and bytes against the memory's rate.
+"""Profile of one training step: time of each kernel and PyTorch operation, and memory traffic against bandwidth.
 
-Time is that of PyTorch's profiler, which sees a span for each kernel (`kernels.watching`) and for each part of a step
-(`training.advance`). Bytes are counted in a step of its own: each tensor that an operation reads or writes, once. So a
-kernel that passes over its data twice moves more, and one whose data stay in a cache moves less. Milliseconds of the
-processor, of the thread that trains, are there for kernels and optimizers: beside other programs only they compare.
+Time is that of PyTorch's profiler, with a span for each kernel (`kernels.watching`) and for each part of a step
+(`training.advance`). Bytes are counted in a separate step: each tensor that an operation reads or writes, once. So a
+kernel that passes over its data twice moves more, and one with data in cache moves less. CPU milliseconds of the
+training thread are given for kernels and optimizers: beside other programs only they are comparable.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ...method import Method
 from ...run import Run, State
 from ...system.threads import TASKS_FOLDER, Contention
 from ...system.work import at_work
-from ...training import advance
+from ...training.loop import advance
 
 KINDS = "kernel", "operation", "optimizer", "data", "check", "autograd", "Python"
 WHOLE = {"data": "photographs and rays", "check": "finite loss and gradients"}  # parts of a step that are one row
@@ -49,8 +49,8 @@ class StepRow:
     """A kernel, an operation or another part of a step, per step.
 
     kind:  one of KINDS
-    bytes: of all tensors read and written, each counted once; 0 where nothing is counted
-    processor_ms: time that this thread ran, of kernels and optimizers
+    bytes: of all tensors read and written, each counted once; 0 if not counted
+    processor_ms: CPU time of this thread, of kernels and optimizers
     """
 
     name: str
@@ -66,15 +66,15 @@ class StepRow:
 
 @dataclass(frozen=True)
 class Anatomy:
-    """A step taken apart.
+    """Profile of a step.
 
     rows:        largest first; their milliseconds sum up to `profiled_ms`
     tree:        the same as nested spans
     ms:          median of a step without the profiler
-    processor_ms: the same of the thread that trains, while it ran
-    profiled_ms: mean of the quicker half of the steps with it
-    waiting:     share of the time that our threads could run in which other programs had the processor
-    memory_rate: bytes per second that the memory moves, in a large copy
+    processor_ms: CPU time of the training thread
+    profiled_ms: mean of the faster half of the profiled steps
+    waiting:     contention: share of runnable time in which other programs had the processor
+    memory_rate: memory bandwidth in bytes per second, of a large copy
     """
 
     rows: list[StepRow]
@@ -96,7 +96,7 @@ class Anatomy:
         return {name: getattr(self, name) for name in names} | {"rows": rows}
 
     def memory_share(self, row: StepRow) -> float:
-        """Rate of a row's bytes as a share of the memory's. Above 1 where they come from a cache."""
+        """Rate of a row's bytes as a share of the memory bandwidth. Above 1 with data in a cache."""
         return row.bytes / (row.ms / 1e3) / self.memory_rate if row.ms else 0.0
 
     def graph(self) -> str:
@@ -129,11 +129,11 @@ class Anatomy:
 def bench_step(
     method: Method, data: Dataset, run: Run | None, warmup: int, count: int, progress: float, seed: int = 0
 ) -> Anatomy:
-    """Take steps of a fresh method apart, or of a run's, whose folder is left as it is.
+    """Profile steps of a fresh method, or of a run's, whose folder is not changed.
 
     warmup:   steps before, in which the share of the budget rises to `progress` for a fresh method
-    count:    steps that are measured
-    progress: share of the budget that schedules follow
+    count:    number of profiled steps
+    progress: share of the budget for schedules
     """
     state = run.restore_weights(method) if run else State()
     optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
@@ -153,9 +153,9 @@ def bench_step(
 
 
 def take_apart(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimizer], count: int) -> Anatomy:
-    """Measure steps of training: so many alone, so many with the profiler, and one more to count bytes.
+    """Measure training steps: `count` alone, `count` with the profiler, and one more to count bytes.
 
-    step: makes the next step, by `training.advance`. On a GPU each launch must wait: CUDA_LAUNCH_BLOCKING=1.
+    step: runs the next step, by `training.advance`. On a GPU launches must be synchronous: CUDA_LAUNCH_BLOCKING=1.
     """
     alone, running = (statistics.median(column) for column in zip(*(seconds(step) for _ in range(count)), strict=True))
     clock, contention = RunningClock(), Contention() if TASKS_FOLDER.exists() else None
@@ -178,14 +178,14 @@ def take_apart(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimiz
 
 
 def seconds(call: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds of a call, and those in which this thread ran."""
+    """Wall-clock and CPU seconds of a call."""
     begin, ran = time.perf_counter(), time.thread_time()
     call()
     return time.perf_counter() - begin, time.thread_time() - ran
 
 
 class RunningClock:
-    """Seconds that this thread ran in each kernel and optimizer, by the name of its row."""
+    """CPU seconds of this thread in each kernel and optimizer, by the name of its row."""
 
     def __init__(self) -> None:
         self.spent: defaultdict[str, float] = defaultdict(float)
@@ -199,7 +199,7 @@ class RunningClock:
 
     @contextmanager
     def of(self, optimizers: Sequence[torch.optim.Optimizer]) -> Iterator[None]:
-        """Inside this block, count the steps of optimizers too."""
+        """Block in which optimizers' steps are counted too."""
 
         def count(sign: int, optimizer: torch.optim.Optimizer, *_: Any) -> None:
             self.spent[update_of(optimizer)] += sign * time.thread_time()
@@ -217,10 +217,10 @@ def update_of(optimizer: torch.optim.Optimizer) -> str:
 
 
 def add(event: Any, around: list[Span], row: StepRow | None, rows: dict[str, StepRow], weight: float) -> None:
-    """Add a profiled event, and all inside it, to the tree and the rows.
+    """Add a profiled event and its children to the tree and the rows.
 
-    around: spans that the event lies in, the whole step first
-    row:    of an event around it that is one row, to which its time belongs
+    around: enclosing spans, the whole step first
+    row:    of an enclosing event that is a single row
     """
     name, ms = plain(event.name), weight * event.cpu_time_total / 1e3
     own = row or whole(event.name)
@@ -254,7 +254,7 @@ def plain(event: str) -> str:
 
 
 def whole(event: str) -> StepRow | None:
-    """The row that an event with all inside it belongs to; None for spans that are taken apart."""
+    """Row of an event including its children; None for spans that are split."""
     name = plain(event)
     if name in WHOLE:
         return StepRow(WHOLE[name], name)
@@ -272,12 +272,12 @@ def kernel_spans() -> frozenset[str]:
 
 
 def remainder(name: str) -> StepRow:
-    """The row of a span's own time, in which nothing runs that has a row."""
+    """Row of a span's self time, without rows inside."""
     return StepRow(f"{name}, between", "Python") if name in PARTS else StepRow("graph of gradients", "autograd")
 
 
 def traffic(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimizer]) -> Iterator[tuple[str, int]]:
-    """Names of rows, and bytes of theirs in one step."""
+    """Names of rows, and their bytes in one step."""
     mode = Traffic()
     with watching(mode.kernel), profile(activities=[ProfilerActivity.CPU]) as profiler, mode:
         with span(STEP):
@@ -290,7 +290,7 @@ def traffic(step: Callable[[], Any], optimizers: Sequence[torch.optim.Optimizer]
 
 
 def row_around(event: Any) -> StepRow | None:
-    """The row that an event belongs to: that of the outermost event around it which has one."""
+    """Row of an event: that of the outermost enclosing event with one."""
     found = None
     while event := event.cpu_parent:
         found = whole(event.name) or found
@@ -298,8 +298,8 @@ def row_around(event: Any) -> StepRow | None:
 
 
 class Traffic(TorchDispatchMode):
-    """Marks, among the profiler's events, the bytes of each operation's tensors. Of a kernel's own only inputs and
-    outputs count, not what it works with."""
+    """Markers, among the profiler's events, of each operation's bytes. For a kernel only inputs and outputs count, not
+    its workspace."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -328,7 +328,7 @@ def mark(count: int) -> None:
 
 
 def moves(function: Any) -> bool:
-    """False for operations that touch no numbers: new views of a tensor, and memory without content."""
+    """False for operations without memory traffic: views, and empty tensors."""
     returned = [r.alias_info for r in function._schema.returns]
     view = any(alias is not None and not alias.is_write for alias in returned)
     return not view and not function._schema.name.startswith("aten::empty")
@@ -356,7 +356,7 @@ def moved_by(optimizer: torch.optim.Optimizer) -> Iterator[int]:
 
 
 def memory_rate() -> float:
-    """Bytes per second of the main memory: a copy's reads and writes, the best of five."""
+    """Memory bandwidth in bytes per second: reads and writes of a copy, the best of five."""
     source = torch.ones(COPY_BYTES // 4)
     target = torch.empty_like(source)
     return 2 * COPY_BYTES / min(seconds(lambda: target.copy_(source))[0] for _ in range(5))

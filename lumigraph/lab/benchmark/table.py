@@ -21,7 +21,7 @@ NONE = "–"
 
 
 def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
-    """The whole page of a benchmark. pictures: names of files beside it."""
+    """Page of a benchmark. pictures: names of files beside it"""
     measured = [row for row in rows if not row["failed"]]
     charts = "\n".join(f"![{name}]({name})" for name in pictures)
     parts = ["# Methods side by side", few_photographs(measured), short_table(measured), charts]
@@ -39,8 +39,8 @@ def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
 
 
 def few_photographs(rows: Sequence[Row]) -> str:
-    """For each scene or collection a line for each method and a column for each number of photographs, with what
-    others report below; empty where all cells learnt from all photographs."""
+    """For each scene or collection a line per method and a column per number of photographs, with published figures
+    below; empty if all cells were trained on all photographs."""
     parts = []
     for place, found in places(rows):
         if all(row["views"] is None for row in found):
@@ -63,7 +63,7 @@ def few_photographs(rows: Sequence[Row]) -> str:
 
 
 def short_table(rows: Sequence[Row]) -> str:
-    """One line for cells that differ in their seeds, or are members of one collection, alone."""
+    """One line for cells that differ only in seeds, or in members of one collection."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in in_order(rows):
         groups.setdefault((together(row), row["method"], row["train_views"], trained_for(row)), []).append(row)
@@ -102,7 +102,7 @@ FIGURES: dict[str, Callable[[Row], str]] = {
 
 
 def halves(row: Row) -> str:
-    """Pixels of photographs that are compared."""
+    """Compared pixels of photographs."""
     if "views" not in row["protocol"]:
         return NONE
     how = row["protocol"].get("halves")
@@ -110,7 +110,7 @@ def halves(row: Row) -> str:
 
 
 def poses(row: Row) -> str:
-    """Origin of the cameras that photographs are compared from."""
+    """Origin of the cameras of the compared photographs."""
     how = row["protocol"].get("poses")
     return NONE if not how else "as captured" if how == CAPTURED_POSES else "refined"
 
@@ -119,12 +119,12 @@ PROTOCOL: dict[str, Callable[[Row], str]] = {"halves": halves, "poses": poses}
 
 
 def shared(value: Callable[[Row], str], group: list[Row]) -> str:
-    """Value that rows share; all of them where they differ."""
+    """Common value of rows; all values if they differ."""
     return " / ".join(dict.fromkeys(map(value, group)))
 
 
 def full_table(rows: Sequence[Row]) -> str:
-    """One line for each cell. One that failed says why where its protocol would stand."""
+    """One line for each cell. A failed one has the reason in the column of its protocol."""
     names = score_names([row for row in rows if not row["failed"]])
     columns: dict[str, Callable[[Row], str]] = {name: partial(score_in, name) for name in names} | FIGURES | PROTOCOL
     lines = []
@@ -136,14 +136,14 @@ def full_table(rows: Sequence[Row]) -> str:
 
 
 def table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """A Markdown table. Columns that say nothing anywhere are left out."""
+    """A Markdown table, without empty columns."""
     kept = [i for i in range(len(names)) if any(line[i] != NONE for line in lines)]
     shown = [[literal(line[i]) for i in kept] for line in (names, ["---"] * len(names), *lines)]
     return "\n".join(f"| {' | '.join(line)} |" for line in shown) if lines else ""
 
 
 def literal(text: str) -> str:
-    """Text that Markdown shows as it is."""
+    """Text escaped for Markdown."""
     return re.sub(r"([\\`*\[\]<>|])", r"\\\1", text)
 
 
@@ -215,7 +215,7 @@ def size(bytes_: int) -> str:
 
 
 def together(row: Row) -> str:
-    """Key that rows are averaged by: the scene, or the collection that the scene is a member of."""
+    """Key of averaging rows: the scene, or its collection."""
     return row.get("collection") or row["scene"]
 
 
@@ -231,7 +231,7 @@ def over_time(rows: Sequence[Row]) -> list[Series]:
 
 
 def over_views(rows: Sequence[Row]) -> list[Series]:
-    """The first score over the number of photographs. Of a collection's members only what all of them have."""
+    """The first score over the number of photographs. For a collection only numbers common to all members."""
     members = {row["scene"] for row in rows}
     points: dict[tuple[Any, ...], set[str]] = {}
     for row in rows:
@@ -251,10 +251,9 @@ def learnt_for(row: Row) -> str:
 def curves(
     rows: Sequence[Row], x: str, point: Callable[[Row], Any], per: Callable[[Row], Any] = lambda row: ""
 ) -> list[Series]:
-    """The first score over x, a curve for each method. Cells of one point, which differ in their seeds or members
-    alone, are their means.
+    """The first score over x, a curve for each method. Points are means over seeds and members.
 
-    point: what cells of one point have in common;  per: what else tells curves apart, of one method by their dashes
+    point: key of a point;  per: key of a curve beside the method, shown by dashes
     """
     groups: dict[tuple[str, Any], dict[Any, list[Row]]] = {}
     for row in rows:
@@ -273,7 +272,7 @@ def curves(
 
 
 def colours(names: set[str]) -> dict[str, int]:
-    """The colour of each method in a chart of these: its own, or the next that is free where another has that."""
+    """Colour of each method in a chart: its own, or the next free one if taken."""
     chosen: dict[str, int] = {}
     for name in sorted(names, key=methods.colour):
         own = methods.colour(name) % COLOURS

@@ -1,1 +1,1 @@
-"""Equations of papers, measured and drawn on the user's data."""
+"""Equations of papers, measured and plotted on the user's data."""

@@ -1,4 +1,4 @@
-"""Why a voxel grid interpolates before it activates: a sharp edge, learnt in three orders (Sun 2022, section 4.1)."""
+"""Pre-, in- and post-activation of a voxel grid on a sharp edge (Sun 2022, section 4.1)."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Picture = Float[Tensor, "1 1 height width"]
 
 
 def alpha(density: Tensor) -> Tensor:
-    """The share of light that a voxel stops."""
+    """Opacity of a voxel."""
     return 1 - torch.exp(-density)
 
 
 def blended(grid: Grid) -> Picture:
-    """Between corners, bilinearly."""
+    """Bilinear interpolation between corners."""
     return interpolate(grid, (SIDE, SIDE), mode="bilinear", align_corners=True)
 
 
@@ -41,7 +41,7 @@ ORDERS: dict[str, Callable[[Grid], Picture]] = {
 
 @dataclass(frozen=True)
 class ActivationFit:
-    """Fitted picture of the edge with one order, and its PSNR in dB."""
+    """Picture of the edge fitted with one order, and its PSNR in dB."""
 
     name: str
     picture: Float[Tensor, "height width"]
@@ -49,13 +49,13 @@ class ActivationFit:
 
 
 def edge() -> Float[Tensor, "height width"]:
-    """A leaf: opaque where two discs overlap, clear elsewhere; every direction of an edge, and two sharp ends."""
+    """A leaf: opaque where two discs overlap, transparent elsewhere; edges in every direction, and two sharp ends."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, SIDE), torch.linspace(-1, 1, SIDE), indexing="ij")
     return (((x - 0.35).hypot(y - 0.2) < 0.95) & ((x + 0.35).hypot(y + 0.2) < 0.95)).float()
 
 
 def fits(cells: int, steps: int) -> list[ActivationFit]:
-    """The leaf as learnt by grids of so many cells along an axis, which differ in nothing but the order."""
+    """Fits of the leaf by grids of `cells` cells along an axis that differ only in the order."""
     target, found = edge(), []
     for name, order in ORDERS.items():
         grid = torch.zeros(1, 1, cells + 1, cells + 1, requires_grad=True)
@@ -70,7 +70,7 @@ def fits(cells: int, steps: int) -> list[ActivationFit]:
 
 
 def draw(path: Path, found: list[ActivationFit], cells: int) -> None:
-    """Write the leaf and what each order made of it side by side."""
+    """Draw the leaf and its fits side by side."""
     pictures = [edge(), *(fit.picture for fit in found)]
     columns = ["the edge", *(f"{fit.name} · {fit.psnr:.1f} dB" for fit in found)]
     rows = [Row("", [picture[..., None].expand(-1, -1, 3) for picture in pictures])]

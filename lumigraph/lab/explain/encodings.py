@@ -1,4 +1,4 @@
-"""The same network behind each encoding of a picture's pixels, and over a range of scales (Tancik 2020, section 6)."""
+"""Encodings of a picture's pixels with one network, and a range of scales (Tancik 2020, section 6)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ...metrics import psnr
 from ...run import build
 from ...system.progress import track
 from ...system.signals import go_on_unless
-from ...training import fit
+from ...training.loop import fit
 
 UNSCALED_ENCODINGS: tuple[Encoding, ...] = ("none", "basic")
 SCALED_ENCODINGS: tuple[Encoding, ...] = ("positional", "gaussian")
@@ -29,7 +29,7 @@ class EncodingFit:
     """One trained network.
 
     scale:       cycles across the picture; None for encodings without one
-    learnt:      PSNR of the pixels that it learnt from, in dB; held_out of the others
+    learnt:      PSNR of its training pixels, in dB; held_out of the others
     eigenvalues: of the tangent kernel before training, as shares of their sum
     """
 
@@ -48,7 +48,7 @@ class EncodingFit:
 
 @dataclass(frozen=True)
 class EncodingComparison:
-    """All fits, and what they were made of."""
+    """All fits, and their settings."""
 
     source: str
     picture: Float[Tensor, "height width 3"]
@@ -61,17 +61,17 @@ class EncodingComparison:
         return [one for one in self.fits if one.encoding == encoding]
 
     def best(self, encoding: Encoding) -> EncodingFit:
-        """The fit that shows held-out pixels best."""
+        """Fit with the highest held-out PSNR."""
         return max(self.of(encoding), key=lambda one: one.held_out)
 
     @property
     def leading(self) -> list[EncodingFit]:
-        """The best of each encoding."""
+        """Best fit of each encoding."""
         return [self.best(encoding) for encoding in UNSCALED_ENCODINGS + SCALED_ENCODINGS]
 
     @property
     def gain(self) -> float:
-        """PSNR that Gaussian features win over none, held out, in dB."""
+        """Held-out PSNR gain of Gaussian features over no encoding, in dB."""
         return self.best("gaussian").held_out - self.best("none").held_out
 
     @property
@@ -107,7 +107,7 @@ class EncodingComparison:
 def compare(
     scene: Scene, scales: tuple[float, ...], steps: int, device: torch.device, config: Config | None = None
 ) -> EncodingComparison:
-    """Train one network for every encoding, and those with a scale once for each.
+    """Train one network for every encoding, and for every scale of those with one.
 
     scene:  of a single picture (`capture.picture`)
     scales: rising
@@ -136,12 +136,12 @@ def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Enc
 
 
 def truth(scene: Scene) -> Float[Tensor, "height width 3"]:
-    """The picture itself, which both of the scene's shots show."""
+    """The picture itself, common to both of the scene's shots."""
     return scene.photograph(0).before(scene.frame.background)
 
 
 def kernel_at_start(method: FourierFeatures) -> Float[Tensor, "point point"]:
-    """The tangent kernel of a network between a grid of places, ahead of its sigmoid."""
+    """Tangent kernel of a network between grid points, before its sigmoid."""
     side = (torch.arange(GRID_POINTS, device=method.device) + 0.5) / GRID_POINTS
     places = torch.cartesian_prod(side, side)
     return tangent_kernel(method.layers, method.encoding(places)).cpu()
@@ -149,12 +149,13 @@ def kernel_at_start(method: FourierFeatures) -> Float[Tensor, "point point"]:
 
 @torch.no_grad()
 def tangent_kernel(network: nn.Sequential, features: Float[Tensor, "point feature"]) -> Float[Tensor, "point point"]:
-    """Theta(x, x') = df(x)/dtheta . df(x')/dtheta, exact for these very weights, averaged over the outputs of f.
+    """Neural tangent kernel Theta(x, x') = df(x)/dtheta . df(x')/dtheta, exact for these weights, averaged over the
+    outputs of f.
 
     network:  f, layers that are all Dense
-    features: what it is given at each point
+    features: input at each point
 
-    With h_l what layer l is given, z_l = W_l h_l + b_l, and delta_l = df/dz_l, the gradient of W_l is delta_l h_l^T and
+    With h_l the input of layer l, z_l = W_l h_l + b_l, and delta_l = df/dz_l, the gradient of W_l is delta_l h_l^T and
     that of b_l is delta_l, so that all of them together give
 
         Theta(x, x') = sum_l (delta_l . delta_l') (h_l . h_l' + 1)
@@ -180,8 +181,8 @@ def tangent_kernel(network: nn.Sequential, features: Float[Tensor, "point featur
 def spectrum(kernel: Float[Tensor, "point point"]) -> Float[Tensor, " point"]:
     """Eigenvalues of the kernel, largest first, as shares of its trace.
 
-    Gradient descent on squared error shrinks what is wrong along the i-th eigenvector as exp(-eta lambda_i t): what
-    lies along small eigenvalues is not learnt in any time that one would wait.
+    Gradient descent on squared error reduces the error along the i-th eigenvector as exp(-eta lambda_i t): components
+    with small eigenvalues are not learnt in any practical time.
     """
     values = torch.linalg.eigvalsh(kernel).flip(0)
     return values / values.sum()

@@ -21,7 +21,7 @@ MIN_EIGENVALUE = 1e-10  # eigenvalue that is drawn, as a share of the trace
 
 
 def write_page(folder: Path, comparison: EncodingComparison) -> None:
-    """Write index.html, which holds everything; and by themselves scales.svg, spectrum.svg, comparison.png and
+    """Write index.html, which is self-contained; and separately scales.svg, spectrum.svg, comparison.png and
     figures.json."""
     scales, spectrum, sheet = scale_chart(comparison), spectrum_chart(comparison), folder / "comparison.png"
     save_picture(sheet, comparison_sheet(comparison), "figure")
@@ -38,7 +38,7 @@ def write_page(folder: Path, comparison: EncodingComparison) -> None:
 
 
 def claim_page(folder: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """Raise LumigraphError unless all that `write_page` writes may be written; see `files.claim`."""
+    """Raise LumigraphError unless all outputs of `write_page` may be written; see `files.claim`."""
     for name in ("index.html", "scales.svg", "spectrum.svg", "comparison.png", "figures.json"):
         claim(folder / name, "figure", overwrite, reads)
 
@@ -59,7 +59,7 @@ def side_by_side(*charts: tuple[str, str]) -> str:
 
 
 def scale_chart(comparison: EncodingComparison) -> str:
-    """PSNR over scales; an encoding without one is a level line."""
+    """PSNR over scales; an encoding without one is a horizontal line."""
     scales = [fit.scale for fit in comparison.of("gaussian") if fit.scale is not None]
     series = []
     for encoding in SCALED_ENCODINGS:
@@ -72,7 +72,7 @@ def scale_chart(comparison: EncodingComparison) -> str:
 
 
 def spectrum_chart(comparison: EncodingComparison) -> str:
-    """Eigenvalues in falling order, those that are not lost in rounding."""
+    """Eigenvalues in falling order, above rounding errors."""
     series = []
     for fit in shown(comparison):
         values = [value for value in fit.eigenvalues.tolist() if value > MIN_EIGENVALUE]
@@ -83,7 +83,7 @@ def spectrum_chart(comparison: EncodingComparison) -> str:
 
 
 def comparison_sheet(comparison: EncodingComparison):
-    """The picture and what networks make of it: all of it, and its middle pixel by pixel."""
+    """The picture and the networks' reconstructions: whole, and a magnified centre."""
     fits = shown(comparison)
     pictures = [comparison.picture, *(fit.rgb.clamp(0, 1) for fit in fits)]
     columns = ["picture", *(f"{fit.name} · {fit.held_out:.2f} dB" for fit in fits)]
@@ -94,7 +94,7 @@ def comparison_sheet(comparison: EncodingComparison):
 
 
 def shown(comparison: EncodingComparison) -> list[EncodingFit]:
-    """The best of each encoding, and Gaussian ones of the smallest and the largest scale."""
+    """Best fit of each encoding, and Gaussian ones of the smallest and the largest scale."""
     smallest, *_, largest = comparison.of("gaussian")
     *others, best = comparison.leading
     return [
@@ -104,7 +104,7 @@ def shown(comparison: EncodingComparison) -> list[EncodingFit]:
 
 
 def middle(picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "tall wide 3"]:
-    """A square out of the middle, every pixel a square of its own."""
+    """A magnified square at the centre, without interpolation."""
     top, left = (max(0, (size - CROP) // 2) for size in picture.shape[:2])
     crop = picture[top : top + CROP, left : left + CROP]
     return torch.repeat_interleave(torch.repeat_interleave(crop, ENLARGEMENT, 0), ENLARGEMENT, 1)

@@ -1,4 +1,4 @@
-"""A mesh fitted by gradients: from a sphere to its target, in plain steps and in large ones (Nicolet 2021)."""
+"""Mesh fitting by gradients: from a sphere to its target, with plain and with preconditioned steps (Nicolet 2021)."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ WAYS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class Fit:
-    """One way to the target.
+    """One optimisation run.
 
-    steps, pictures: at which the surface was drawn, shaded
+    steps, pictures: shaded renderings at some steps
     errors:  mean squared error of each step's photographs
-    chamfer: distance to the target at the drawn steps, percent of its diagonal; empty without a target mesh
+    chamfer: distance to the target at those steps, percent of its diagonal; empty without a target mesh
     """
 
     name: str
@@ -58,7 +58,7 @@ class Fit:
 
 
 def compare(data: Scene | Shapes, steps: int, seed: int = 0) -> tuple[Float[Tensor, "height width 3"], list[Fit]]:
-    """The target as the fits are drawn, and the fits from a sphere, which differ in the preconditioner alone. Raises
+    """Rendering of the target, and the fits from a sphere, which differ only in the preconditioner. Raises
     LumigraphError for a target that is neither a mesh nor photographs of an object."""
     shape = data.members[0] if isinstance(data, Shapes) else None
     if shape is not None and shape.is_cloud:
@@ -78,7 +78,7 @@ def compare(data: Scene | Shapes, steps: int, seed: int = 0) -> tuple[Float[Tens
 
 
 def fitted(scene: Scene, config: Config, name: str, chosen: Sequence[int], camera: Camera, shape: Shape | None) -> Fit:
-    """Fit a sphere with one configuration. chosen: steps ahead of which the surface is drawn; the last ends it"""
+    """Fit a sphere with one configuration. chosen: steps before which the surface is rendered; the last ends it"""
     method, chance = MeshFit(scene.frame, config), torch.Generator().manual_seed(config.seed)
     optimizers, last = method.optimizers(), chosen[-1] + 1
     method.begin(scene)
@@ -100,7 +100,7 @@ def fitted(scene: Scene, config: Config, name: str, chosen: Sequence[int], camer
 
 
 def photographed(shape: Shape) -> Scene:
-    """Pictures of a mesh under one light, from all around, through our own rasteriser."""
+    """Renderings of a mesh under one light, from all around, by our own rasteriser."""
     around = dome(ring(shape.frame.bounds, size=SIZE))
     cameras = around[torch.arange(0, len(around), math.ceil(len(around) / VIEWS))]
     index = torch.arange(len(cameras))
@@ -123,7 +123,7 @@ def holding(frame: Frame, mesh: Mesh) -> MeshFit:
 
 @torch.no_grad()
 def shaded(method: MeshFit, camera: Camera) -> Float[Tensor, "height width 3"]:
-    """The surface in grey under one light, before white."""
+    """The surface in grey under one light, over white."""
     seen = method.render(camera)
     light = unit(torch.tensor(LIGHT))
     grey = AMBIENT + (1 - AMBIENT) * (seen.extra["normals"] @ light + 1) / 2

@@ -35,9 +35,9 @@ EPI_HEIGHT = 192  # pixels, for the picture
 
 @dataclass(frozen=True)
 class Sampling:
-    """Quality of views between `cameras` cameras on one line, for numbers of layers of depth.
+    """Quality of interpolated views between `cameras` cameras on one line, for numbers of depth layers.
 
-    disparity: pixels between the ends of the line, of the range of depth: f t (1 / near - 1 / far)
+    disparity: range of disparity over the line, in pixels: f t (1 / near - 1 / far)
     psnr:      of interpolated views, for each number of layers and of cameras
     """
 
@@ -54,12 +54,12 @@ class Sampling:
         return max(max(row) for row in self.psnr) - QUALITY_LOSS
 
     def needed(self) -> list[float]:
-        """Cameras at which each number of layers reaches the target, between those that were measured (in the
-        logarithm of their distances); infinity where it does not."""
+        """Number of cameras at which each number of layers reaches the target, interpolated in the logarithm of their
+        distances; infinity if it does not."""
         return [reached([n - 1 for n in self.cameras], row, self.target) + 1 for row in self.psnr]
 
     def bound(self) -> list[float]:
-        """Cameras that the spectrum of the light field asks for (Chai 2000, eq. 14)."""
+        """Minimum number of cameras by the light field's spectrum (Chai 2000, eq. 14)."""
         return [self.disparity / (MAX_DISPARITY * n) + 1 for n in self.layers]
 
 
@@ -77,7 +77,7 @@ class CameraRow:
     focus: float
 
     def disparity(self, z: Tensor) -> Tensor:
-        """Pixels by which a place at depth z moves to the left per camera to the right."""
+        """Disparity at depth z, pixels per camera."""
         return self.focal * self.spacing * (1 / z - 1 / self.focus)
 
 
@@ -96,7 +96,7 @@ def seen_along(method: Method, camera: Camera, span: float, focus: float) -> Cam
 
 
 def measure(line: CameraRow) -> Sampling:
-    """Interpolate views between fewer and fewer cameras, with depth rounded to fewer and fewer layers."""
+    """Interpolate views between fewer and fewer cameras, with depth quantised to fewer and fewer layers."""
     known = line.z[line.z.isfinite()]
     if not len(known):
         raise LumigraphError("The row of cameras sees no surface; choose another --view")
@@ -110,7 +110,7 @@ def measure(line: CameraRow) -> Sampling:
 
 
 def quality(line: CameraRow, stride: int, layers: int, near: float, far: float) -> float:
-    """PSNR of the views in the middle between neighbouring cameras."""
+    """PSNR of interpolated views halfway between cameras."""
     middles = range(stride // 2, INTERVALS, stride)
     found = torch.stack([between(line, middle, stride // 2, layers, near, far) for middle in middles])
     return float(psnr(found, line.rgb[list(middles)]))
@@ -119,7 +119,7 @@ def quality(line: CameraRow, stride: int, layers: int, near: float, far: float) 
 def between(
     line: CameraRow, view: int, reach: int, layers: int, near: float, far: float
 ) -> Float[Tensor, "height width 3"]:
-    """A view from the two at `reach` on either side."""
+    """A view interpolated from the two at `reach` on either side."""
     left, right = (warped(line, view, view + side, layers, near, far) for side in (-reach, reach))
     return 0.5 * (left + right)
 
@@ -127,7 +127,7 @@ def between(
 def warped(
     line: CameraRow, view: int, camera: int, layers: int, near: float, far: float, rows: slice = slice(None)
 ) -> Float[Tensor, "height width 3"]:
-    """Rows of a view from another camera's, each pixel at the middle of its layer of depth."""
+    """Rows of a view warped from another camera's, each pixel at the middle of its depth layer."""
     share = (1 / line.z[view, rows].nan_to_num(far, far).clamp(near, far) - 1 / far) / (1 / near - 1 / far)
     layer = ((share * layers).floor().clamp(max=layers - 1) + 0.5) / layers
     shift = line.disparity(1 / (layer * (1 / near - 1 / far) + 1 / far)) * (camera - view)
@@ -139,7 +139,7 @@ def warped(
 
 
 def reached(gaps: Sequence[float], values: Sequence[float], target: float) -> float:
-    """Number at which rising values first reach a target; infinity if they do not."""
+    """Position at which rising values first reach a target; infinity if they do not."""
     if values[0] >= target:
         return gaps[0]
     for (a, low), (b, high) in pairwise(zip(gaps, values, strict=True)):
@@ -149,8 +149,8 @@ def reached(gaps: Sequence[float], values: Sequence[float], target: float) -> fl
 
 
 def spectrum(epi: Float[Tensor, "view width 3"]) -> Float[Tensor, "view width"]:
-    """Logarithm of the magnitude of an epipolar-plane image's spectrum, from 0 to 1; zero frequency in the middle. It
-    lies between two lines through the middle, whose slopes are the nearest and the farthest depth."""
+    """Log magnitude of an epipolar-plane image's spectrum, from 0 to 1; zero frequency in the middle. Its support lies
+    between two lines through the middle, with slopes by the nearest and the farthest depth."""
     grey = epi.mean(-1)
     window = torch.hann_window(grey.shape[0])[:, None] * torch.hann_window(grey.shape[1])
     size = torch.fft.fftshift(torch.fft.fft2((grey - grey.mean()) * window).abs())
@@ -187,7 +187,7 @@ def draw(folder: Path, name: str, line: CameraRow, found: Sampling, row: int) ->
 def interpolated_epi(
     line: CameraRow, stride: int, layers: int, found: Sampling, row: int
 ) -> Float[Tensor, "view width 3"]:
-    """The epipolar-plane image with all but every so many of its cameras interpolated."""
+    """Epipolar-plane image with only every `stride`-th camera given and the others interpolated."""
     rows = []
     for view in range(INTERVALS + 1):
         left = view // stride * stride
@@ -202,5 +202,5 @@ def interpolated_epi(
 
 
 def stretched(epi: Float[Tensor, "view width 3"]) -> Float[Tensor, "height width 3"]:
-    """Rows repeated, so that an epipolar-plane image can be seen."""
+    """Rows repeated to make an epipolar-plane image visible."""
     return epi.repeat_interleave(max(1, EPI_HEIGHT // len(epi)), 0)

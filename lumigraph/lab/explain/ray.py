@@ -1,4 +1,4 @@
-"""One ray: what a method finds along it, and how the colour of a pixel comes of that."""
+"""One ray: samples of a method along it, and the composition of the pixel's colour."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ INSET_PIXELS = 400  # pixels of the small picture's longer side, at most
 
 @dataclass(frozen=True)
 class RayPass:
-    """One look along the ray, in the notation of Mildenhall 2020, eq. 3.
+    """One pass along the ray, in the notation of Mildenhall 2020, eq. 3.
 
     start, end:    of each sample, in scene units from the camera
     density:       sigma_i, per scene unit
     rgb:           c_i, sRGB-encoded
     weight:        w_i = T_i (1 - exp(-sigma_i delta_i))
-    transmittance: T_i, of the light in front of each sample, and behind the last
-    so_far:        sum_{j<i} w_j c_j + T_i background: the colour, had the ray ended in front of each sample; and behind
+    transmittance: T_i in front of each sample, and behind the last
+    so_far:        sum_{j<i} w_j c_j + T_i background: the colour if the ray ended in front of each sample; and behind
                    the last, the pixel's own
     """
 
@@ -60,14 +60,14 @@ class RayPass:
 
 @dataclass(frozen=True)
 class Sight:
-    """A pixel (column, row) of a picture, and all that was found along its ray.
+    """A pixel (column, row) of a picture, and all passes along its ray.
 
-    passes:     the one that is composited into the picture last
-    rgb:        what they make of the pixel, the background behind it
-    depth:      expected distance, in scene units; infinity where nothing is
-    opacity:    share of light that the scene stops
-    picture:    what the camera sees, made small
-    photograph: the pixel as it was photographed, where that is known
+    passes:     the composited one last
+    rgb:        of the pixel, over the background
+    depth:      expected distance, in scene units; infinity for an empty ray
+    opacity:    accumulated opacity
+    picture:    the camera's small picture
+    photograph: the photograph's colour at the pixel, if known
     """
 
     camera: Camera
@@ -85,13 +85,12 @@ class Sight:
         width, height = self.camera.size[0].tolist()
         return width, height
 
-    def beside(self, photograph: Float[Tensor, "height width 3"] | None) -> Sight:
-        """The same with what the photograph shows at the pixel."""
-        x, y = self.pixel
-        return self if photograph is None else replace(self, photograph=photograph[y, x])
+    def beside(self, photograph: Float[Tensor, "height width 3"]) -> Sight:
+        """The same with the photograph's colour at the pixel."""
+        return replace(self, photograph=photograph[self.pixel[1], self.pixel[0]])
 
     def rows(self) -> dict[str, str]:
-        """The figures worth a line, by name."""
+        """Figures for the text, by name."""
         last, counts = self.passes[-1], ", ".join(f"{len(each)} {each.name}" for each in self.passes)
         found = {"pixel": triple(self.rgb)}
         if self.photograph is not None:

@@ -1,4 +1,4 @@
-"""The figure of one ray: samples, density, transmittance, weights and the colour so far, above one axis of distance."""
+"""Figure of one ray: samples, density, transmittance, weights and the accumulated colour, over distance."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ svg text.symbol { font: italic 15px Georgia, "DejaVu Serif", serif; }
 
 
 def ray_figure(sight: Sight, title: str) -> str:
-    """SVG text; `charts.standalone` makes a file of it."""
+    """Figure as SVG text; `charts.standalone` makes a file of it."""
     last, x, passes = sight.passes[-1], distances(sight), coloured(sight)
     heights = [STRIP, PANEL, PANEL, *(PANEL for _ in passes), STRIP]
     tops = [TOP + sum(heights[:i]) + GAP * i for i in range(len(heights))]
@@ -81,7 +81,7 @@ def ray_figure(sight: Sight, title: str) -> str:
 
 
 def distances(sight: Sight) -> Axis:
-    """From the first sample of all passes to the last, and a little beyond; a sample without end is cut short."""
+    """Axis from the first sample of all passes to the last, with a margin; an unbounded sample is truncated."""
     start, end = (torch.cat([getattr(each, name) for each in sight.passes]) for name in ("start", "end"))
     near, far, last = float(start.min()), float(end.max()), float(start.max())
     if far - last > 2 * (last - near) > 0:
@@ -91,7 +91,7 @@ def distances(sight: Sight) -> Axis:
 
 
 def density_axis(sight: Sight, bottom: float, top: float) -> Axis:
-    """Logarithmic, over the last decades below the densest sample."""
+    """Logarithmic axis, over the last decades below the highest density."""
     found = torch.cat([each.density for each in sight.passes])
     found = found[found > 0]
     if not len(found):
@@ -102,7 +102,7 @@ def density_axis(sight: Sight, bottom: float, top: float) -> Axis:
 
 
 def falling_light(each: RayPass, x: Axis) -> list[tuple[float, float]]:
-    """Points of the transmittance's curve, which falls exponentially within each sample and nowhere else."""
+    """Points of the transmittance's curve, which falls exponentially within each sample and is constant elsewhere."""
     points = [(x.low, 1.0)]
     for i, (a, b, sigma) in enumerate(columns(each, "density")):
         T = float(each.transmittance[i])
@@ -114,12 +114,12 @@ def falling_light(each: RayPass, x: Axis) -> list[tuple[float, float]]:
 
 
 def columns(each: RayPass, name: str) -> list[tuple[float, float, float]]:
-    """Beginning, end and a quantity of every sample."""
+    """Begin, end and a quantity of every sample."""
     return list(zip(each.start.tolist(), each.end.tolist(), getattr(each, name).tolist(), strict=True))
 
 
 def coloured(sight: Sight) -> list[tuple[RayPass, str]]:
-    """Passes, and how their lines look: the last always in the first colour, and bold."""
+    """Passes with their line style: the last always in the first colour, and bold."""
     last = len(sight.passes) - 1
     return [(each, f"{'bold' if i == last else 'thin'} c{last - i}") for i, each in enumerate(sight.passes)]
 
@@ -152,7 +152,7 @@ def scale(y: Axis) -> str:
 
 
 def skyline(each: RayPass, x: Axis, y: Axis, kind: str) -> str:
-    """Density, which is constant over each sample; down to the ground where there is none, or no sample."""
+    """Density as a step curve, constant over each sample, zero elsewhere."""
     d, before = "", None
     for a, b, value in columns(each, "density"):
         if not value:
@@ -220,7 +220,7 @@ def inset(sight: Sight, top: float) -> str:
 
 
 def ends(sight: Sight, top: float) -> str:
-    """Final colour of the strip, and the photograph's colour."""
+    """Ends of the strip: its final colour, and the photograph's colour."""
     parts = [f"<text class='label symbol' x='{SIDE}' y='{top + STRIP + 42}'>C = Σ wᵢ cᵢ + T background</text>"]
     for i, (name, rgb) in enumerate((("pixel", sight.rgb), ("photograph", sight.photograph))):
         if rgb is not None:

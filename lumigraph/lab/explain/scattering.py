@@ -1,9 +1,9 @@
-"""Emission and absorption against scattering: a field fitted to fog under a fixed lamp, asked about other lamps.
+"""Emission-absorption model against scattering: a field fitted to fog under a fixed lamp, rendered under others.
 
-The source of single scattering, J(x, d) = sigma_s p(cos) E(x), is a function of place and direction while lamps stand
-still. So sigma and c(x, d) = J / sigma_t hold all of it, as far as c has the directions: band l of Henyey and
-Greenstein's phase function has the size g^l, of which harmonics up to degree n keep the first n. A lamp that moves
-changes E, which is in c.
+The source of single scattering, J(x, d) = sigma_s p(cos) E(x), is a function of position and direction for fixed lamps.
+So sigma and c(x, d) = J / sigma_t represent it, up to the angular resolution of c: band l of the Henyey-Greenstein
+phase function has the magnitude g^l, of which harmonics up to degree n keep the first n. A moving lamp changes E, which
+is baked into c.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ GAMMA, TONE_FLOOR = 1 / 2.2, 1e-3  # of the loss, which weighs light about as it
 
 
 class GlowingGrid(nn.Module):
-    """Emission and absorption: density and harmonics of linear colour at the nodes of a dense grid."""
+    """Emission-absorption field: density and harmonics of linear colour at the nodes of a dense grid."""
 
     def __init__(self, degree: int):
         super().__init__()
@@ -72,7 +72,7 @@ class GlowingGrid(nn.Module):
         return softplus(density), colour.clamp_min(0)
 
     def forward(self, rays: Rays, generator: torch.Generator | None = None) -> Float[Tensor, "ray 3"]:
-        """Linear light of rays before black (Max 1995)."""
+        """Linear radiance of rays over black (Max 1995)."""
         box = rays.origins.new_tensor([[-HALF] * 3, [HALF] * 3])
         enter, leave = (t[:, None].clamp_min(0) for t in rays.through_box(box))
         shares = stratified(len(rays), RAY_SAMPLES, generator, rays.origins.device)
@@ -93,7 +93,7 @@ class ScatteringFit:
     """One degree of colour. PSNR is of sRGB-encoded pictures of held-out cameras.
 
     moved:  PSNR under the lamp moved by each of LAMPS
-    inside: PSNR of cameras in the fog, which all photographs were taken outside of
+    inside: PSNR of cameras in the fog; all training cameras are outside
     phase:  colour at PHASE_PLACE over directions at each of PHASE_ANGLES to the light, its mean 1
     """
 
@@ -113,7 +113,7 @@ class Scattering:
 
 
 def angles() -> Float[Tensor, " angle"]:
-    """Angles between the light's direction and the eye's, radians."""
+    """Angles between light direction and viewing direction, radians."""
     return torch.linspace(0, math.pi, PHASE_ANGLES)
 
 
@@ -123,7 +123,7 @@ def henyey_greenstein(cosine: Float[Tensor, " angle"], g: float) -> Float[Tensor
 
 
 def truncation(g: float, degree: int, bands: int = 200) -> float:
-    """Share of the phase function's squared size beyond a degree: sum of (2 l + 1) g^2l over l > n, over all l."""
+    """Energy share of the phase function beyond a degree: sum of (2 l + 1) g^2l over l > n, over all l."""
     sizes = [(2 * band + 1) * g ** (2 * band) for band in range(bands)]
     return sum(sizes[degree + 1 :]) / sum(sizes)
 
@@ -131,8 +131,9 @@ def truncation(g: float, degree: int, bands: int = 200) -> float:
 def measure(
     anisotropy: float = 0.6, steps: int = 500, size: int = 64, seed: int = 0
 ) -> tuple[Scattering, list[list[Float[Tensor, "height width 3"]]]]:
-    """Fits of all degrees, and pictures of one held-out camera: under the first lamp, a moved one, and from inside, of
-    the truth first. size: of pictures, pixels a side"""
+    """Fits of all degrees, and pictures of one held-out camera: under the first lamp, a moved one, and from inside, the
+    truth
+    first. size: of pictures, pixels a side"""
     stage = fog.stage(size, VIEWS, seed, anisotropy=round(100 * anisotropy))
     inward = [look_at(sphere_point(a, math.radians(12), INSIDE), [0, 0, -0.15]) for a in (0.6, 2.6, 4.7)]
     test = stage.cameras["test"][:: max(1, len(stage.cameras["test"]) // TEST_VIEWS)]
@@ -156,14 +157,14 @@ def measure(
 
 
 def light_of(world: object, camera: Camera) -> Float[Tensor, "height width 3"]:
-    """The tracer's light of one camera."""
+    """Radiance of one camera by the tracer."""
     return torch.from_numpy(scattered(world, camera))  # type: ignore[arg-type]
 
 
 def fitted(
     cameras: Camera, light: Sequence[Float[Tensor, "height width 3"]], degree: int, steps: int, seed: int
 ) -> GlowingGrid:
-    """A field fitted to the light of photographs."""
+    """A field fitted to linear radiance of photographs."""
     field, chance = GlowingGrid(degree), torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(field.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.95))
     target, pixels = torch.stack(list(light)).flatten(1, 2), cameras[0].pixels()
@@ -180,7 +181,7 @@ def fitted(
 
 
 def quality_of(seen: Sequence[Tensor], truth: Sequence[Tensor]) -> float:
-    """Mean PSNR of pictures as they are shown."""
+    """Mean PSNR of sRGB-encoded pictures."""
     return sum(psnr(shown(a), shown(b)) for a, b in zip(seen, truth, strict=True)) / len(seen)
 
 
@@ -196,7 +197,9 @@ def enlarged(picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "tall wi
 
 @torch.no_grad()
 def phase_of(field: GlowingGrid) -> list[float]:
-    """Colour at PHASE_PLACE for eyes at angles to the light's direction, the mean around it; its mean over all is 1."""
+    """Colour at PHASE_PLACE in viewing directions at angles to the light's direction, averaged around it; its mean over
+    all is 1.
+    """
     place, lamp = torch.tensor(PHASE_PLACE), torch.tensor([fog.LAMP_ORBIT, 0.0, fog.LAMP_HEIGHT])
     light = torch.nn.functional.normalize(place - lamp, dim=0)
     x = torch.nn.functional.normalize(torch.linalg.cross(light, torch.tensor([0.0, 0.0, 1.0])), dim=0)

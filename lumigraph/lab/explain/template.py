@@ -1,4 +1,4 @@
-"""Train, move, continue: a trained field moved into structures, each beside the same structure trained from nothing."""
+"""Conversion of a trained field into other structures with further training, compared with training from scratch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ...files import write_bytes, write_json
 from ...method import Method
 from ...run import Run, build
 from ...system.signals import go_on_unless
-from ...training import fit
+from ...training.loop import fit
 
 STAGES = "trained", "moved", "continued", "from nothing"
 
@@ -31,9 +31,9 @@ class TemplateStage:
     """A method at one stage.
 
     stage:   one of STAGES
-    seconds: of training since the field began, moving included
+    seconds: of training since the field began, conversion included
     psnr:    mean over held-out views, dB
-    view_seconds: to render one of them
+    view_seconds: rendering time of one of them
     picture: the first of them
     """
 
@@ -51,10 +51,10 @@ class TemplateStage:
 def stages_of(
     run: Run, scene: Scene, into: Sequence[str], seconds: float, views: int, runs: Path, alone: bool
 ) -> list[TemplateStage]:
-    """The run itself; and each method moved from it, trained on for so many seconds, and, with `alone`, trained from
-    nothing for as long as both together. Raises LumigraphError for methods that the run cannot become.
+    """The run itself; and each method converted from it and trained for `seconds` more, and, with `alone`, trained from
+    scratch for as long as both together. Raises LumigraphError for methods that the run cannot be converted to.
 
-    scene: the run's photographs; views: held-out ones at most; runs: new folder of the runs
+    scene: the run's photographs; views: largest number of held-out ones; runs: new folder of the runs
     """
     for name in into:
         check(run, methods.find(name))
@@ -85,13 +85,13 @@ def stages_of(
 
 
 def shown_photograph(scene: Scene) -> int:
-    """The first held-out photograph, or the first of all."""
+    """Index of the first held-out photograph, or of the first of all."""
     held_out = scene.splits.get("test")
     return int((scene.splits["train"] if held_out is None or not len(held_out) else held_out)[0])
 
 
 def from_nothing(scene: Scene, name: str, seconds: float, seed: int, device: torch.device) -> Method:
-    """A method trained on a scene for so many seconds, with its preset."""
+    """A method trained on a scene for `seconds` seconds, with its preset."""
     kind = methods.find(name)
     method = build(kind, scene.frame, kind.preset(device), device, seed, learning=True)
     go_on_unless(fit(method, scene, seconds=seconds, seed=seed, show=False).signal)

@@ -1,4 +1,4 @@
-"""Light probes: harmonics of light and distances on a grid, their files, and light at any surface between them."""
+"""Light probes: spherical harmonics of radiance and distance maps on a grid, their files, and interpolated light."""
 
 from .grid import FREE as FREE
 from .grid import MATTER as MATTER

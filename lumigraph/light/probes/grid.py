@@ -1,4 +1,4 @@
-"""ProbeGrid: light at the points of a grid, interpolated with visibility (Greger 1998; Majercik 2019, DDGI)."""
+"""ProbeGrid: light probes on a grid, interpolated with visibility (Greger 1998; Majercik 2019, DDGI)."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class ProbeGrid:
     mean:     mean distance to surfaces, bordered octahedral maps; no more than `far`
     squared:  mean squared distance, likewise
     state:    FREE, MATTER (in a solid), or UNSEEN (hidden from all cameras)
-    far:      length at which distances are cut
-    up:       unit vector to above
+    far:      upper limit of distances
+    up:       unit vector upwards
     """
 
     origin: Float[Tensor, " 3"]
@@ -68,7 +68,7 @@ class ProbeGrid:
 
     @cached_property
     def shown(self) -> Float[Tensor, "probe coefficient 3"]:
-        """Radiance, where probes that are not free have that of the nearest free one."""
+        """Radiance, with that of the nearest free probe for probes that are not free."""
         free = self.state == FREE
         if free.all() or not free.any():
             return self.radiance
@@ -84,8 +84,8 @@ class ProbeGrid:
 
         w = trilinear * (((d . n + 1) / 2)^2 + 0.2) * max(v^3, 0.05),    v = s^2 / (s^2 + (r - m)^2) where r > m
 
-        with the direction d to the probe, the probe's distance r from a place a little above the surface, mean m and
-        variance s^2 of the distances that the probe sees along that way (Chebyshev's inequality).
+        with the direction d to the probe, the probe's distance r from a point slightly above the surface, mean m and
+        variance s^2 of the probe's distances in that direction (Chebyshev's inequality).
         """
         lengths = self.axes.norm(dim=-1)
         last = torch.tensor(self.counts, dtype=points.dtype) - 1
@@ -116,7 +116,7 @@ class ProbeGrid:
     def irradiance(
         self, points: Float[Tensor, "point 3"], normals: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 3"]:
-        """Linear irradiance E(n) at points of surfaces: pi times the radiance of white chalk there."""
+        """Linear irradiance E(n) at surface points: pi times the radiance of a white diffuse surface there."""
         return self._interpolated(points, normals, normals, convolved)
 
     def coefficients(
@@ -135,6 +135,6 @@ class ProbeGrid:
 
 
 def lattice(counts: tuple[int, int, int]) -> Int[Tensor, "probe 3"]:
-    """Integer places (i, j, k) of a grid, i the fastest."""
+    """Integer coordinates (i, j, k) of a grid, i the fastest."""
     k, j, i = torch.meshgrid(*(torch.arange(n) for n in reversed(counts)), indexing="ij")
     return torch.stack([i, j, k], -1).reshape(-1, 3)

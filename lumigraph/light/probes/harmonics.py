@@ -1,4 +1,4 @@
-"""Light from all directions as spherical harmonics, and the irradiance that follows from it (Ramamoorthi 2001)."""
+"""Spherical harmonics of radiance, and of irradiance (Ramamoorthi 2001)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Octahedral maps (Cigolle 2014): all directions on a square, whose texels interpolate across its edges by a border."""
+"""Octahedral maps (Cigolle 2014): the sphere on a square, with a border for interpolation across its edges."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ BORDER = 1  # texels around a map, copies of those that neighbour across its edg
 
 
 def encoded(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-    """Places in [-1, 1]^2 of unit directions: (x, y) / (|x| + |y| + |z|), with the lower half folded outward."""
+    """Octahedral coordinates in [-1, 1]^2 of unit directions: (x, y) / (|x| + |y| + |z|), with the lower half folded
+    outward.
+    """
     x, y, z = (directions / directions.abs().sum(-1, keepdim=True)).unbind(-1)
     sign_x, sign_y = (torch.where(v >= 0, 1.0, -1.0) for v in (x, y))
     below = z < 0
@@ -19,7 +21,7 @@ def encoded(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
 
 
 def decoded(places: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-    """Unit directions of places in [-1, 1]^2."""
+    """Unit directions of octahedral coordinates in [-1, 1]^2."""
     x, y = places.unbind(-1)
     z = 1 - x.abs() - y.abs()
     fold = (-z).clamp_min(0)

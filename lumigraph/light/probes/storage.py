@@ -48,7 +48,7 @@ class ProbeRecord:
 
 
 def write_probes(folder: Path, grid: ProbeGrid, geographic: dict[str, float] | None = None) -> None:
-    """Write a folder of probes, whole or not at all. geographic: origin of the frame on Earth, see `Frame.origin`"""
+    """Write a folder of probes, atomically. geographic: origin of the frame on Earth, see `Frame.origin`"""
     radiance = grid.radiance.double().numpy()
     low, high = radiance.min(0), radiance.max(0)
     high = np.maximum(high, low + MIN_RANGE)
@@ -118,12 +118,12 @@ def read_probes(path: Path | str) -> ProbeGrid:
 
 
 def _moments(grid: ProbeGrid) -> tuple[tuple[torch.Tensor, float], ...]:
-    """Distances and their squares, and the values that 65535 stands for."""
+    """Distances and their squares, and the value of 65535 for each."""
     return (grid.mean, grid.far), (grid.squared, grid.far**2)
 
 
 def tiled(maps: Float[np.ndarray, "probe wide wide"], counts: tuple[int, int, int]) -> Float[np.ndarray, "row column"]:
-    """Maps on one picture: probe (i, j, k) in column i and row j + n_1 k of tiles."""
+    """Maps tiled in one picture: probe (i, j, k) in column i and row j + n_1 k of tiles."""
     wide = maps.shape[1]
     rows = maps.reshape(counts[1] * counts[2], counts[0], wide, wide).transpose(0, 2, 1, 3)
     return rows.reshape(counts[1] * counts[2] * wide, counts[0] * wide)
@@ -145,7 +145,7 @@ def save(path: Path, shares: Float[np.ndarray, "row column"]) -> None:
 
 @reads("cannot be read", "export the probes again, or copy it anew")
 def load(path: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Numbers of a grey PNG of 16 bits. Raises LumigraphError for one that is missing, cut short or of another size."""
+    """Numbers of a grey PNG of 16 bits. Raises LumigraphError for one that is missing, truncated or of another size."""
     with Image.open(path) as image:
         if image.size != shape[::-1] or not image.mode.startswith("I"):
             raise LumigraphError(

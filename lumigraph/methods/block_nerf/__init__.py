@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField
 from ...components.sampling.cone_sampler import ConeSampler
@@ -23,7 +23,7 @@ from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.schedules import RISE
+from ...components.training.schedules import RISE, held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Steps, Width, changed
 from ...method import FieldMethod, seeded
@@ -70,7 +70,7 @@ FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
 class BlockNeRF(FieldMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | FrustumField
     in_blocks = True
 
@@ -103,20 +103,16 @@ class BlockNeRF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table with Instant-NGP's numbers."""
-        return changed(
-            Config(), **CPU_BACKBONE, coarse_samples=128, fine_samples=128, rays_per_step=4096,
-            visibility_layers=2, visibility_width=64, head_layers=1, head_width=16,
-            pose_penalty=0.0, final_pose_penalty=0.0, warmup_steps=RISE, huber_delta=0.3,
-        )  # fmt: skip
+        return changed(Config(), **CPU_BACKBONE, coarse_samples=128, fine_samples=128, rays_per_step=4096,
+            visibility_layers=2, visibility_width=64, head_layers=1, head_width=16, pose_penalty=0.0,
+            final_pose_penalty=0.0, warmup_steps=RISE, huber_delta=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with tiny networks, every part of it, within some twenty quick steps."""
-        return changed(
-            Config(), **TINY_BACKBONE, refine_cameras=True, residual_masks=True, appearance_code=4,
+        return changed(Config(), **TINY_BACKBONE, refine_cameras=True, residual_masks=True, appearance_code=4,
             exposure_frequencies=2, visibility_frequencies=3, visibility_layers=1, visibility_width=16,
-            warmup_steps=RISE, pose_penalty=1.0,
-        )  # fmt: skip
+            warmup_steps=RISE, pose_penalty=1.0)  # fmt: skip
 
     # Learning
 

@@ -23,17 +23,7 @@ from ...components.training.row_optimizers import LazyAdam
 from ...components.training.schedules import BandSchedule, exponential_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...files.ranges import (
-    BatchSize,
-    Cells,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Seed,
-    Share,
-    Width,
-    between,
-)
+from ...files.ranges import BatchSize, Cells, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...method import seeded
 from .fields import LOGIT_SCALE, OccupancyField, TableField
 
@@ -107,19 +97,15 @@ class DVR(SurfaceMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table whose levels join one by one; rays look within the visual hull alone."""
-        return Config(
-            CPU_LEVELS, field="hash", hidden_width=32, hull_cells=64, march_steps=192, first_march_steps=96,
-            march_settling=0.3, coarse_to_fine=0.5, neighbour_distance=1e-2, difference_step=1e-2,
-            learning_rate=1e-2, final_learning_rate=1e-3,
-        )  # fmt: skip
+        return Config(CPU_LEVELS, field="hash", hidden_width=32, hull_cells=64, march_steps=192, first_march_steps=96,
+            march_settling=0.3, coarse_to_fine=0.5, neighbour_distance=1e-2, difference_step=1e-2, learning_rate=1e-2,
+            final_learning_rate=1e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            TINY_LEVELS, field="hash", hidden_width=16, hull_cells=16, march_steps=32, rays_per_step=256,
-            coarse_to_fine=0.5, neighbour_distance=0.05, difference_step=0.05,
-            learning_rate=2e-2, final_learning_rate=5e-3,
-        )  # fmt: skip
+        return Config(TINY_LEVELS, field="hash", hidden_width=16, hull_cells=16, march_steps=32, rays_per_step=256,
+            coarse_to_fine=0.5, neighbour_distance=0.05, difference_step=0.05, learning_rate=2e-2,
+            final_learning_rate=5e-3)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.hash_field import HashNumbers
 from ...components.sampling.occupancy_sampler import StepNumbers
 from ...components.sampling.samplers import sampling_bytes
@@ -19,6 +19,7 @@ from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
 from ...components.training.photometric import backdrop
+from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
 from ...files.ranges import Seed, changed
 from ...method import FieldMethod, Pass, seeded
@@ -46,7 +47,7 @@ class Config:
 class HumanNeRF(Articulated, FieldMethod):
     """A canonical field, and the way to it from a body in any pose."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: PosedField
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -63,24 +64,18 @@ class HumanNeRF(Articulated, FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical field, a learnt volume of weights, a small offset, and higher rates."""
-        return changed(
-            changed(Config(), **CPU_BACKBONE), sh_bands=1, samples_per_step=1 << 13, occupancy_resolution=64,
-            learning_rate=1e-2,
-            weight_cells=24, weight_code=0, weights_lr=1e-2,
-            pose_correction="table", pose_lr=2e-3, pose_from=0.1, pose_smoothing=True,
-            nonrigid_depth=2, nonrigid_width=32, nonrigid_skip=1, nonrigid_frequencies=4,
-            nonrigid_from=0.3, nonrigid_until=0.7, nonrigid_lr=1e-3,
-        )  # fmt: skip
+        return changed(changed(Config(), **CPU_BACKBONE), sh_bands=1, samples_per_step=1 << 13, occupancy_resolution=64,
+            learning_rate=1e-2, weight_cells=24, weight_code=0, weights_lr=1e-2, pose_correction="table", pose_lr=2e-3,
+            pose_from=0.1, pose_smoothing=True, nonrigid_depth=2, nonrigid_width=32, nonrigid_skip=1,
+            nonrigid_frequencies=4, nonrigid_from=0.3, nonrigid_until=0.7, nonrigid_lr=1e-3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under tiny motions within some twenty quick steps."""
-        return changed(
-            changed(Config(), **TINY_BACKBONE), samples_per_step=1024, weight_cells=8, weight_code=4, weights_lr=1e-2,
-            bone_radius=0.2, pose_lr=1e-3, pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2,
+        return changed(changed(Config(), **TINY_BACKBONE), samples_per_step=1024, weight_cells=8, weight_code=4,
+            weights_lr=1e-2, bone_radius=0.2, pose_lr=1e-3, pose_from=0.0, pose_width=8, pose_depth=1, nonrigid_depth=2,
             nonrigid_width=8, nonrigid_skip=1, nonrigid_frequencies=2, nonrigid_from=0.0, nonrigid_until=0.5,
-            nonrigid_lr=1e-3,
-        )  # fmt: skip
+            nonrigid_lr=1e-3)  # fmt: skip
 
     # Moments
 

@@ -26,19 +26,7 @@ from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import (
-    BatchSize,
-    Count,
-    Layers,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Seed,
-    Share,
-    Width,
-    between,
-    changed,
-)
+from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ...geometry import look_at, turning
 from ...method import Method, RayMethod, seeded
 from ...method.controls import Control, Value, blend
@@ -168,23 +156,23 @@ class HypNeRF(RayMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Smaller codes, tables and networks of the same design."""
-        return changed(
-            Config(), levels=5, features_per_level=4, log2_hashmap_size=12, base_resolution=8, max_resolution=64,
-            sh_bands=2, shape_code=64, colour_code=32, code_deviation=0.1, hyper_width=96, hidden_width=32,
+        table = HashNumbers(
+            levels=5, features_per_level=4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2
+        )
+        return Config(table, shape_code=64, colour_code=32, code_deviation=0.1, hyper_width=96, hidden_width=32,
             steps_per_diagonal=112, transmittance_threshold=1e-3, occupancy_resolution=32, members=1024,
-            members_per_step=4, rays_per_member=192, targets=2, empty_points=256,
-            learning_rate=4e-3, final_learning_rate=4e-4, denoiser_start=0.8,
-        )  # fmt: skip
+            members_per_step=4, rays_per_member=192, targets=2, empty_points=256, learning_rate=4e-3,
+            final_learning_rate=4e-4, denoiser_start=0.8)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
-        return changed(
-            Config(), levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8,
-            sh_bands=1, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1,
+        table = HashNumbers(
+            levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8, sh_bands=1
+        )
+        return Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1,
             hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64,
-            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3,
-            denoiser_width=4, denoiser_start=0.0, denoise_views=2, denoise_steps=4, code_steps=8, tune_steps=4,
-        )  # fmt: skip
+            members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3, denoiser_width=4,
+            denoiser_start=0.0, denoise_views=2, denoise_steps=4, code_steps=8, tune_steps=4)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

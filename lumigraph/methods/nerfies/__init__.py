@@ -13,26 +13,16 @@ from torch.nn.functional import pad, softplus
 
 from ...camera.rays import Rays
 from ...components.fields.appearance import AppearanceCodes
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import BandSchedule, joining_of
+from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import (
-    Layers,
-    NonNegative,
-    Octaves,
-    PositiveShare,
-    Seed,
-    Share,
-    Width,
-    between,
-    changed,
-)
+from ...files.ranges import Layers, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between, changed
 from ...method import FieldMethod, Pass, seeded
 from ...method.field import Densities, Points
 from ...method.sampler import Density
@@ -89,7 +79,7 @@ class Config:
 class Nerfies(FieldMethod):
     """A canonical scene, and a field of motions from each moment to it."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: WarpedField
     background_points: Tensor
     grows = ("background_points",)
@@ -119,21 +109,17 @@ class Nerfies(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table as canonical scene, a narrower deformation, fewer samples and cells, as each is deformed."""
-        return changed(
-            changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, samples_per_step=1 << 13, occupancy_resolution=64,
-            appearance_code=0, deformation_depth=4, deformation_width=64, deformation_skip=2, annealing=0.5,
-            elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True,
-            deformation_frequencies=4, growth=0.5, table_annealing=0.5, deformation_rate=0.3,
-        )  # fmt: skip
+        return changed(changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, samples_per_step=1 << 13,
+            occupancy_resolution=64, appearance_code=0, deformation_depth=4, deformation_width=64, deformation_skip=2,
+            annealing=0.5, elastic_samples=256, background_points=1024, elastic_until=0.5, moment_waves=True,
+            deformation_frequencies=4, growth=0.5, table_annealing=0.5, deformation_rate=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table under a tiny deformation with a slice, within some twenty quick steps."""
-        return changed(
-            Config(), **TINY_BACKBONE, appearance_code=2, deformation_depth=2, deformation_width=16,
+        return changed(Config(), **TINY_BACKBONE, appearance_code=2, deformation_depth=2, deformation_width=16,
             deformation_skip=1, moment_code=2, deformation_frequencies=4, elastic_samples=64, background_points=64,
-            slice_dimensions=1, slice_width=16, deformation_rate=0.1,
-        )  # fmt: skip
+            slice_dimensions=1, slice_width=16, deformation_rate=0.1)  # fmt: skip
 
     # Codes
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from ...camera.rays import Look, Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import CoordinateField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
@@ -21,6 +21,7 @@ from ...components.sampling.sampling import stratified
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.schedules import held_decay
 from ...composition.composed import union
 from ...datasets.scene import Batch, Frame, Scene
 from ...datasets.tracks import BoxTrack, GraphNode, TrackEdit, TrackEdits, nodes_of
@@ -65,7 +66,7 @@ class NeuralSceneGraph(FieldMethod):
     found:       tracks and codes of instances that were found in another scene's photographs
     """
 
-    Config, learning_rate, accepts = Config, backbone_decay, (Scene, TrackEdits)
+    Config, learning_rate, accepts = Config, held_decay, (Scene, TrackEdits)
     further_bytes = staticmethod(sampling_bytes)
     network: HashField | CoordinateField
     rays_per_chunk: ClassVar[int] = 4096  # type: ignore[misc]
@@ -98,19 +99,16 @@ class NeuralSceneGraph(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables with Instant-NGP's numbers for the background, and smaller ones for the classes."""
-        return changed(
-            Config(), **CPU_BACKBONE, class_log2_hashmap_size=15, class_max_resolution=96, code_width=16,
-            code_weight=1e-3, box_samples=16, box_scale=1.1, pose_input="heading", symmetric=True, huber_delta=0.3,
-        )  # fmt: skip
+        return changed(Config(), **CPU_BACKBONE, class_log2_hashmap_size=15, class_max_resolution=96, code_width=16,
+            code_weight=1e-3, box_samples=16, box_scale=1.1, pose_input="heading", symmetric=True,
+            huber_delta=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables and networks with corrections of poses, within some twenty quick steps."""
-        return changed(
-            Config(), **TINY_BACKBONE | {"final_learning_rate": 2e-3}, class_log2_hashmap_size=10,
+        return changed(Config(), **TINY_BACKBONE | {"final_learning_rate": 2e-3}, class_log2_hashmap_size=10,
             class_max_resolution=16, code_width=4, box_samples=8, box_scale=1.1, pose_input="heading",
-            refine_tracks=True,
-        )  # fmt: skip
+            refine_tracks=True)  # fmt: skip
 
     # The graph
 

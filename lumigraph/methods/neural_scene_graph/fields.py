@@ -13,13 +13,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.coordinate_network import CoordinateNetwork
+from ...components.fields.coordinate_field import LatentField, NetworkNumbers
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
-from ...components.fields.layers import MLP, in_chunks, truncated_exp
+from ...components.fields.layers import MLP, truncated_exp
 from ...components.sampling.spaces import Box, Space
-from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
 CUBE = Box(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 0.0)  # coordinates of a box
@@ -29,43 +27,24 @@ POSE_FREQUENCIES = 4  # octaves of these: multires_obj of the release
 THIN = 2.0  # density of a hash field is exp(-THIN) per coordinate at first, so that nothing hides the background
 
 
-class NetworkClassField(Field):
+def late_softplus(raw: Tensor) -> Tensor:
+    """Density of a network's output, thin at first."""
+    return softplus(raw - THIN)
+
+
+class NetworkClassField(LatentField):
     """The paper's networks: one of position and latent code, then one of direction and pose (eq. 5)."""
 
-    deforms = True
-
     def __init__(self, numbers: NetworkNumbers, hidden_width: int, space: Space, latent: int):
-        super().__init__()
-        self.latent = latent
-        self.encode_position = FrequencyEncoding(3, numbers.position_frequencies)
-        self.encode_direction = FrequencyEncoding(3, numbers.direction_frequencies)
-        self.encode_pose = FrequencyEncoding(POSE_NUMBERS - 1, POSE_FREQUENCIES)
-        inputs = self.encode_position.width + latent, self.encode_direction.width + self.encode_pose.width + 1
-        shape = numbers.depth, hidden_width, numbers.skip_layer
-        self.network = CoordinateNetwork(*inputs, *shape, exact=not numbers.bfloat16)
+        pose = FrequencyEncoding(POSE_NUMBERS - 1, POSE_FREQUENCIES)
+        named: dict[str, Any] = {"code": pose.width + 1, "latent": latent, "keep_input": True}
+        super().__init__(numbers, hidden_width, space, activation=late_softplus, **named)
+        self.encode_pose = pose
 
-    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
+    def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
         assert code is not None
-
-        def answer(points: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
-            raw, feature = self.network.geometry(torch.cat([self.encode_position(points), latent], -1))
-            return softplus(raw - THIN), feature
-
-        return in_chunks(answer, points, code[:, : self.latent])  # type: ignore[return-value]
-
-    def colour(self, features: Tensor, directions: Directions, code: Codes | None = None) -> Colours:
-        assert code is not None
-
-        def answer(feature: Tensor, directions: Tensor, pose: Tensor) -> tuple[Tensor]:
-            place, side = pose.split([POSE_NUMBERS - 1, 1], -1)
-            seen = torch.cat([self.encode_direction(directions), self.encode_pose(place), side], -1)
-            return (self.network.seen(feature, seen).sigmoid(),)
-
-        return in_chunks(answer, features, directions, code[:, self.latent :])[0]
-
-    def optimizers_at(self, learning_rate: float, groups: Any = ()) -> list[torch.optim.Optimizer]:
-        """Adam for the networks. groups: further groups of parameters"""
-        return [torch.optim.Adam([{"params": list(self.network.parameters())}, *groups], learning_rate, eps=1e-7)]
+        latent, place, side = code.split([self.latent, POSE_NUMBERS - 1, 1], -1)
+        return super().colour(features, directions, torch.cat([latent, self.encode_pose(place), side], -1))
 
 
 class HashClassField(HashField):

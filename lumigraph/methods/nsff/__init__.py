@@ -12,18 +12,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera.rays import Rays, Rendering, Samples
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
+from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene
-from ...files.ranges import (
-    NonNegative,
-    PositiveShare,
-    Seed,
-    between,
-    changed,
-)
+from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
 from ...method import FieldMethod, seeded
 from ...method.controls import Control, moment
 from ...method.field import Densities, Directions, Points
@@ -84,7 +79,7 @@ class Hop(NamedTuple):
 class NSFF(FieldMethod):
     """Two fields: one stands still, and one knows for each point and moment where it was and where it goes."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: BlendedField
     known_moments: Tensor
 
@@ -113,11 +108,9 @@ class NSFF(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """Hash tables instead of networks, one neighbour in a step, fewer levels, samples and cells."""
-        return changed(
-            changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, levels=6, max_resolution=192,
-            steps_per_diagonal=192, samples_per_step=1 << 13, occupancy_resolution=64,
-            both_ways=False, neighbours=1, max_flow=0.3, prior_interval=0.3,
-        )  # fmt: skip
+        return changed(changed(Config(), **CPU_BACKBONE), learning_rate=1e-2, levels=6, max_resolution=192,
+            steps_per_diagonal=192, samples_per_step=1 << 13, occupancy_resolution=64, both_ways=False, neighbours=1,
+            max_flow=0.3, prior_interval=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -14,12 +14,12 @@ from typing import Annotated, Any
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool3d
+from torch.nn.functional import max_pool3d, softplus
 
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.appearance import CodeWidth
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers, backbone_decay
-from ...components.fields.coordinate_field import CoordinateField
+from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ...components.fields.coordinate_field import CoordinateField, LatentField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.fields.instance_codes import InstanceCodes
 from ...components.instances import ALONE, Edit, check_labels, edit_controls, edit_of, labels_of, layers_of
@@ -27,6 +27,7 @@ from ...components.sampling.hierarchical_sampler import HierarchicalSampler, Ray
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import huber
+from ...components.training.schedules import held_decay
 from ...composition.composed import kept, union
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import NonNegative, PositiveShare, Seed, between, changed
@@ -35,7 +36,7 @@ from ...method import FieldMethod, seeded
 from ...method.controls import Control
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .fields import InstanceBoxes, ObjectNetwork, ObjectTable, SceneWithout
+from .fields import InstanceBoxes, ObjectTable, SceneWithout
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Config:
 
 
 OBJECT_LAYERS, OBJECT_WIDTH = 4, 128  # hidden layers of the object branch's network, and their channels
+OBJECT_NETWORK = {"depth": OBJECT_LAYERS, "skip_layer": OBJECT_LAYERS // 2, "hidden_width": OBJECT_WIDTH}
 OBJECT_COLOUR_WEIGHT = 1.0  # weight of an instance's colours, eq. 6
 OBJECT_OPACITY_WEIGHT = 10.0  # weight of an instance's opacity against its mask, eq. 6
 OUTSIDE_WEIGHT = 0.05  # weight of pixels outside a mask in that, section 3.3
@@ -68,9 +70,9 @@ REGION_DILATION = 2  # cells around, whose soft edge goes along
 class ObjectNeRF(FieldMethod):
     """A scene that can be taken apart by the instances of its photographs' masks."""
 
-    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), backbone_decay
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: HashField | CoordinateField
-    branch: ObjectTable | ObjectNetwork
+    branch: ObjectTable | LatentField
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -78,8 +80,9 @@ class ObjectNeRF(FieldMethod):
         b, space = c.backbone, space_of(frame)
         with seeded(c.seed):
             self.network = b.build(frame, space, network=partial(CoordinateField.twice, keep_input=True))
-            narrow = b if b.hashed else changed(b, depth=OBJECT_LAYERS, hidden_width=OBJECT_WIDTH)
-            self.branch = narrow.build(frame, space, ObjectTable, ObjectNetwork, latent=c.code)
+            narrow = b if b.hashed else changed(b, **OBJECT_NETWORK)
+            kinds = ObjectTable, partial(LatentField, keep_input=True, activation=softplus)  # section 3.2
+            self.branch = narrow.build(frame, space, *kinds, latent=c.code)
         self.sampler = b.sampler(frame, space) if b.hashed else HierarchicalSampler(space, c.rays)
         self.codes = InstanceCodes(c.instances, c.code)
         self.boxes = InstanceBoxes(c.instances, frame.bounds)

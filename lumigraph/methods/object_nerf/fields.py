@@ -9,11 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.coordinate_network import CoordinateNetwork
-from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
-from ...components.fields.layers import MLP, in_chunks
+from ...components.fields.layers import MLP
 from ...components.sampling.spaces import Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
@@ -23,41 +20,8 @@ BOX_SHARE = 0.02  # of an instance's seen surface that may lie outside its box, 
 BOX_MARGIN = 0.03  # of the box of interest's sides, around an instance's box
 
 
-class ObjectNetwork(Field):
-    """The paper's object branch: a coordinate network on position and code (section 3.2).
-
-    coarse: branch of the coarse pass; None for this one
-    """
-
-    deforms, coarse = True, None
-
-    def __init__(self, numbers: NetworkNumbers, hidden_width: int, space: Space, latent: int):
-        super().__init__()
-        self.space = space
-        self.encode_position = FrequencyEncoding(3, numbers.position_frequencies, True)
-        self.encode_direction = FrequencyEncoding(3, numbers.direction_frequencies, True)
-        sizes = numbers.depth, hidden_width, max(1, numbers.depth // 2), not numbers.bfloat16
-        self.network = CoordinateNetwork(self.encode_position.width + latent, self.encode_direction.width, *sizes)
-
-    def geometry(self, points: Points, code: Codes | None = None) -> tuple[Densities, Tensor]:
-        assert code is not None
-
-        def answer(x: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
-            raw, feature = self.network.geometry(torch.cat([self.encode_position(x), code], -1))
-            return nn.functional.softplus(raw), feature
-
-        density, features = in_chunks(answer, self.space.warp(points), code)
-        return density * self.space.stretch(points), features
-
-    def colour(self, features: Any, directions: Directions, code: Codes | None = None) -> Colours:
-        def answer(feature: Tensor, direction: Tensor) -> tuple[Tensor]:
-            return (self.network.seen(feature, self.encode_direction(direction)).sigmoid(),)
-
-        return in_chunks(answer, features, directions)[0]
-
-
 class ObjectTable(HashField):
-    """The same in a hash table of its own, read together with the code."""
+    """A hash table of its own, whose density network reads it together with the code."""
 
     deforms = True
 

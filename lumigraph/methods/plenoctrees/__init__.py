@@ -119,11 +119,9 @@ class PlenOctrees(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table, three bands, and a shallower octree."""
-        return changed(
-            Config(CPU_LEVELS), samples_per_step=1 << 15, occupancy_threshold=0.15, field="hash", hidden_width=32,
-            sh_bands=3, steps_per_diagonal=384, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3,
-            sparsity_points=1024, teacher_share=0.5, octree_depth=8, leaf_points=8,
-        )  # fmt: skip
+        return changed(Config(CPU_LEVELS), samples_per_step=1 << 15, occupancy_threshold=0.15, field="hash",
+            hidden_width=32, sh_bands=3, steps_per_diagonal=384, learning_rate=2e-2, final_learning_rate=1e-3,
+            decay_start=0.3, sparsity_points=1024, teacher_share=0.5, octree_depth=8, leaf_points=8)  # fmt: skip
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
@@ -133,11 +131,10 @@ class PlenOctrees(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
-        return changed(
-            Config(TINY_LEVELS), samples_per_step=2048, occupancy_resolution=16, field="hash", hidden_width=16,
-            hidden_layers=1, sh_bands=2, steps_per_diagonal=128, learning_rate=2e-2, final_learning_rate=1e-2,
-            sparsity_points=64, teacher_share=0.5, octree_depth=4, leaf_points=2, rays_per_step=128,
-        )  # fmt: skip
+        return changed(Config(TINY_LEVELS), samples_per_step=2048, occupancy_resolution=16, field="hash",
+            hidden_width=16, hidden_layers=1, sh_bands=2, steps_per_diagonal=128, learning_rate=2e-2,
+            final_learning_rate=1e-2, sparsity_points=64, teacher_share=0.5, octree_depth=4, leaf_points=2,
+            rays_per_step=128)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

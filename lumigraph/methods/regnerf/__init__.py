@@ -52,6 +52,7 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     table: HashNumbers = HashNumbers()
     steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
     field: Literal["network", "hash", "auto"] = "network"  # mip-NeRF's network; a faster hash table; auto: see field_of
     unseen_patches: Annotated[int, between(0, 4096)] = 64  # patches of 8 x 8 unobserved rays in a step; 0: none
     depth_weight: NonNegative = 0.1  # weight of depth's roughness in these patches, eq. 6; higher smooths depth
@@ -66,7 +67,7 @@ class Config:
     random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
     annealing: Share = 512 / 69_768  # share of the budget in which samples spread along rays, eq. 10
     forward_annealing_start: PositiveShare = 1e-4  # share of forward-facing rays, from the far plane on, at first
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
     # Of the network.
     hidden_width: Width = 256  # channels of a layer
     density_noise: NonNegative = 1.0  # deviation of noise on raw density in training; 0: none
@@ -84,7 +85,6 @@ class Config:
     table_occupancy_threshold: NonNegative = 0.05  # of the table: optical thickness of an empty cell; higher: faster
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     huber_delta: PositiveShare = 0.1  # of the hash table: residual at which the loss turns from squared to linear
-    sweep_weight: NonNegative = 0.03  # of the hash table: weight of plane-sweep depth in the open at first; 0: off
 
     @property
     def occupancy(self) -> OccupancyNumbers:
@@ -93,11 +93,6 @@ class Config:
         return OccupancyNumbers(
             self.samples_per_step, self.transmittance_threshold, cells, self.table_occupancy_threshold
         )
-
-    @property
-    def proposals(self) -> ProposalNumbers:
-        """Numbers of the hash table's samples in scenes without bounds."""
-        return ProposalNumbers(sweep_weight=self.sweep_weight)
 
 
 ANNEALING_START = 0.5  # p_s, share of each ray, around its middle, that is sampled at first, eq. 10
@@ -152,13 +147,12 @@ class RegNeRF(FieldMethod):
     def cpu_preset(cls) -> Any:
         """A hash table, for after a laptop's minutes a network is still a blur; a smaller network for objects of few
         photographs. Fewer patches, and a larger share of the budget for what the paper does in its first steps."""
-        return changed(
-            Config(**CPU_NETWORK), depth=6, skip_layer=3, unseen_patches=8, annealing=0.25, depth_settling=0.25,
-            depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5, density_noise=0.0,
-            gradient_clip=0.0, coarse_to_fine=0.9, field="auto", table=CPU_HASH["table"], steps=CPU_HASH["steps"],
-            table_width=32, samples_per_step=1 << 15, transmittance_threshold=1e-3, table_occupancy_threshold=0.15,
-            table_learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3,
-        )  # fmt: skip
+        return changed(Config(**CPU_NETWORK), depth=6, skip_layer=3, unseen_patches=8, annealing=0.25,
+            depth_settling=0.25, depth_weight=0.05, depth_weight_start=5.0, forward_annealing_start=0.5,
+            density_noise=0.0, gradient_clip=0.0, coarse_to_fine=0.9, field="auto", table=CPU_HASH["table"],
+            steps=CPU_HASH["steps"], table_width=32, samples_per_step=1 << 15, transmittance_threshold=1e-3,
+            table_occupancy_threshold=0.15, table_learning_rate=2e-2, hash_weight_decay=0.3,
+            huber_delta=0.3)  # fmt: skip
 
     @classmethod
     def smallest(cls) -> Any:

@@ -156,12 +156,10 @@ class SNeRG(FieldMethod):
     @classmethod
     def cpu_preset(cls) -> Any:
         """A hash table, fewer voxels in smaller blocks, and voxels that learn on after baking."""
-        return Config(
-            **CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32,
-            learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3,
-            deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128, rays_per_step=4096,
-            hash_weight_decay=0.3, huber_delta=0.3, sparsity_weight=1e-4,
-        )  # fmt: skip
+        return Config(**CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32,
+            learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3, deferred_share=0.6,
+            voxel_share=0.8, resolution=400, visibility_resolution=128, rays_per_step=4096, hash_weight_decay=0.3,
+            huber_delta=0.3, sparsity_weight=1e-4)  # fmt: skip
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
@@ -171,12 +169,10 @@ class SNeRG(FieldMethod):
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table, a grid of three sizes and a few thousand voxels, in all stages within some twenty steps."""
-        return changed(
-            Config(**TINY_HASH | {"table": TINY_LEVELS}), transmittance_threshold=1e-3, field="hash", hidden_layers=1,
-            hidden_width=16, rays_per_step=512, learning_rate=2e-2, final_learning_rate=2e-3, view_learning_rate=5e-3,
-            visibility_resolution=16, deferred_share=0.6, voxel_share=0.6, resolution=32, block_size=8,
-            huber_delta=0.1, sparsity_weight=1e-4,
-        )  # fmt: skip
+        return changed(Config(**TINY_HASH | {"table": TINY_LEVELS}), transmittance_threshold=1e-3, field="hash",
+            hidden_layers=1, hidden_width=16, rays_per_step=512, learning_rate=2e-2, final_learning_rate=2e-3,
+            view_learning_rate=5e-3, visibility_resolution=16, deferred_share=0.6, voxel_share=0.6, resolution=32,
+            block_size=8, huber_delta=0.1, sparsity_weight=1e-4)  # fmt: skip
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -1,6 +1,6 @@
-"""Categories: procedural objects of one kind, as many as one likes, each with proportions, colours and materials of its
-own. One file each, found by its name, with `objects(random)` and the `BOUNDS` that all of them keep to. The first of
-the objects stands as the whole does: its rotation says how far this one is turned from the way that all of them face.
+"""Categories: procedural objects of one kind, any number of them, with random proportions, colours and materials. One
+file each, found by its name, with `objects(random)` and the common `BOUNDS`. The rotation of the first object is the
+deviation from the category's common orientation.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ def available() -> list[str]:
 
 
 def stage(name: str, member: int, size: int, views: int, seed: int) -> SyntheticStage:
-    """One object of a category, seen from a dome; held-out views climb around it. The same seed and member always give
-    the same object, however many there are.
+    """One object of a category, seen from a dome; held-out views climb around it. The object depends only on seed and
+    member.
 
-    size: of the square pictures, pixels; views: to learn from
+    size: of the square pictures, pixels; views: training views
     """
     category = importlib.import_module(f".{name.replace('-', '_')}", __name__)
     random = np.random.default_rng((seed, member))
@@ -42,7 +42,7 @@ def stage(name: str, member: int, size: int, views: int, seed: int) -> Synthetic
 def surrounded(
     objects: tuple[Object, ...], bounds: tuple[Vector, Vector], size: int, views: int, random: np.random.Generator
 ) -> SyntheticStage:
-    """Objects in the light of all categories, seen from a dome; held-out views climb around them."""
+    """Objects in the categories' common light, seen from a dome; held-out views climb around them."""
     world = World(objects, (KEY, FILL), SKY)
     cameras = {
         "train": pinhole(dome(views, CAMERA_DISTANCE, random, MIN_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW),

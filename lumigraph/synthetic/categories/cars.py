@@ -17,7 +17,7 @@ LAMP, TAIL = Material(Plain((0.98, 0.95, 0.80)), gloss=1.0), Material(Plain((0.7
 
 
 def objects(random: np.random.Generator, astray: float = 25.0) -> Iterator[Object]:
-    """One car, centred. It drives towards -x, give or take `astray` degrees."""
+    """One car, centred. It faces -x, within `astray` degrees."""
     long, wide = random.uniform(0.62, 0.8), random.uniform(0.27, 0.34)
     wheel, body, cabin = random.uniform(0.10, 0.145), random.uniform(0.10, 0.15), random.uniform(0.10, 0.16)
     floor = 0.8 * wheel

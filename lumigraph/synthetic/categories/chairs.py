@@ -14,7 +14,7 @@ BOUNDS = ((-0.7, -0.7, -0.9), (0.7, 0.7, 0.9))
 
 
 def objects(random: np.random.Generator) -> Iterator[Object]:
-    """One chair, centred. Its back is at +y, give or take."""
+    """One chair, centred. Its back is at about +y."""
     wide, deep, thick = random.uniform(0.34, 0.5), random.uniform(0.34, 0.48), random.uniform(0.03, 0.07)
     seat, back = random.uniform(0.55, 0.8), random.uniform(0.5, 0.8)
     turn = Pose.at(0, 0, -0.5 * (seat + back), turn=random.uniform(-25, 25))

@@ -1,4 +1,4 @@
-"""Parts of several categories: colours and materials drawn at random."""
+"""Parts of several categories: random colours and materials."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GLASS = Material(Plain((0.16, 0.20, 0.26)), gloss=1.0, roughness=0.25)
 
 
 def colour(random: np.random.Generator, vivid: tuple[float, float] = (0.35, 0.85)) -> Colour:
-    """Any hue. vivid: least and most saturation"""
+    """Random hue. vivid: least and most saturation"""
     return colorsys.hsv_to_rgb(random.uniform(), random.uniform(*vivid), random.uniform(0.45, 0.95))
 
 
@@ -31,7 +31,7 @@ def timber(random: np.random.Generator) -> Material:
 
 
 def finish(random: np.random.Generator) -> Material:
-    """Paint most of the time, sometimes a pattern, marble or wood."""
+    """Random material: mostly paint, sometimes a pattern, marble or wood."""
     kind, a, b = random.uniform(), colour(random), colour(random, (0.0, 0.25))
     if kind < 0.55:
         return paint(a)

@@ -15,7 +15,7 @@ LYING = Pose.about((0, 1, 0), 90)  # turns an upright shape along x
 
 
 def objects(random: np.random.Generator) -> Iterator[Object]:
-    """One figure, centred. It faces -y, give or take."""
+    """One figure, centred. It faces about -y."""
     pieces = list(figure(random))
     low, high = min(o.bounds()[0][2] for o in pieces), max(o.bounds()[1][2] for o in pieces)
     place = Pose.at(0, 0, 0, turn=random.uniform(-25, 25)) @ Pose.at(0, 0, -0.5 * (low + high))

@@ -22,8 +22,8 @@ def options(name: str) -> type[Pictures]:
 
 
 def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: Any) -> SyntheticStage:
-    """Build a scene. size: of the pictures, pixels; views: for training; seed: fixes where cameras stand; further: what
-    else its `Options` have. Raises LumigraphError for a name that nothing here has."""
+    """Build a scene. size: of the pictures, pixels; views: for training; seed: of the camera positions; further: its
+    other `Options`. Raises LumigraphError for an unknown name."""
     return scene(name).stage(size, views, seed, **further)
 
 

@@ -36,7 +36,7 @@ def blocks(options: Options) -> BlockLabels:
 
 
 def cubes(land: Terrain) -> BlockLabels:
-    """Land as cubes: soil below grass, stone below all, water up to its level, trunks and crowns of trees."""
+    """Land as blocks: soil below grass, stone below all, water up to its level, trunks and crowns of trees."""
     height = np.maximum(np.round(land.ground), 1).astype(int)
     side, top = len(height), int(max(height.max(), WATER_LEVEL)) + MARGIN
     labels, z = np.zeros((side, side, top), np.uint8), np.arange(top)
@@ -56,7 +56,7 @@ def cubes(land: Terrain) -> BlockLabels:
 
 
 def plant(labels: np.ndarray, x: int, y: int, ground: int, tall: int, radius: float) -> None:
-    """A trunk, and a crown around its upper half."""
+    """Add a tree: a trunk, and a crown around its upper half."""
     labels[x, y, ground : ground + tall - 1] = TREE
     i, j, k = np.ogrid[tuple(map(slice, labels.shape))]
     centre = ground + 0.65 * tall

@@ -1,7 +1,6 @@
-"""A clockwork before a board, from time 0 to time 1: two wheels in gear, a hand and a pendulum, all of them rigid.
+"""A clockwork in front of a board, from time 0 to time 1: two wheels in gear, a hand and a pendulum, all of them rigid.
 
-The wheels turn against each other as their teeth demand, and the pendulum swings. `World.carried` gives the path of
-any point of their surfaces.
+The wheels turn by their gear ratio, and the pendulum swings. `World.carried` gives the path of any surface point.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ STEEL = Material(Plain((0.72, 0.73, 0.75)), roughness=0.35, metal=1.0)
 
 
 def about_front(x: float, y: float, z: float, degrees: float) -> Pose:
-    """A place, turned about the axis that leads to the front, anticlockwise as one sees it from there."""
+    """A position with a rotation about the axis to the front, anticlockwise as seen from there."""
     return Pose((x, y, z)) @ Pose.about((0.0, -1.0, 0.0), degrees)
 
 
 def wheel(name: str, teeth: int, hub: Pose, paint: Material) -> Iterator[Object]:
-    """A disc with teeth, in the plane of x and z."""
+    """A toothed disc, in the plane of x and z."""
     radius = MODULE * (0.5 * teeth - 0.5)
     yield Object(Cylinder(radius, 0.05, 0.01), paint, hub @ Pose.about((1, 0, 0), 90), name)
     for k in range(teeth):
@@ -42,7 +41,7 @@ def wheel(name: str, teeth: int, hub: Pose, paint: Material) -> Iterator[Object]
 
 
 def world(time: float) -> World:
-    """Everything at a moment in [0, 1]."""
+    """The world at a time in [0, 1]."""
     first, second = TEETH
     turn = TURN * time
     apart = 0.5 * MODULE * (first + second) + 0.5 * MODULE

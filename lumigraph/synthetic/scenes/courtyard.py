@@ -1,4 +1,4 @@
-"""A courtyard in the south: an unbounded scene seen from inside. A unit is some four metres; z = 0 is at eye height."""
+"""A southern courtyard: an unbounded scene seen from inside. A unit is some four metres; z = 0 is at eye height."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def hills():
 
 
 def world() -> World:
-    """Everything within 64 units, on a plain that reaches the horizon."""
+    """Everything within 64 units, on an infinite plane."""
     objects = (
         Object(Plane(), GRASS, Pose.at(0, 0, FLOOR - 0.03), "ground"),
         Object(Cuboid((2.6, 2.6, 0.1)), PAVING, Pose.at(0, 0, FLOOR - 0.1), "terrace"),
@@ -182,7 +182,7 @@ def world() -> World:
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
-    """The courtyard, walking around its fountain; held-out views are one stroll around it."""
+    """The courtyard, with training views around its fountain; held-out views are one walk around it."""
     random = np.random.default_rng(seed)
     cameras = {
         "train": pinhole(walk(views, 0.75, 1.15, random), size, 75.0),

@@ -35,7 +35,7 @@ class Options(Pictures):
 
 
 def world(lamp: float = 0.0, anisotropy: float = 0.6, thickness: float = 0.8) -> World:
-    """Five columns on a round floor, a ball in their middle, and the lamp that goes around it."""
+    """Five columns on a round floor, a ball in their middle, and the lamp at an azimuth."""
     stone = Material(Plain((0.80, 0.77, 0.70)))
     rings = Material(Rings((0.72, 0.40, 0.28), (0.85, 0.80, 0.70), period=0.12))
     floor = Material(Checker((0.75, 0.72, 0.66), (0.42, 0.44, 0.50), size=0.22))
@@ -60,7 +60,7 @@ def world(lamp: float = 0.0, anisotropy: float = 0.6, thickness: float = 0.8) ->
 def stage(
     size: int = 200, views: int = 100, seed: int = 0, lamp: int = 0, anisotropy: int = 60, thickness: int = 80
 ) -> SyntheticStage:
-    """Views from a dome outside the fog to learn from; held-out ones climb around it."""
+    """Training views from a dome outside the fog; held-out ones climb around it."""
     random = np.random.default_rng(seed)
     held_out = max(views * 2 // 5, 1)
     return SyntheticStage(

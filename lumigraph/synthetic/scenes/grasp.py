@@ -36,7 +36,7 @@ REST_AWAY = 0.5  # of the hand at rest from where it grasps, so that each body i
 
 
 def bones() -> tuple[tuple[str, ...], tuple[int, ...], Joints]:
-    """Names, parents and joints at rest, the hand open; axes along the world's."""
+    """Names, parents and rest pose of the joints, the hand open; axes along the world's."""
     names, parents, places = ["wrist"], [ROOT], [(0.0, REST_AWAY, -0.26)]
     for finger, (start, lengths, _) in FINGERS.items():
         along, place, parent = direction(finger), np.array(start) + (0.0, REST_AWAY, 0.0), 0
@@ -58,7 +58,7 @@ def direction(finger: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Grasp:
-    """Hand and can, as `characters.Character` asks for one."""
+    """Hand and can, a `characters.Character`."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -67,7 +67,7 @@ class Grasp:
         return Skeleton(names, parents, pose, (0.0,), (pose,))
 
     def pose(self, share: float) -> Joints:
-        """Joints at a share of the capture, 0 to 1: open, closed around the can, open."""
+        """Joints at a time from 0 to 1: open, closed around the can, open."""
         names, parents, joints = bones()
         closed = 0.5 - 0.5 * math.cos(2 * math.pi * share)
         local = joints.copy()
@@ -86,7 +86,7 @@ class Grasp:
         return posed(parents, torch.from_numpy(local)).numpy()
 
     def parts(self) -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
-        """Shapes at rest, with the bone that moves each."""
+        """Shapes at rest, with each one's bone."""
         names, _, joints = bones()
         skin = Mottle(SKIN, BLUSH, size=0.25, contrast=2.0)
         yield "wrist", Cuboid(PALM, 0.065), skin, Pose.at(0, REST_AWAY, 0)
@@ -103,7 +103,7 @@ class Grasp:
         yield CAN, Cylinder(CAN_RADIUS, CAN_HALF, 0.03), Sectors(RED, CREAM, count=8), Pose.at(*CAN_PLACE)
 
     def world(self, pose: Joints) -> World:
-        """Hand and can in a pose, and their light."""
+        """Hand and can in a pose, with light."""
         names, _, home = bones()
         shift = pose[:, :, 3] - (pose[:, :, :3] @ home[:, :, 3:])[:, :, 0]
         moves = {name: Pose(tuple(shift[i].tolist()), nested(pose[i, :, :3])) for i, name in enumerate(names)}
@@ -114,7 +114,7 @@ class Grasp:
         return World(objects, (KEY, FILL), SKY)
 
     def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of the box around both in a pose."""
+        """Bounding box in a pose: lowest and highest corner."""
         return self.world(pose).bounds()
 
 

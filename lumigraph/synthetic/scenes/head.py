@@ -1,8 +1,8 @@
-"""A head that speaks, from time 0 to time 1, photographed by a dome of cameras: glossy skin, and a tracked mesh.
+"""A speaking head, from time 0 to time 1, photographed by a dome of cameras: glossy skin, and a tracked mesh.
 
-Mouth, smile, brows and gaze move by different periods, so that most moments have an expression of their own. Each
-photograph comes with the mesh of its moment, `Scene.about["vertices"]`: a grid (row, column, 3) over directions from
-the middle of the head, in the source's frame, from the crown down and once around from the back.
+Mouth, smile, brows and gaze have different periods, so that most times have a unique expression. Each photograph has
+the mesh at its time, `Scene.about["vertices"]`: a grid (row, column, 3) over directions from the centre of the head, in
+the source's frame, from the crown down and once around from the back.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ LIP, MOUTH, WHITE, IRIS = (0.70, 0.25, 0.26), (0.20, 0.05, 0.06), (0.93, 0.93, 0
 
 @dataclass(frozen=True)
 class Options(Pictures):
-    """Options of every scene, and moments at which the dome takes photographs, `views` in all."""
+    """Options of every scene. moments: number of times at which the dome takes photographs, `views` in all"""
 
     moments: Annotated[int, between(2, 200)] = 16
 
 
 class Expression(NamedTuple):
-    """mouth: from closed to open; smile, brow, gaze: to either side of 0"""
+    """Facial expression. mouth: from closed to open; smile, brow, gaze: around 0"""
 
     mouth: float
     smile: float
@@ -52,14 +52,14 @@ class Expression(NamedTuple):
 
 
 def expression(time: float) -> Expression:
-    """Expression of the face at a moment in [0, 1]."""
+    """Expression at a time in [0, 1]."""
     turn = 2 * math.pi * time
     mouth = 0.5 - 0.5 * math.cos(2 * turn)
     return Expression(mouth, math.sin(turn + 0.4), math.sin(2 * turn + 1.1), math.sin(turn - 0.8))
 
 
 def face(now: Expression):
-    """Parts of the head, its middle at the origin, the face towards -y."""
+    """Parts of the head, centred at the origin, the face towards -y."""
     skin = Material(Mottle(SKIN, BLUSH, size=0.5, contrast=1.6, seed=2.0), gloss=1.0, roughness=0.3)
     hair = Material(Mottle(HAIR, DARK_HAIR, size=0.12, contrast=2.5, seed=5.0), gloss=0.8, roughness=0.4)
     lip = Material(Plain(LIP), gloss=1.0, roughness=0.3)
@@ -95,7 +95,7 @@ def chin() -> Pose:
 
 
 def world(time: float) -> World:
-    """Everything at a moment in [0, 1]."""
+    """The world at a time in [0, 1]."""
     key = Lamp((-2.2, -2.8, 2.4), radius=0.35, power=17.0, colour=(1.0, 0.95, 0.87))
     fill = Lamp((2.8, -1.6, 1.0), radius=0.6, power=6.0, colour=(0.86, 0.93, 1.0))
     sky = Sky((0.84, 0.91, 1.0), (0.95, 0.94, 0.92), (0.70, 0.62, 0.54), light=0.42)
@@ -104,7 +104,7 @@ def world(time: float) -> World:
 
 @cache
 def tracked(time: float) -> np.ndarray:
-    """The mesh at a moment, (row, column, 3): the outermost surface along each direction from the origin."""
+    """The mesh at a time, (row, column, 3): the outermost surface along each direction from the origin."""
     polar = np.linspace(0, math.pi, ROWS)[:, None]
     around = np.linspace(0, 2 * math.pi, COLUMNS)[None] + math.radians(-FRONT)
     flat = np.sin(polar)
@@ -115,7 +115,7 @@ def tracked(time: float) -> np.ndarray:
 
 
 def stage(size: int = 200, views: int = 160, seed: int = 0, moments: int = 16) -> SyntheticStage:
-    """The head from a dome. Held out are new cameras at the moments of training, then cameras between moments."""
+    """The head from a dome. Held out are new cameras at training times, then cameras between times."""
     random = np.random.default_rng(seed)
     times = (np.arange(moments) + 0.5) / moments
     train = [(place(random), float(times[k % moments])) for k in range(views)]

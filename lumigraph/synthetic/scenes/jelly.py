@@ -1,6 +1,6 @@
 """A jelly on a board, from time 0 to time 1: its foot stays, its body sways from side to side, stretches and turns.
 
-Its motion is that of no rigid body. `World.carried` gives the path of any point of its surface.
+Its motion is not rigid. `World.carried` gives the path of any surface point.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RED, YELLOW = (0.84, 0.16, 0.12), (0.99, 0.83, 0.36)
 
 
 def jelly(time: float) -> Object:
-    """The body at a moment."""
+    """The body at a time."""
     bend = math.radians(MAX_BEND) * math.sin(2 * math.pi * SWAYS * time)
     stretch = 1.0 + MAX_STRETCH * math.sin(2 * math.pi * STRETCHES * time)
     height = 2 * HALF_HEIGHT * stretch
@@ -36,7 +36,7 @@ def jelly(time: float) -> Object:
 
 
 def world(time: float) -> World:
-    """Everything at a moment in [0, 1]."""
+    """The world at a time in [0, 1]."""
     board = Material(Checker(CREAM, SLATE, size=0.2), gloss=0.6, roughness=0.4)
     key = Lamp((-2.6, -1.8, 3.2), radius=0.5, power=18.0, colour=(1.0, 0.95, 0.87))
     fill = Lamp((3.0, -0.8, 2.0), radius=0.8, power=5.0, colour=(0.86, 0.93, 1.0))

@@ -1,5 +1,5 @@
-"""A still life of known materials in the light of an environment map: albedo, roughness, normals and visibility are
-exact. `light=1` chooses another light, `bounces=1` adds light that surfaces reflect onto each other.
+"""A still life of known materials under an environment map: albedo, roughness, normals and visibility are exact.
+`light=1` chooses another light, `bounces=1` adds interreflections.
 
 Light 0 to 4: a studio with two soft boxes, a sun in the morning, a low sun, an overcast sky, a room with a window.
 """
@@ -39,7 +39,7 @@ def satin(texture, roughness: float) -> Material:
 
 
 def world() -> World:
-    """Objects of six roughnesses on a slab, centred; everything lies within [-1, 1]^3."""
+    """Objects of six roughnesses on a slab, centred, within [-1, 1]^3."""
     wood = satin(Wood((0.80, 0.62, 0.42), (0.62, 0.42, 0.25), ring=0.09, seed=1.0), 0.6)
     slab = satin(Mottle((0.72, 0.70, 0.66), (0.60, 0.58, 0.55), size=0.4), 0.75)
     checks = satin(Checker((0.85, 0.80, 0.70), (0.25, 0.30, 0.38), size=0.11, shift=0.055), 0.45)
@@ -95,7 +95,7 @@ def environment(number: int) -> EnvironmentLight:
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0, light: int = 0, bounces: int = 0) -> SyntheticStage:
-    """Views from a dome to learn from; held-out ones climb around the still life."""
+    """Training views from a dome; held-out ones climb around the still life."""
     random = np.random.default_rng(seed)
     held_out = max(views * 2 // 5, 1)
     shown = environment(light)

@@ -1,5 +1,5 @@
 """The study at night: two lamps and the moon through the window, photographed raw by a hand-held camera at three
-shutter times, most of it in the dark. What is known besides is the light itself, without noise.
+shutter times, mostly dark. The noise-free radiance is known.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def world() -> World:
 
 
 def held(count: int, random: np.random.Generator) -> np.ndarray:
-    """Poses of somebody who stands at one side of the room and looks at the other."""
+    """Hand-held poses at one side of the room, looking at the other."""
     poses = []
     for _ in range(count):
         eye = (random.uniform(-0.40, 0.25), random.uniform(-0.42, -0.15), random.uniform(-0.22, 0.14))
@@ -38,7 +38,7 @@ def held(count: int, random: np.random.Generator) -> np.ndarray:
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
-    """So many photographs, and a fifth as many held out."""
+    """`views` training photographs, and a fifth as many held out."""
     random = np.random.default_rng(seed)
     held_out = max(views // 5, 1)
     cameras = pinhole(held(views + held_out, random), size, FIELD_OF_VIEW)

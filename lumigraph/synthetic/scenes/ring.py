@@ -1,4 +1,4 @@
-"""A rig for omnidirectional stereo: cameras on a level circle that look outward, in the study of `room`."""
+"""A rig for omnidirectional stereo: outward cameras on a level circle, in the study of `room`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Options(Pictures):
 
 
 def stage(size: int = 400, views: int = 12, seed: int = 0) -> SyntheticStage:
-    """The rig in the middle of the study, a little off; the held-out view looks from its middle."""
+    """The rig near the middle of the study; the held-out view is at the rig's centre."""
     around = room.stage(8, 1, seed)
     middle = np.array([0.1, -0.05, 0.0])
     poses = []

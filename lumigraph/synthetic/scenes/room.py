@@ -37,7 +37,7 @@ LEAVES = Material(Mottle((0.38, 0.53, 0.25), (0.15, 0.28, 0.13), size=0.07, cont
 
 
 def shell():
-    """Floor, ceiling and four walls, each of its own material, so that every view is distinct."""
+    """Floor, ceiling and four walls, of different materials, so that every view is distinct."""
     up, middle = (CEILING - FLOOR) / 2, (CEILING + FLOOR) / 2
     boards = Material(Stripes((0.60, 0.43, 0.27), (0.45, 0.30, 0.18), period=0.11, share=0.5))
     on_side = Pose.about((1, 0, 0), 90)
@@ -125,7 +125,7 @@ def plants():
 
 
 def world() -> World:
-    """Everything within [-1, 1]^3; the middle is free to walk in."""
+    """Everything within [-1, 1]^3, with free space in the middle."""
     rug = Material(Rings((0.62, 0.24, 0.18), (0.90, 0.80, 0.62), period=0.09, share=0.4))
     objects = (
         *shell(),
@@ -149,7 +149,7 @@ def world() -> World:
 
 
 def inside(count: int, random: np.random.Generator, reach: float = 0.28):
-    """Poses near the middle of the room, evenly spread over all directions of gaze but straight up and down."""
+    """Poses near the middle of the room, evenly spread over viewing directions except steep ones."""
     poses = []
     for k in range(count):
         height = 0.97 * (1 - (2 * k + 1) / count)
@@ -172,7 +172,7 @@ class Options(Pictures):
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0, depth: int = 0) -> SyntheticStage:
-    """The room from near its middle, in all directions; held-out views likewise. depth: see `Options`."""
+    """The room from near its middle, in all directions; held-out views likewise. depth: see `Options`"""
     random = np.random.default_rng(seed)
     bounds = (-1.0, -0.8, -0.56), (1.0, 0.8, 0.5)
     if depth:
@@ -192,5 +192,5 @@ def stage(size: int = 200, views: int = 100, seed: int = 0, depth: int = 0) -> S
 
 
 def counted(cameras: Camera, first: int) -> Camera:
-    """Cameras whose pictures are numbered."""
+    """Cameras with image indices from `first` on."""
     return replace(cameras, image_index=torch.arange(first, first + len(cameras)))

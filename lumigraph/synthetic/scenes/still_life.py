@@ -100,7 +100,7 @@ def marbles():
 
 
 def world() -> World:
-    """The toys, centred: everything lies within [-1, 1]^3, and the turntable nearly fills it from side to side."""
+    """The toys, centred, within [-1, 1]^3; the turntable nearly fills it."""
     objects = (
         *turntable(),
         *stacking_rings(Pose.at(-0.33, 0.34, 0)),

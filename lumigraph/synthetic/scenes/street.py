@@ -1,6 +1,6 @@
-"""A street, from time 0 to time 1: three figures walk past a house, their arms and legs swinging.
+"""A street, from time 0 to time 1: three figures walk past a house, with swinging arms and legs.
 
-Every limb is rigid, turns about its joint and touches no other. `World.carried` gives the path of any point of it.
+Every limb is rigid, turns about its joint and touches no other. `World.carried` gives the path of any of its points.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ FIGURES = (
 
 
 def limb(length: float, radius: float) -> tuple[SoftCapsule, Pose]:
-    """A straight limb, and its place below its joint."""
+    """A straight limb, and its pose below its joint."""
     return SoftCapsule(radius, 0.5 * length, 0.0, 1.0), Pose.at(0, 0, -0.5 * length)
 
 
 def figure(number: int, time: float) -> Iterator[Object]:
-    """One that walks, at a moment."""
+    """A walking figure at a time."""
     depth, way, start, steps, coat, trim = FIGURES[number]
     name, phase = f"figure {number + 1}", 2 * math.pi * steps * time
     cloth = Material(Mottle(coat, trim, size=0.14, contrast=3.0, seed=float(number)), roughness=0.8)
@@ -60,7 +60,7 @@ def figure(number: int, time: float) -> Iterator[Object]:
 
 
 def world(time: float) -> World:
-    """Everything at a moment in [0, 1]."""
+    """The world at a time in [0, 1]."""
     brick = Material(Bricks((0.66, 0.36, 0.28), (0.80, 0.77, 0.72)), roughness=0.9)
     flags = Material(Checker(CREAM, GREY, size=0.22), roughness=0.8)
     door = Material(Stripes((0.20, 0.34, 0.30), (0.26, 0.44, 0.38)), gloss=0.4, roughness=0.5)

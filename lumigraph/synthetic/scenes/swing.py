@@ -1,6 +1,6 @@
-"""A pendulum over a board: a ball on a rod that swings once across, from time 0 to time 1, while all else stands still.
+"""A pendulum over a board: a ball on a rod that swings once across, from time 0 to time 1, in a static scene.
 
-Held-out views are spread over the same second. Where the ball is at any moment follows from `angle`.
+Held-out views are spread over the same second. `angle` is the ball's exact position at any time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STEEL = Material(Plain((0.72, 0.73, 0.75)), roughness=0.3, metal=1.0)
 
 
 def still() -> tuple[Object, ...]:
-    """The board and the gallows, which stand still."""
+    """Board and gallows, the static objects."""
     board = Material(Checker(CREAM, BLUE, size=0.2), gloss=0.6, roughness=0.4)
     posts = (
         Object(Cuboid((0.03, 0.03, 0.60), 0.01), OAK, Pose.at(0, side * 0.42, -0.02), "gallows") for side in (-1.0, 1.0)
@@ -35,12 +35,12 @@ def still() -> tuple[Object, ...]:
 
 
 def angle(time: float) -> float:
-    """Degrees from the plumb line, towards +x: half a period, from -WIDEST at time 0 to WIDEST at time 1."""
+    """Degrees from the vertical, towards +x: half a period, from -WIDEST at time 0 to WIDEST at time 1."""
     return -MAX_ANGLE * math.cos(math.pi * time)
 
 
 def world(time: float) -> World:
-    """Everything at a moment in [0, 1]."""
+    """The world at a time in [0, 1]."""
     swung = Pose(PIVOT) @ Pose.about((0.0, 1.0, 0.0), -angle(time))
     stripes = Material(Sectors(RED, CREAM, count=6, cap=0.2), gloss=1.0, roughness=0.25)
     pendulum = (
@@ -54,7 +54,7 @@ def world(time: float) -> World:
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
-    """The pendulum seen from a dome, each photograph at a moment of its own; held-out views climb around it."""
+    """The pendulum from a dome, each photograph at its own time; held-out views climb around it."""
     random = np.random.default_rng(seed)
     held_out = max(views * 2 // 5, 1)
     cameras = {

@@ -1,5 +1,5 @@
-"""A façade on a square, as tourists photograph it: other days and lenses, other cameras' colours, people and cars
-before it. Held-out photographs were taken in a light of their own too, with nobody there.
+"""A façade on a square, as tourists photograph it: varying weather, lenses and colours, with people and cars as
+transient occluders. Held-out photographs have a light of their own too, without occluders.
 
 A unit is some six metres; z = 0 is at eye height, the façade faces -y.
 """
@@ -48,10 +48,10 @@ MAX_AZIMUTH = 42.0  # degrees to either side
 
 @dataclass(frozen=True)
 class Day:
-    """The light of one photograph, and what its camera made of it.
+    """Light and camera settings of one photograph.
 
-    sun:      degrees (azimuth from straight before the façade, elevation)
-    overcast: share of the sun that clouds take
+    sun:      degrees (azimuth from the façade's front, elevation)
+    overcast: share of the sun that clouds block
     balance:  factors on red, green and blue
     exposure: factor on all light
     """
@@ -63,7 +63,7 @@ class Day:
 
     @staticmethod
     def drawn(random: np.random.Generator) -> Day:
-        """Morning to evening, clear or dull, warm or cold, a stop of exposure in all."""
+        """Random light: morning to evening, clear or overcast, warm or cold, one stop of exposure in all."""
         warm, tint = random.normal(0, 0.13), random.normal(0, 0.03)
         return Day(
             (random.uniform(-75, 75), random.uniform(15, 65)),
@@ -74,7 +74,7 @@ class Day:
 
     @property
     def lights(self) -> tuple[Sun]:
-        """The sun: warmer as it sinks."""
+        """The sun: warmer near the horizon."""
         azimuth, elevation = (math.radians(x) for x in self.sun)
         low = 1 - math.sin(elevation)
         colour = (1.0, 0.95 - 0.20 * low, 0.86 - 0.42 * low)
@@ -157,7 +157,7 @@ def square() -> Iterator[Object]:
 
 
 def person(place: Pose, shirt: Colour, trousers: Colour) -> Iterator[Object]:
-    """Somebody who stands there, 0.29 units tall."""
+    """A standing person, 0.29 units tall."""
     for side in (-0.022, 0.022):
         legs = Cylinder(0.02, 0.065, 0.008)
         yield Object(legs, Material(Plain(trousers)), place @ Pose.at(side, 0, 0.065), "passers-by")
@@ -178,7 +178,7 @@ def car(place: Pose, paint: Colour) -> Iterator[Object]:
 
 
 def passing(camera: Camera, random: np.random.Generator) -> Iterator[Object]:
-    """People and now and then a car between a camera and the façade, each before some other part of it."""
+    """Transient occluders: people and occasionally a car between a camera and the façade, spread over it."""
     eye = camera.position[0].numpy()
     for _ in range(random.integers(1, MAX_PASSERS + 1)):
         aim = np.array([random.uniform(-0.9, 0.9), WALL])
@@ -194,7 +194,7 @@ def passing(camera: Camera, random: np.random.Generator) -> Iterator[Object]:
 
 
 def visits(count: int, random: np.random.Generator, size: int) -> Camera:
-    """Cameras of people who look at the façade from the square, with lenses of 45 to 70 degrees."""
+    """Cameras of visitors who look at the façade from the square, with lenses of 45 to 70 degrees."""
     poses = []
     for _ in range(count):
         azimuth = math.radians(random.uniform(-MAX_AZIMUTH, MAX_AZIMUTH))
@@ -206,19 +206,19 @@ def visits(count: int, random: np.random.Generator, size: int) -> Camera:
 
 
 def world(day: Day, others: tuple[Object, ...] = ()) -> World:
-    """The square on a day, with passers-by. The numbers of masks are the same without them."""
+    """The square on a day, with occluders. Mask numbers are the same without them."""
     return World((*front(), *tower(-0.94), *tower(0.94), *square(), *others), day.lights, day.sky)
 
 
 def photographed(seed: int, cameras: Camera, lasting: bool, index: int) -> World:
-    """The world when a photograph was taken. lasting: without what only passed by."""
+    """The world in a photograph. lasting: without transient objects"""
     random = np.random.default_rng([seed, index])
     day = Day.drawn(random)
     return world(day, () if lasting else tuple(passing(cameras[index], random)))
 
 
 def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
-    """The façade by so many visitors; a quarter as many photographs, without anybody before it, are held out."""
+    """The façade by `views` visitors; a quarter as many photographs, without occluders, are held out."""
     held_out = max(views // 4, 1)
     cameras = visits(views + held_out, np.random.default_rng(seed), size)
     cameras = replace(cameras, image_index=torch.arange(len(cameras)))

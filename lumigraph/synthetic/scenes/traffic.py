@@ -1,7 +1,7 @@
 """Traffic, from time 0 to time 1: cars of one category circle a square in two lanes, and the camera drives along.
 
-Cars are rigid, and their boxes are known at every moment. The held-out photographs are taken by the same camera, each
-between two photographs to learn from. `with_edits` renders the truth of an edited scene.
+Cars are rigid, and their boxes are known at all times. The held-out photographs are by the same camera, each between
+two training photographs. `with_edits` renders the truth of an edited scene.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Options(Pictures):
 
 @cache
 def car(seed: int, number: int) -> tuple[tuple[Object, ...], tuple[float, float, float]]:
-    """Parts of a car in its box's frame, which it fills, and the size of the box."""
+    """Parts of a car in its box's frame, and the size of its tight box."""
     around = Pose.at(0, 0, 0, turn=180.0)  # the category drives towards -x
     parts = [
         replace(x, pose=around @ x.pose).scaled(CAR_SCALE)
@@ -71,7 +71,7 @@ def car(seed: int, number: int) -> tuple[tuple[Object, ...], tuple[float, float,
 
 
 def place(seed: int, number: int, time: float) -> Pose:
-    """The pose of a car's box at a moment."""
+    """The pose of a car's box at a time."""
     lane, slot = SLOTS[number]
     start = 360.0 * slot / LANE_CARS[lane] - 130.0 + 37.0 * lane + 11.0 * seed
     angle = start + TURNS[lane] * time
@@ -81,7 +81,7 @@ def place(seed: int, number: int, time: float) -> Pose:
 
 @cache
 def square() -> tuple[Object, ...]:
-    """Everything that stands still."""
+    """All static objects."""
     parts = [
         Object(Cuboid((4.0, 4.0, 0.05)), PAVING, Pose.at(0, 0, GROUND - 0.06), "pavement"),
         Object(Cylinder(1.06, 0.02), ASPHALT, Pose.at(0, 0, GROUND - 0.02), "road"),
@@ -112,7 +112,7 @@ SKY = Sky((0.36, 0.58, 0.88), (0.83, 0.89, 0.94), (0.60, 0.56, 0.50), light=0.7,
 
 
 def world(seed: int, cars: int, time: float) -> World:
-    """Everything at a moment in [0, 1]."""
+    """The world at a time in [0, 1]."""
     driving = [
         replace(part, pose=place(seed, number, time) @ part.pose)
         for number in range(cars)
@@ -122,7 +122,7 @@ def world(seed: int, cars: int, time: float) -> World:
 
 
 def tracks(seed: int, cars: int, times: np.ndarray) -> tuple[BoxTrack, ...]:
-    """The boxes of all cars at moments."""
+    """The boxes of all cars at some times."""
 
     def track(number: int) -> BoxTrack:
         poses = [place(seed, number, float(t)) for t in times]
@@ -135,9 +135,9 @@ def tracks(seed: int, cars: int, times: np.ndarray) -> tuple[BoxTrack, ...]:
 
 
 def with_edits(stage: SyntheticStage, edits: TrackEdits, time: float, seed: int = 0) -> World:
-    """The truth of an edited scene at a moment: its cars moved, turned, removed, added or swapped.
+    """The truth of an edited scene at a time: its cars moved, turned, removed, added or swapped.
 
-    seed: that the stage was built with
+    seed: of the stage
     """
     parts = list(square())
     for node in nodes_of(stage.tracks, edits):

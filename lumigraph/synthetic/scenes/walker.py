@@ -47,12 +47,12 @@ PLACES = np.array([place for _, place in JOINTS.values()])
 
 
 def rest() -> Joints:
-    """Joints at rest, their axes along the world's."""
+    """Rest pose of the joints, axes along the world's."""
     return np.concatenate([np.broadcast_to(np.eye(3), (len(NAMES), 3, 3)), PLACES[:, :, None]], -1)
 
 
 def angles(share: float) -> dict[str, tuple[float, float, float]]:
-    """Degrees by which joints turn about x, y and z at a share of the capture: swing, sideways, twist."""
+    """Joint angles about x, y and z in degrees at a time from 0 to 1: swing, sideways, twist."""
     phase = 2 * math.pi * STRIDES * share
     found = {
         "hips": (2.0, 3.0 * math.sin(phase), 8.0 * math.sin(phase)),
@@ -72,7 +72,7 @@ def angles(share: float) -> dict[str, tuple[float, float, float]]:
 
 
 def joints(turns: dict[str, tuple[float, float, float]], lift: float = 0.0) -> Joints:
-    """Joints that turn from rest by degrees about x, then y, then z; the hips are lifted, scene units."""
+    """Joints after rotations by degrees about x, then y, then z; the hips are lifted, scene units."""
     local = rest()
     local[:, :, 3] -= np.where(np.array(PARENTS)[:, None] < 0, 0, PLACES[np.maximum(PARENTS, 0)])
     local[0, 2, 3] += lift
@@ -83,7 +83,7 @@ def joints(turns: dict[str, tuple[float, float, float]], lift: float = 0.0) -> J
 
 
 def limb(start: str, end: str, radius: float, texture: Texture) -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
-    """A capsule from one joint to the next, which the first one moves."""
+    """A capsule from one joint to the next, moved by the first."""
     a, b = (np.array(JOINTS[name][1]) for name in (start, end))
     along = (b - a) / np.linalg.norm(b - a)
     side = np.cross([0.0, 1.0, 0.0], along)
@@ -98,7 +98,7 @@ def limb(start: str, end: str, radius: float, texture: Texture) -> Iterator[tupl
 
 
 def parts() -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
-    """Shapes of the figure at rest, with the joint that moves each."""
+    """Shapes of the figure at rest, with each one's joint."""
     skin, shirt = Mottle(SKIN, (0.78, 0.52, 0.42), size=0.3, contrast=1.5), Stripes(SHIRT, STRIPE, period=0.11)
     cloth = Checker(TROUSERS, SEAM, size=0.09)
     yield "hips", SoftCapsule(0.115, 0.05), cloth, Pose.at(0, 0, 0.05) @ Pose.about((0, 1, 0), 90)
@@ -128,7 +128,7 @@ def parts() -> Iterator[tuple[str, SolidShape, Texture, Pose]]:
 
 @dataclass(frozen=True)
 class Walker:
-    """The figure, as `characters.Character` asks for one."""
+    """The figure, a `characters.Character`."""
 
     @property
     def skeleton(self) -> Skeleton:
@@ -136,11 +136,11 @@ class Walker:
         return Skeleton(NAMES, PARENTS, pose, (0.0,), (pose,))
 
     def pose(self, share: float) -> Joints:
-        """Joints at a share of the capture, 0 to 1."""
+        """Joints at a time from 0 to 1."""
         return joints(angles(share), lift=0.012 * math.cos(4 * math.pi * STRIDES * share))
 
     def world(self, pose: Joints) -> World:
-        """The figure in a pose, and its light."""
+        """The figure in a pose, with light."""
         home = rest()
         turn = pose[:, :, :3] @ home[:, :, :3].transpose(0, 2, 1)
         shift = pose[:, :, 3] - (turn @ home[:, :, 3:])[:, :, 0]
@@ -152,7 +152,7 @@ class Walker:
         return World(objects, (KEY, FILL), SKY)
 
     def extent(self, pose: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of the box around it in a pose."""
+        """Bounding box in a pose: lowest and highest corner."""
         return self.world(pose).bounds()
 
 

@@ -1,7 +1,6 @@
 """A city, photographed by a car with three cameras that drives along every street once in each direction: façades with
-windows and shops, trees, parked cars and others that drive. The sun moves during the drive and a cloud comes before it;
-each camera exposes in its own way, and differently from place to place. Every eighth photograph is held out and was
-taken with nobody driving.
+windows and shops, trees, parked cars and moving ones. The sun moves during the drive and a cloud covers it; each camera
+has its own exposure, which varies with the position. Every eighth photograph is held out and shows no moving cars.
 
     procedural:city,crossings=6,views=400,size=320        pictures of 320x240, further options as everywhere
 
@@ -52,7 +51,7 @@ class Options(Pictures):
     """Options of every scene, but for these.
 
     size:      width of the pictures, which are three quarters as high
-    crossings: of streets; around each is as much of the city as one block of a large scene may hold
+    crossings: number of street crossings; one block of a large scene contains the surroundings of one
     jitter_poses: degrees, and percent of a street's width
     """
 
@@ -63,9 +62,9 @@ class Options(Pictures):
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive through a city of so many crossings, with so many photographs.
+    """A drive through a city of some crossings.
 
-    photographs: held-out ones included
+    photographs: number of photographs, held-out ones included
     """
 
     crossings: int
@@ -73,7 +72,7 @@ class Drive:
     seed: int
 
     def share(self, number: int) -> float:
-        """Share of the drive that is over when a photograph is taken."""
+        """Position of a photograph in the drive, from 0 to 1."""
         return (number // len(RIG) + 0.5) / self.stops
 
     @property
@@ -81,7 +80,7 @@ class Drive:
         return -(-self.photographs // len(RIG))
 
     def exposure(self, number: int) -> float:
-        """Light that one camera of the rig takes, of what it would take otherwise."""
+        """Exposure factor of a photograph's camera."""
         gain = RIG[number % len(RIG)][2]
         return gain * 2 ** (EXPOSURE_STOPS * math.sin(2 * math.pi * EXPOSURE_CYCLES * self.share(number)))
 
@@ -99,9 +98,9 @@ class Drive:
         return look_at(eye, eye + gaze)
 
     def world(self, number: int, lasting: bool) -> World:
-        """The city in one photograph. lasting: without cars that drive
+        """The city in one photograph. lasting: without moving cars
 
-        Its lengths are metres: the sky has hardly any haze, and ambient occlusion within arm's reach.
+        Its lengths are metres: the sky has hardly any haze, and ambient occlusion has a reach of about a metre.
         """
         today = day(self.share(number), self.exposure(number))
         parts = [still(self.crossings, self.seed)]
@@ -117,7 +116,7 @@ def still(crossings: int, seed: int) -> World:
 
 @lru_cache(16)
 def driving(drive: Drive, stop: int) -> World:
-    """Cars that drive while the rig takes its photographs."""
+    """Moving cars at the times of the photographs."""
     eye = route(drive.crossings, drive.stops)[0][stop]
     return World(tuple(traffic(everybody(drive.crossings, drive.seed), drive.time(stop * len(RIG)), eye)))
 
@@ -133,7 +132,7 @@ def route(crossings: int, stops: int) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def stage(size: int = 320, views: int = 400, seed: int = 0, crossings: int = 6) -> SyntheticStage:
-    """The city, seen along one drive: so many photographs to learn from, and after every seventh one that is not."""
+    """The city, seen along one drive: `views` training photographs, and after every seventh one a held-out one."""
     count = views + max(views // (HOLD_OUT - 1), 1)
     drive = Drive(crossings, count, seed)
     held_out = np.arange(count) % HOLD_OUT == HOLD_OUT - 1
@@ -169,7 +168,7 @@ def stage(size: int = 320, views: int = 400, seed: int = 0, crossings: int = 6) 
 
 
 def day(share: float, exposure: float) -> Day:
-    """The light when a share of the drive is over."""
+    """Light at a share of the drive."""
     begin, end = SWEEP
     middle, width, most = CLOUD
     overcast = most * math.exp(-(((share - middle) / width) ** 2))
@@ -179,7 +178,7 @@ def day(share: float, exposure: float) -> Day:
 
 @dataclass(frozen=True)
 class Lane:
-    """A straight way through the whole city: where it begins, which way it leads (degrees), how long it is."""
+    """A straight lane through the whole city: start, direction (degrees), length."""
 
     begin: tuple[float, float]
     turn: float
@@ -188,7 +187,7 @@ class Lane:
 
 @dataclass(frozen=True)
 class Driver:
-    """A car on its lane: where it was at the beginning, how quick it is, what it is like."""
+    """A car on its lane: initial position, speed, appearance."""
 
     lane: Lane
     start: float
@@ -201,7 +200,7 @@ class Driver:
 
 
 def lanes(places: list[Crossing]) -> Iterator[Lane]:
-    """Both lanes of every street, which goes on to the outskirts."""
+    """Both lanes of every street, extended to the outskirts."""
     columns, rows = (max(place[axis] for place in places) + 1 for axis in range(2))
     out = OUTSKIRTS - 6.0
     for j in range(rows):
@@ -226,7 +225,7 @@ def drivers(places: list[Crossing], seed: int) -> list[Driver]:
 
 
 def traffic(everybody: list[Driver], time: float, eye: np.ndarray) -> Iterator[Object]:
-    """The cars on the streets at a moment, but for those in another's way. eye: where the photographs are taken"""
+    """Cars on the streets at a time, without overlaps. eye: position of the cameras"""
     there = [eye]
     for driver in everybody:
         pose = driver.pose(time)

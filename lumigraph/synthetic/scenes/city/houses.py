@@ -62,7 +62,7 @@ class Style:
 
 
 def wall(random: np.random.Generator, seed: float) -> Material:
-    """Bricks or plaster with its stains."""
+    """Wall of bricks, or of stained plaster."""
     if random.uniform() < 0.4:
         colour = BRICKS[random.integers(len(BRICKS))]
         return Material(Bricks(colour, (0.75, 0.72, 0.66), length=0.5, height=0.18, joint=0.03, variation=0.3))
@@ -71,7 +71,7 @@ def wall(random: np.random.Generator, seed: float) -> Material:
 
 
 def painted(random: np.random.Generator) -> Material:
-    """Boards in a colour."""
+    """Painted boards."""
     colour = PAINTS[random.integers(len(PAINTS))]
     return Material(Stripes(colour, darker(colour, 0.65), period=0.16, share=0.35), gloss=0.4, roughness=0.5)
 
@@ -86,8 +86,8 @@ def house(
 ) -> Iterator[Object]:
     """One house with windows on some of its sides.
 
-    place: of its middle, on the ground; half: of its sizes along x and y
-    fronts: where those sides face, degrees from -y anticlockwise: 0, 90, 180 or 270
+    place: centre of its base; half: of its sizes along x and y
+    fronts: directions of those sides, degrees from -y anticlockwise: 0, 90, 180 or 270
     """
     style = Style.drawn(random)
     x, y, height = *half, style.height

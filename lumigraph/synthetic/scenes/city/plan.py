@@ -23,13 +23,13 @@ Crossing = tuple[int, int]  # column and row
 
 
 def crossings(count: int) -> list[Crossing]:
-    """So many crossings in rows as long as they are many, the last one maybe shorter."""
+    """`count` crossings in a square grid, the last row maybe shorter."""
     columns = math.ceil(math.sqrt(count))
     return [(k % columns, k // columns) for k in range(count)]
 
 
 def extent(count: int) -> tuple[Vector, Vector]:
-    """Two corners of the box that holds such a city, the ground included."""
+    """Two corners of the city's box, the ground included."""
     places = crossings(count)
     columns, rows = (max(place[axis] for place in places) + 1 for axis in range(2))
     out = (PITCH * (columns - 1) + OUTSKIRTS, PITCH * (rows - 1) + OUTSKIRTS, MAX_HEIGHT)
@@ -37,7 +37,7 @@ def extent(count: int) -> tuple[Vector, Vector]:
 
 
 def neighbours(places: list[Crossing]) -> dict[Crossing, list[Crossing]]:
-    """Crossings that streets lead to from each crossing."""
+    """Neighbouring crossings of each crossing."""
     return {
         (i, j): [there for there in ((i + 1, j), (i, j + 1), (i - 1, j), (i, j - 1)) if there in places]
         for i, j in places
@@ -45,7 +45,7 @@ def neighbours(places: list[Crossing]) -> dict[Crossing, list[Crossing]]:
 
 
 def tour(places: list[Crossing]) -> list[Crossing]:
-    """A round that goes along every street once in each direction, straight on where it can (Hierholzer 1873)."""
+    """An Eulerian tour along every street once in each direction, straight on where possible (Hierholzer 1873)."""
     onward = neighbours(places)
     way, done = [places[0]], []
     while way:
@@ -66,7 +66,7 @@ def straightness(before: Crossing, here: Crossing, there: Crossing) -> int:
 
 
 def track(places: list[Crossing]) -> Float[np.ndarray, "point 2"]:
-    """The drive as a closed line: along the lanes, in a curve over each crossing."""
+    """The drive as a closed line: along the lanes, with curves over the crossings."""
     round_trip = tour(places)
     corners = PITCH * np.array(round_trip, float)
     way = np.diff(corners, axis=0) / PITCH
@@ -88,7 +88,7 @@ def curve(start: np.ndarray, way: np.ndarray, stop: np.ndarray, onward: np.ndarr
 
 
 def stops(places: list[Crossing], count: int) -> tuple[Float[np.ndarray, "stop 2"], Float[np.ndarray, " stop"], float]:
-    """Evenly spaced stops of a drive; its heading there, radians; its length."""
+    """Evenly spaced positions of a drive; headings, radians; its length."""
     line = track(places)
     gone = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
 

@@ -39,7 +39,7 @@ LEAVES = tuple(
 
 
 def standing(places: list[Crossing], seed: int) -> World:
-    """All that stands still, without light. places: the crossings"""
+    """All static objects, without light. places: the crossings"""
     random = np.random.default_rng([seed, 0xC17])
     columns, rows = (max(place[axis] for place in places) + 1 for axis in range(2))
     objects = [*ground(columns, rows), *markings(places)]
@@ -63,14 +63,14 @@ def ground(columns: int, rows: int) -> Iterator[Object]:
 
 
 def between(here: Crossing, there: Crossing) -> tuple[Pose, float]:
-    """The middle of a street, x along it; and half its length between the crossings."""
+    """Pose of a street's centre, x along it; and half its length between the crossings."""
     (a, b), (c, d) = here, there
     turn = math.degrees(math.atan2(d - b, c - a))
     return Pose.at(0.5 * PITCH * (a + c), 0.5 * PITCH * (b + d), 0, turn=turn), 0.5 * PITCH - ROAD
 
 
 def markings(places: list[Crossing]) -> Iterator[Object]:
-    """Dashes along the middle, and where people cross."""
+    """Road markings: dashes along the middle, and pedestrian crossings."""
     upright = Pose.about((0, 1, 0), 90)  # stripes go across z: turned along the street
     aside = Pose.about((1, 0, 0), 90)
     for here, there in streets(places):
@@ -82,7 +82,7 @@ def markings(places: list[Crossing]) -> Iterator[Object]:
 
 
 def quarter(i: int, j: int, columns: int, rows: int, random: np.random.Generator) -> Iterator[Object]:
-    """The houses between four crossings, of which (i, j) is the lowest, in two rows back to back, on their pavement."""
+    """Houses between four crossings, of which (i, j) is the lowest, in two rows back to back, on their pavement."""
     half = 0.5 * PITCH - ROAD
     middle = Pose.at((i + 0.5) * PITCH, (j + 0.5) * PITCH, 0)
     yield Object(Cuboid((half, half, KERB), 0.02), FLAGS, middle, "pavement")
@@ -137,7 +137,7 @@ def lamp(place: Pose) -> Iterator[Object]:
 
 
 def car(place: Pose, random: np.random.Generator, name: str) -> Iterator[Object]:
-    """Any car, its wheels on the ground, driving towards +x of its place."""
+    """A random car, its wheels on the ground, facing +x of its place."""
     parts = [part.scaled(CAR) for part in cars.objects(random, astray=0.0)]
     lowest = min(float(part.bounds()[0][2]) for part in parts)
     turned = place @ Pose.at(0, 0, -lowest, turn=180)
