@@ -30,7 +30,7 @@ TEACHABLE = [
 def term(rendered: float, opacity: float = 1.0, weight: float = 1.0, **layers_: float) -> torch.Tensor:
     """Loss of one ray of that rendered depth. layers_: of the photograph, a depth of 2 if not given"""
     layers = {name: torch.tensor([value]) for name, value in ({"depth": 2.0} | layers_).items()}
-    config = replace(Config(), measured=DepthNumbers(weight, 0.01))
+    config = replace(Config(), measured=DepthNumbers(weight))
     return depth_terms(config, layers, torch.tensor([rendered]), torch.tensor([opacity])).get(
         "measured", torch.tensor(0.0)
     )

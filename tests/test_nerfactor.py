@@ -187,7 +187,8 @@ def test_lights_that_cannot_be(tmp_path):
 def test_networks_of_the_paper_learn(monkeypatch):
     """Every term of the paper's variant, and gradients of all that learns."""
     monkeypatch.setattr("lumigraph.methods.nerfactor.PRIOR_STEPS", 2)
-    method = relightable(properties="network", visibility="network", reflectance="learnt", property_width=16)
+    monkeypatch.setattr("lumigraph.methods.nerfactor.PROPERTY_WIDTH", 16)
+    method = relightable(properties="network", visibility="network", reflectance="learnt")
     method._choose_learning()
     method.train().before_step(0, 1.0)
     method.began.fill_(0.0)

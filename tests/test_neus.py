@@ -21,7 +21,7 @@ from lumigraph.volume import weights_of
 pytestmark = budget("methods", 8)
 
 UNIT = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-PAPER = replace(Config(), network=DistanceNumbers(depth=3, skip_layer=2, position_frequencies=3), hidden_width=48)
+PAPER = replace(Config(), network=DistanceNumbers(depth=3, position_frequencies=3), hidden_width=48)
 SHARPNESS, WALL = 64.0, 1.0  # s per scene unit; distance along the ray at which a plane is met
 
 

@@ -9,6 +9,7 @@ from budgets import budget
 
 from lumigraph import methods
 from lumigraph.components.clouds.adaptive import AdaptiveDensity
+from lumigraph.components.clouds.cloud import SCALES_LR
 from lumigraph.components.clouds.interval_schedule import IntervalSchedule, short_schedule_lr_scale
 from lumigraph.files.ranges import changed
 from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain
@@ -108,7 +109,7 @@ def test_the_papers_steps_hold_for_the_papers_budget():
             raised.append(method.bands)
         if method.density_control.due(step, step / PAPER):
             due.append(step)
-    assert method.learning_rates(4000, 4000 / PAPER)["scales"] == method.config.rates.scales_lr
+    assert method.learning_rates(4000, 4000 / PAPER)["scales"] == SCALES_LR
     assert raised == [1, 2, 3, 4, 4] and due == [*range(500, 4001, 100)]
 
 

@@ -10,9 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..datasets.scene import Scene
-from ..files.ranges import NonNegative, PositiveShare
+from ..files.ranges import NonNegative
 
 DEPTH_LAYER, DEVIATION_LAYER = "depth", "depth_deviation"  # of a scene: lengths, and their standard deviations
+DEPTH_DEVIATION = 0.01  # relative deviation of a measurement, where the capture gives none
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,6 @@ class DepthNumbers:
     """A Config's numbers of depth supervision."""
 
     depth_weight: NonNegative = 0.0  # weight of measured depth in the loss; higher: better geometry, worse colours
-    depth_deviation: PositiveShare = 0.01  # relative deviation of a measurement, where the capture gives none
 
 
 def depth_layers(config: Any, scene: Scene) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ def depth_terms(
     measured = extra[DEPTH_LAYER]
     known = measured.isfinite() & (measured > 0)
     target = torch.where(known, measured, 1.0)
-    share = torch.full_like(target, numbers.depth_deviation)
+    share = torch.full_like(target, DEPTH_DEVIATION)
     if DEVIATION_LAYER in extra:
         stated = extra[DEVIATION_LAYER] / target
         share = torch.where(stated.isfinite() & (stated > 0), stated, share)

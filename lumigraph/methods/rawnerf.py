@@ -36,6 +36,7 @@ from ..volume import composite
 
 VARIANCE_WEIGHT = 1e-3  # weight of the variance of weights, supplement
 EXPOSURE_SCALES = True  # an option of older runs: a factor per colour of each exposure is learnt, section 4.2
+FINAL_LEARNING_RATE = 1e-3  # learning rate at the end of the budget, reached exponentially
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,6 @@ class Config:
     huber_delta: NonNegative = 0.0  # relative error at which the loss turns from squared to linear; 0: always squared
     hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
     learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher learns faster, and may diverge
-    final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
     hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -238,7 +238,7 @@ class RawNeRF(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
-        return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, DECAY_START)
+        return hold_and_decay(c.learning_rate, FINAL_LEARNING_RATE, step, progress, DECAY_START)
 
     # Being seen
 

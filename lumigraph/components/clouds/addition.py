@@ -22,7 +22,7 @@ from .dense_points import Points
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """TrainingViews that a cloud is learnt from.
+    """Views that a cloud is learnt from.
 
     cameras:    of all photographs, as they were given; None before training
     refined:    gives cameras their learnt poses

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from abc import ABC
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +18,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...datasets.scene import Frame, Photograph, Scene
+from ...files.ranges import CloudSize, Share, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
@@ -25,11 +26,12 @@ from ...method.capabilities import ColourPairs
 from ...method.depth import depth_layers, depth_terms
 from ..fields.teacher import teacher_of
 from ..training.pose_refinement import PoseRefinement
+from .adaptive import AdaptiveNumbers
 from .addition import Addition, Step, TrainingViews
-from .appearance import SplatAppearance
-from .cloud import Cloud, picture_share, thinned
+from .appearance import AppearanceNumbers, SplatAppearance
+from .cloud import Cloud, HasteNumbers, picture_share, thinned
 from .dense_points import Points, compile_sweep, seen_points
-from .density_control import BYTES_PER_GAUSSIAN, DensityControl
+from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
 from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
 from .interval_schedule import intervals
 from .moved_cloud import seen_from
@@ -47,18 +49,32 @@ PLACEHOLDER_COUNT = 1000  # random Gaussians before training at most
 MAX_TEACHER_SHARE = 0.5  # of the cap, with which a cloud begins on the surfaces of a teacher
 
 
+@dataclass(frozen=True)
+class CloudNumbers:
+    """Options of a cloud, those of 3D Gaussian Splatting."""
+
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
+    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
+    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
+    rates: HasteNumbers = HasteNumbers()
+    refine: RefineNumbers = RefineNumbers()
+    adaptive: AdaptiveNumbers = AdaptiveNumbers()
+    photographs: AppearanceNumbers = AppearanceNumbers()
+
+
 class CloudMethod(Method, ABC):
     """A cloud of Gaussians trained on one photograph a step; `density_control` changes their number.
 
     Assign a DensityControl as `density_control`, a PoseRefinement or None as `poses`, and further `Addition`s. The
-    Config has `sh_degree`, `ssim_weight`, `initialization`, `initial_gaussians`, `half_resolution_until` and `seed`,
-    and the parts' `rates`, `refine` and `photographs`.
+    Config has `cloud: CloudNumbers`, `initialization` and `seed`.
     cameras:  of the training photographs; None before training
     bands:    of the harmonics in use
     current:  the step between `loss` and `after_step`
     drawn:    number of training photographs sampled so far
     """
 
+    ssim_weight: float = SSIM_WEIGHT
+    numbers: CloudNumbers
     density_control: DensityControl
     poses: PoseRefinement | None
     drawn: Tensor
@@ -66,12 +82,13 @@ class CloudMethod(Method, ABC):
     def __init__(self, frame: Frame, config: Any):
         c = config
         super().__init__(frame, c)
-        count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians or PLACEHOLDER_COUNT)
-        self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), most_haste=c.rates.most_haste)
-        self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
+        n = self.numbers = c.cloud
+        count = min(PLACEHOLDER_COUNT, n.refine.max_gaussians or PLACEHOLDER_COUNT)
+        self.cloud = Cloud(random_cloud(frame, count, n.sh_degree, self.random(0)), most_haste=n.rates.most_haste)
+        self.appearance = SplatAppearance(frame, n.photographs) if n.photographs.appearance != "no" else None
         self.register_buffer("drawn", torch.tensor(0))
         self.cameras: Camera | None = None
-        self.bands = c.sh_degree + 1
+        self.bands = n.sh_degree + 1
         self.current: Step | None = None
 
     @property
@@ -103,13 +120,13 @@ class CloudMethod(Method, ABC):
     def first_cloud(self, data: Scene, sweep: Callable[[], Points]) -> Gaussians:
         """Initial cloud from the photographs. sweep: returns points of plane sweeps"""
         c, cap = self.config, self.density_control.max_count(self.cloud)
-        counts = min(c.initial_gaussians, cap), cap
-        return initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), sweep)
+        counts = min(c.cloud.initial_gaussians, cap), cap
+        return initial_cloud(data, c.initialization, *counts, c.cloud.sh_degree, self.random(1), sweep)
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Initialise with Gaussians on the teacher's surfaces; a cloud is copied."""
-        degree, cap = self.config.sh_degree, self.density_control.max_count(self.cloud)
+        degree, cap = self.numbers.sh_degree, self.density_control.max_count(self.cloud)
         found = cloud_of(teacher, cap, degree)
         if found is None:
             count = max(2, math.ceil(MAX_TEACHER_SHARE * cap))
@@ -129,11 +146,10 @@ class CloudMethod(Method, ABC):
     def before_step(self, step: int, progress: float) -> None:
         """Add bands of harmonics one by one (section 7.1), but not while they would compensate wrong poses or depth."""
         super().before_step(step, progress)
-        c = self.config
         joined = intervals(step, progress, SH_DEGREE_INTERVAL, SH_DEGREE_INTERVAL_SHARE)
         coarse = self.moves_cameras and progress < COARSE_UNTIL
         plain = coarse or any(part.base_colours for part in self.additions)
-        self.bands = 1 if plain else 1 + min(int(joined), c.sh_degree)
+        self.bands = 1 if plain else 1 + min(int(joined), self.numbers.sh_degree)
 
     def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
         """The next photograph, in random order without repetition within an epoch."""
@@ -159,7 +175,7 @@ class CloudMethod(Method, ABC):
 
     def reduction(self, height: int, width: int) -> int:
         """Current downscaling factor of photographs of a size, in pixels."""
-        half = self.config.half_resolution_until or COARSE_UNTIL * self.moves_cameras
+        half = self.numbers.half_resolution_until or COARSE_UNTIL * self.moves_cameras
         times = 4 if self.progress < half / 4 else 2 if self.progress < half else 1
         while times > 1 and height * width < self.least_pixels * times**2:
             times //= 2
@@ -180,7 +196,7 @@ class CloudMethod(Method, ABC):
             photograph, self.random(~number), cloud, cloud, photograph.camera, self.cloud, self.prune, self.views,
             number, self.random(number), self.progress, int(self.drawn), self.bands, moment,
             differ=self.appearance is not None and self.appearance.is_active,
-            full_size=self.progress >= self.config.half_resolution_until)  # fmt: skip
+            full_size=self.progress >= self.numbers.half_resolution_until)  # fmt: skip
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         """The absolute error and D-SSIM of a picture (eq. 7), and the terms of additions."""
@@ -207,7 +223,7 @@ class CloudMethod(Method, ABC):
         for part in self.additions:
             part.mask(now)
         ssim, l1 = kernels.photometric(now.rgb, now.target)
-        now.terms |= {"l1": (1 - c.ssim_weight) * l1, "ssim": c.ssim_weight * (1 - ssim)}
+        now.terms |= {"l1": (1 - self.ssim_weight) * l1, "ssim": self.ssim_weight * (1 - ssim)}
         if batch.extra:
             now.terms |= depth_terms(c, batch.extra, now.picture.along_rays(now.camera), now.picture.opacity)
         for part in self.additions:

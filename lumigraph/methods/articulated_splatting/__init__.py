@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Int
@@ -12,21 +12,16 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.adaptive import AdaptiveDensity
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
-from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.cloud_method import BLACK, CloudMethod, CloudNumbers
 from ...components.clouds.initialization import Initialization, round_gaussians
 from ...components.clouds.tidying import Tidying, TidyingNumbers
 from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers
 from ...datasets.scene import Frame, Photograph, Scene
-from ...files.ranges import CloudSize, PositiveShare, Seed, Share, between, changed
+from ...files.ranges import PositiveShare, Seed, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
@@ -35,7 +30,7 @@ from ...method.controls import Control
 from .contact import PICTURE, bodies_of, contact_control, contact_map
 from .skinned_cloud import SkinnedCloud
 
-TIDYING = TidyingNumbers(limit_anisotropy=True)
+PRUNE_NEAR, LIMIT_SCALE, LIMIT_ANISOTROPY, OBSERVED_HARMONICS = False, False, True, False  # rules of tidying
 MAX_RATIO = 4.0  # of the longest to the shortest deviation, above which the isotropy term acts
 ISOTROPY_WEIGHT = 0.01  # weight of long Gaussians, which tear at joints
 INITIALIZATION: Initialization = "random"  # an option of older runs; first Gaussians are about the bones
@@ -45,18 +40,11 @@ INITIALIZATION: Initialization = "random"  # an option of older runs; first Gaus
 class Config:
     """Kerbl's (2023) numbers of the cloud, as in MANUS; those of bones and weights are ours, not the paper's."""
 
-    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
-    ssim_weight: ClassVar[float] = SSIM_WEIGHT
+    cloud: CloudNumbers = CloudNumbers(initial_gaussians=10_000, photographs=AppearanceNumbers(appearance="no"))
     initialization: ClassVar[Initialization] = INITIALIZATION
-    initial_gaussians: CloudSize = 10_000  # random Gaussians about the bones at first
-    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     contact_distance: PositiveShare = 0.02  # gap in scene units up to which two bodies touch in a map of contact
     bones: BoneNumbers = BoneNumbers(pose_correction="table", pose_lr=1e-2, pose_from=0.1)
     weights: WeightNumbers = WeightNumbers(weight_code=0, weights_lr=1e-2)
-    rates: HasteNumbers = HasteNumbers()
-    refine: RefineNumbers = RefineNumbers()
-    adaptive: AdaptiveNumbers = AdaptiveNumbers()
-    photographs: AppearanceNumbers = AppearanceNumbers(appearance="no")
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
@@ -69,11 +57,11 @@ class ArticulatedSplatting(Articulated, CloudMethod):
         c = config or Config()
         super().__init__(frame, c)
         self.poses = None
-        self.density_control = AdaptiveDensity(c.refine, c.adaptive, len(self.cloud))
+        self.density_control = AdaptiveDensity(c.cloud.refine, c.cloud.adaptive, len(self.cloud))
         with seeded(c.seed):
             self.skin = SkinnedCloud(frame, c.bones, c.weights)
         self.bones = self.skin.bones
-        self.tidying = Tidying(TIDYING)
+        self.tidying = Tidying(TidyingNumbers(PRUNE_NEAR, LIMIT_SCALE, LIMIT_ANISOTROPY, OBSERVED_HARMONICS))
 
     @classmethod
     def cpu_preset(cls) -> Any:
@@ -91,8 +79,8 @@ class ArticulatedSplatting(Articulated, CloudMethod):
     def first_cloud(self, data: Scene, sweep: Any) -> Gaussians:
         """Round Gaussians about the bones at rest, in random colours."""
         generator, cap = self.random(1), self.density_control.max_count(self.cloud)
-        means = self.skin.first_means(min(self.config.initial_gaussians, cap), generator)
-        return round_gaussians(means, torch.rand(len(means), 3, generator=generator), self.config.sh_degree)
+        means = self.skin.first_means(min(self.numbers.initial_gaussians, cap), generator)
+        return round_gaussians(means, torch.rand(len(means), 3, generator=generator), self.numbers.sh_degree)
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         """The cloud's terms, and the isotropy of its Gaussians: the mean excess of their ratios of deviations."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,18 +13,13 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.adaptive import AdaptiveDensity
 from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, CloudMethod
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
-from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.cloud_method import BLACK, CloudMethod, CloudNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...datasets.scene import Frame, Scene
-from ...files.ranges import CloudSize, Seed, Share, between, changed
+from ...files.ranges import Seed, Share, changed
 from ...gaussians import Gaussians
 from ...gaussians.moving import MovingGaussians, fitted
 from ...gaussians.splatting import render
@@ -42,16 +37,10 @@ MIN_FOLLOWED_OPACITY = 0.1  # of these Gaussians
 class Config:
     """The numbers of the authors' release, with Kerbl's (2023) of the cloud."""
 
-    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
+    cloud: CloudNumbers = CloudNumbers(initial_gaussians=2000, photographs=AppearanceNumbers(appearance="no"))
     ssim_weight: Share = 0.0  # share of D-SSIM in the loss; higher gives structure more weight
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
-    initial_gaussians: CloudSize = 2000  # random Gaussians, where there are no points
-    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     motion: MotionNumbers = MotionNumbers()
-    rates: HasteNumbers = HasteNumbers()
-    refine: RefineNumbers = RefineNumbers()
-    adaptive: AdaptiveNumbers = AdaptiveNumbers()
-    photographs: AppearanceNumbers = AppearanceNumbers(appearance="no")
     tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -65,8 +54,8 @@ class DeformableSplatting(CloudMethod):
         c = config or Config()
         super().__init__(frame, c)
         count = len(self.cloud)
-        self.poses = None
-        self.density_control = AdaptiveDensity(c.refine, c.adaptive, count)
+        self.poses, self.ssim_weight = None, c.ssim_weight
+        self.density_control = AdaptiveDensity(c.cloud.refine, c.cloud.adaptive, count)
         with seeded(c.seed):
             self.motion = PlaneMotion(frame, c.motion, count)  # it follows what density control does to the cloud
         self.tidying = Tidying(c.tidying)

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, Literal
 
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
-from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import HasteNumbers
-from ...components.clouds.cloud_method import BLACK, SSIM_WEIGHT, CloudMethod
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD as TRANSMITTANCE_THRESHOLD
-from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.adaptive import AdaptiveDensity
+from ...components.clouds.cloud_method import BLACK, CloudMethod, CloudNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.instances import edit_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame
 from ...errors import LumigraphError
-from ...files.ranges import CloudSize, Seed, Share, between, changed
+from ...files.ranges import Seed, changed
 from ...gaussians.splatting import render
 from ...method.depth import DepthNumbers
 from .few_views import FewViewNumbers, FewViews
@@ -41,20 +35,13 @@ CPU_GROUPS = InstanceNumbers(
 class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
-    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
-    ssim_weight: ClassVar[float] = SSIM_WEIGHT
+    cloud: CloudNumbers = CloudNumbers()
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
-    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
-    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
-    rates: HasteNumbers = HasteNumbers()
-    refine: RefineNumbers = RefineNumbers()
-    adaptive: AdaptiveNumbers = AdaptiveNumbers()
     mcmc: McmcNumbers = McmcNumbers()
     filters: MipNumbers = MipNumbers()
     poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
     measured: DepthNumbers = DepthNumbers()
-    photographs: AppearanceNumbers = AppearanceNumbers()
     distractors: RobustNumbers = RobustNumbers()
     sparse: FewViewNumbers = FewViewNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
@@ -63,7 +50,7 @@ class Config:
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.strategy == "mcmc" and not self.refine.max_gaussians:
+        if self.strategy == "mcmc" and not self.cloud.refine.max_gaussians:
             raise LumigraphError("With --strategy mcmc a cloud grows up to its cap; give one with --max-gaussians")
 
 
@@ -78,7 +65,9 @@ class GaussianSplatting(CloudMethod):
         self.cloud.antialiased, count = c.filters.antialiased, len(self.cloud)
         self.few_views = FewViews(c.sparse) if c.sparse.few_views != "no" else None
         self.density_control = (
-            MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
+            MarkovChain(c.cloud.refine, c.mcmc)
+            if c.strategy == "mcmc"
+            else AdaptiveDensity(c.cloud.refine, c.cloud.adaptive, count)
         )
         self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
         self.tidying = Tidying(c.tidying)

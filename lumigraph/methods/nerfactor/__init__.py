@@ -65,6 +65,7 @@ VISIBILITY_SMOOTHNESS = 0.01  # weight of smooth visibility
 ALBEDO_SMOOTHNESS = 0.01  # weight of smooth albedo; higher leaves more to shading
 CODE_SMOOTHNESS = 0.01  # weight of smooth reflectance
 LIGHT_VARIATION = 5e-6  # weight of the squared differences of neighbouring pixels of the light
+PROPERTY_WIDTH = 128  # width of a property's network, section 3
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,6 @@ class Config:
     geometry_share: Share = 0.5  # share of the budget in which geometry learns, before all else
     shape_share: Share = 0.2  # share of the rest in which normals and visibility alone learn, with networks
     hidden_width: Width = 64  # neurons of a hidden layer behind hash tables; wider costs time
-    property_width: Width = 128  # width of a property's network, section 3
     light_rows: Annotated[int, between(4, 64)] = 16  # rows of the light's map, section 3.4; twice as many columns
     grid_resolution: Annotated[int, between(8, 512)] = 256  # cells along the box that hold the geometry
     surface_rays: BatchSize = 1024  # rays of a step once geometry is learnt; more reduce noise, and cost time
@@ -152,8 +152,8 @@ class NeRFactor(FieldMethod):
             if c.properties == "hash":
                 self.properties = HashProperties(c.table, c.hidden_width, code, space, frame.reach)
             else:
-                self.properties = NetworkProperties(POSITION_FREQUENCIES, PROPERTY_LAYERS, c.property_width, code)
-            sizes = PROPERTY_LAYERS, c.property_width
+                self.properties = NetworkProperties(POSITION_FREQUENCIES, PROPERTY_LAYERS, PROPERTY_WIDTH, code)
+            sizes = PROPERTY_LAYERS, PROPERTY_WIDTH
             frequencies = POSITION_FREQUENCIES, DIRECTION_FREQUENCIES
             self.lights_seen = VisibilityNetwork(*frequencies, *sizes) if c.visibility == "network" else None
             learnt = c.reflectance == "learnt"
@@ -187,7 +187,7 @@ class NeRFactor(FieldMethod):
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         pairs = 2 * config.light_rows**2 * config.surface_rays * 4
-        kept = 4 + 2 * PROPERTY_LAYERS * config.property_width * (config.visibility == "network")
+        kept = 4 + 2 * PROPERTY_LAYERS * PROPERTY_WIDTH * (config.visibility == "network")
         return sampling_bytes(frame, config, learning) + pairs * kept * learning
 
     def _choose_learning(self) -> None:

@@ -25,7 +25,7 @@ from ...files.ranges import LearningRate, NonNegative, RaySamples, Seed, Share, 
 from ...method import FieldMethod, seeded
 from ...method.depth import DepthNumbers, depth_terms
 from ...volume import composite
-from .fields import DistanceNumbers, HashDistance, NetworkDistance, NeuSField
+from .fields import COLOUR_DEPTH, DistanceNumbers, HashDistance, NetworkDistance, NeuSField
 from .sampler import NETWORK_CHUNK, TABLE_CHUNK, SectionSampler
 
 HULL_CELLS = 64  # per axis, of the visual hull that the first sphere is found from
@@ -132,7 +132,7 @@ class NeuS(FieldMethod):
         if config.field == "hash":
             return config.table.activation_bytes(TAPS * config.samples_per_step, config.hidden_width)
         n = config.network
-        return 8 * config.rays.samples_per_step * config.hidden_width * (n.depth + n.colour_depth)
+        return 8 * config.rays.samples_per_step * config.hidden_width * (n.depth + COLOUR_DEPTH)
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Signed distance to the nearest surface in scene units, negative inside."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from ... import kernels
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import HashField, HashNumbers, Joining
 from ...components.sampling.spaces import Box
-from ...files.ranges import Depth, Layers, Octaves, between
+from ...files.ranges import Depth, Octaves
 from ...geometry import Vector
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
@@ -27,6 +27,9 @@ SOFTPLUS_BETA = 100.0  # of the distance network's activations, section E.1
 MAX_SHARPNESS = 1.3  # s times the finest cell of a hash table: a steeper surface falls between its places
 EXTENT = 1.1  # half-size of the cube that the hash table covers: taps beyond the box of interest stay inside
 TETRAHEDRON = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))  # corners, times sqrt(3)
+SKIP_LAYER = 4  # layer whose activation the input is concatenated to again
+COLOUR_DEPTH = 4  # hidden layers of the colour network
+DIRECTION_FREQUENCIES = 4  # octaves of directions for colour
 
 
 @dataclass(frozen=True)
@@ -34,10 +37,7 @@ class DistanceNumbers:
     """A Config's numbers of the distance and colour networks; the paper's (Wang 2021, section E.1)."""
 
     depth: Depth = 8  # hidden layers of the distance network; more hold more detail, and cost time
-    skip_layer: Layers = 4  # layer whose activation the input is concatenated to again
-    colour_depth: Layers = 4  # hidden layers of the colour network
     position_frequencies: Octaves = 6  # octaves of positions for the distance; more give finer detail, and noise
-    direction_frequencies: Annotated[int, between(0, 10)] = 4  # octaves of directions for colour
 
 
 class Surface(NamedTuple):
@@ -103,8 +103,8 @@ class NetworkDistance(DistanceField):
         super().__init__()
         n = numbers
         self.encode_position = FrequencyEncoding(3, n.position_frequencies, base=1.0)
-        self.encode_direction = FrequencyEncoding(3, n.direction_frequencies, base=1.0)
-        inputs, self.skip = self.encode_position.width, min(n.skip_layer, n.depth - 1)
+        self.encode_direction = FrequencyEncoding(3, DIRECTION_FREQUENCIES, base=1.0)
+        inputs, self.skip = self.encode_position.width, min(SKIP_LAYER, n.depth - 1)
         narrow = max(width - inputs, 1)  # the layer before the skip: with the input again it has the usual width
         self.activation = nn.Softplus(SOFTPLUS_BETA)
         layers = []
@@ -117,7 +117,7 @@ class NetworkDistance(DistanceField):
         nn.init.normal_(last.weight, math.sqrt(math.pi / width), 1e-4)
         nn.init.zeros_(last.bias)
         self.last = weight_norm(last)
-        widths = [3 + 3 + self.encode_direction.width + width, *[width] * n.colour_depth, 3]
+        widths = [3 + 3 + self.encode_direction.width + width, *[width] * COLOUR_DEPTH, 3]
         colour = [weight_norm(nn.Linear(a, b)) for a, b in zip(widths[:-1], widths[1:], strict=True)]
         self.colour = nn.Sequential(*[x for layer in colour for x in (layer, nn.ReLU())][:-1])
 

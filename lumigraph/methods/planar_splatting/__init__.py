@@ -7,26 +7,22 @@ Each Gaussian is flattened into a disc, whose plane gives unbiased depth and a n
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.clouds.adaptive import AdaptiveDensity, AdaptiveNumbers
+from ...components.clouds.adaptive import AdaptiveDensity
 from ...components.clouds.addition import Addition, Step, TrainingViews
-from ...components.clouds.appearance import AppearanceNumbers
-from ...components.clouds.cloud import Cloud, HasteNumbers
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL as SH_DEGREE_INTERVAL  # options of older runs
-from ...components.clouds.cloud_method import SH_DEGREE_INTERVAL_SHARE as SH_DEGREE_INTERVAL_SHARE
-from ...components.clouds.cloud_method import SSIM_WEIGHT, TRANSMITTANCE_THRESHOLD, CloudMethod
-from ...components.clouds.density_control import RefineNumbers
+from ...components.clouds.cloud import Cloud
+from ...components.clouds.cloud_method import TRANSMITTANCE_THRESHOLD, CloudMethod, CloudNumbers
 from ...components.clouds.initialization import Initialization
 from ...components.clouds.tidying import ALL_RULES, Tidying, TidyingNumbers
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...files.ranges import BatchSize, CloudSize, NonNegative, Seed, Share, between, changed
+from ...files.ranges import BatchSize, NonNegative, Seed, Share, between, changed
 from ...gaussians.splatting import splat, view_of
 from ...geometry import unit
 from ...method.depth import DepthNumbers
@@ -64,18 +60,11 @@ class PlaneNumbers:
 class Config:
     """The paper's numbers, those of 3D Gaussian Splatting where it gives none."""
 
-    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics; 0: no view dependence
-    ssim_weight: ClassVar[float] = SSIM_WEIGHT
+    cloud: CloudNumbers = CloudNumbers()
     initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
-    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points
-    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
     planes: PlaneNumbers = PlaneNumbers()
-    rates: HasteNumbers = HasteNumbers()
-    refine: RefineNumbers = RefineNumbers()
-    adaptive: AdaptiveNumbers = AdaptiveNumbers()
     poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
     measured: DepthNumbers = DepthNumbers()
-    photographs: AppearanceNumbers = AppearanceNumbers()
     tidying: TidyingNumbers = TidyingNumbers()
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
@@ -137,7 +126,7 @@ class PlanarSplatting(CloudMethod):
         c = config or Config()
         super().__init__(frame, c)
         self.planes = Planes(c.planes)
-        self.density_control = AdaptiveDensity(c.refine, c.adaptive, len(self.cloud))
+        self.density_control = AdaptiveDensity(c.cloud.refine, c.cloud.adaptive, len(self.cloud))
         self.tidying = Tidying(c.tidying)
         self.poses = poses_for(frame, c.poses)
 

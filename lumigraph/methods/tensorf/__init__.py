@@ -40,6 +40,9 @@ Components = Annotated[int, between(1, 1024)]  # of each factor
 TV_DENSITY_WEIGHT = 0.02  # weight of density's total variation, in the open
 TV_APPEARANCE_WEIGHT = 0.02  # weight of appearance's total variation, in the open
 DENSITY_SCALE = 25.0  # factor behind the softplus, the code's; higher learns density faster
+APPEARANCE_FEATURES = 27  # P, outputs of the basis matrix B, section 5
+DIRECTION_FREQUENCIES = 2  # octaves of the directions' encoding, the code's
+SH_BANDS = 3  # spherical-harmonics bands, with --shading sh; more cost time
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,9 @@ class Config:
     initial_resolution: Resolution = 128  # nodes per axis at first, section 5; more cost time early
     final_resolution: Resolution = 300  # nodes per axis in the end, section 5; more give detail, cost memory
     open_final_resolution: Resolution = 640  # the same where there is no bound, the code's for forward-facing
-    appearance_features: Annotated[int, between(1, 256)] = 27  # P, outputs of the basis matrix B, section 5
     shading: Literal["mlp", "sh"] = "mlp"  # colour from features: a network, or spherical harmonics, section 4.1
-    sh_bands: Annotated[int, between(1, 4)] = 3  # spherical-harmonics bands, with --shading sh; more cost time
     hidden_width: Width = 128  # channels of the network's two hidden layers, section 5; wider costs time
     feature_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the features' encoding, the code's
-    direction_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the directions' encoding, the code's
     density_shift: Annotated[float, between(-30, 30)] = -7.0  # shift ahead of the softplus; higher begins denser
     step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # sample distance over node distance; larger is faster
     rays_per_step: BatchSize = 4096  # rays in a step at most, section 5; more reduce noise, and cost time
@@ -114,10 +114,10 @@ class TensorField(Field):
         self.density_grid = FactorGrid(c.factors, nodes, c.density_components)
         self.appearance_grid = FactorGrid(c.factors, nodes, c.appearance_components)
         products = Factors(c.factors, nodes).products * c.appearance_components
-        features = c.appearance_features if c.shading == "mlp" else 3 * c.sh_bands**2
+        features = APPEARANCE_FEATURES if c.shading == "mlp" else 3 * SH_BANDS**2
         self.basis = nn.Linear(products, features, bias=False)  # B of eq. 6
         if c.shading == "mlp":
-            inputs = features * (1 + 2 * c.feature_frequencies) + 3 * (1 + 2 * c.direction_frequencies)
+            inputs = features * (1 + 2 * c.feature_frequencies) + 3 * (1 + 2 * DIRECTION_FREQUENCIES)
             self.network = MLP(inputs + 1, c.hidden_width, c.hidden_width, 3)
         self.register_buffer("box", torch.tensor(whole))
         self.register_buffer("stage", torch.tensor(0))
@@ -154,9 +154,9 @@ class TensorField(Field):
         """S: features become a colour seen along directions."""
         c = self.config
         if c.shading == "sh":
-            harmonics = spherical_harmonics(directions, c.sh_bands)
+            harmonics = spherical_harmonics(directions, SH_BANDS)
             return torch.sigmoid((features.view(len(features), 3, -1) * harmonics[:, None]).sum(-1))
-        encoded = octaves(features.t(), c.feature_frequencies), octaves(directions.t(), c.direction_frequencies)
+        encoded = octaves(features.t(), c.feature_frequencies), octaves(directions.t(), DIRECTION_FREQUENCIES)
         constant = torch.ones_like(features.t()[:1])  # in place of biases
         return torch.sigmoid(self.network(torch.cat([*encoded, constant]).t()))
 
@@ -211,8 +211,8 @@ class TensoRF(FieldMethod):
         """Few components and nodes, all upsamplings, a grid of three sizes, within some twenty quick steps."""
         return changed(
             Config(), samples_per_step=4096, occupancy_resolution=16, initial_resolution=8, final_resolution=16,
-            open_final_resolution=16, density_components=4, appearance_components=6, appearance_features=8,
-            hidden_width=16, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0,
+            open_final_resolution=16, density_components=4, appearance_components=6,
+            hidden_width=16, feature_frequencies=1, density_shift=-3.0, step_ratio=1.0,
             rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)  # fmt: skip
 
     @classmethod
