@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..components.fields.development import decoded, encoded
+from ..components.training.development import decoded, encoded
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
 from ..errors import LumigraphError

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..components.fields.development import decoded
+from ..components.training.development import decoded
 from ..errors import LumigraphError
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json

@@ -11,6 +11,7 @@ from ..errors import LumigraphError
 
 Value = float | str
 
+AVERAGE = "average"  # the choice of the mean of all learnt codes
 NAMED = 8  # choices in a sentence at most
 
 

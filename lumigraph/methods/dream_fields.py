@@ -12,6 +12,7 @@ from torch import Tensor
 from ..budget import Effort, Efforts
 from ..camera.rays import Rays
 from ..components.fields.hash_field import HashField, HashNumbers
+from ..components.fields.spaces import space_of
 from ..components.guidance import (
     CPU_GUIDANCE,
     TINY_GUIDANCE,
@@ -22,7 +23,6 @@ from ..components.guidance import (
 )
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ..components.sampling.spaces import space_of
 from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Frame
 from ..datasets.words import Words

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.hash_field import HashField, HashNumbers
+from ..components.fields.spaces import Box, space_of
 from ..components.fields.teacher import distil, teacher_of
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ..components.sampling.spaces import Box, space_of
 from ..components.training.photometric import Exposure, Setting, backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import hold_and_decay

@@ -16,8 +16,8 @@ from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted
 from ...method import Part
 from ...method.controls import Configured
+from ..training.dense_points import Points
 from .cloud import Cloud
-from .dense_points import Points
 
 
 @dataclass(frozen=True)

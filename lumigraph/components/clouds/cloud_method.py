@@ -25,12 +25,12 @@ from ...method import Method
 from ...method.capabilities import ColourPairs
 from ...method.depth import depth_layers, depth_terms
 from ..fields.teacher import teacher_of
+from ..training.dense_points import Points, compile_sweep, seen_points
 from ..training.pose_refinement import PoseRefinement
 from .adaptive import AdaptiveNumbers
 from .addition import Addition, Step, TrainingViews
 from .appearance import AppearanceNumbers, SplatAppearance
 from .cloud import Cloud, HasteNumbers, picture_share, thinned
-from .dense_points import Points, compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
 from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
 from .interval_schedule import intervals

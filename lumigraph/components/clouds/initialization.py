@@ -18,7 +18,7 @@ from ...kernels.spherical_harmonics import K00
 from ...method.capabilities import HasGaussians, can
 from ..fields.teacher import Teacher
 from ..sampling.occupancy import visual_hull
-from .dense_points import Points, seen_points, thinned
+from ..training.dense_points import Points, seen_points, thinned
 
 Initialization = Literal["dense", "sparse", "random"]
 

@@ -23,8 +23,8 @@ from ...kernels import spherical_harmonics
 from ...method.capabilities import HasDensity, HasField, can
 from ...method.field import Colours, Densities, Directions, Points
 from ...system.progress import track
-from ..sampling.spaces import Space
 from ..training.schedules import hold_and_decay
+from .spaces import Space
 
 AT_ONCE = 1 << 17  # points
 VIEWS, SIZE = 24, 128  # depth maps of a teacher at most, and pixels of their longer side

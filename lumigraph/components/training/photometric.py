@@ -18,9 +18,8 @@ from ...depth_maps.flat_view import FlatView, flat_view
 from ...errors import LumigraphWarning
 from ...geometry import evenly
 from ...method import Part
-from ...method.controls import Control, Value
-from ..fields.appearance import AVERAGE
-from ..fields.development import decoded, encoded
+from ...method.controls import AVERAGE, Control, Value
+from .development import decoded, encoded
 
 MAX_PHOTOGRAPHS = 32  # photographs, each beside its neighbour
 MAX_SIDE = 200  # pixels along their longer side

@@ -22,8 +22,8 @@ from torch.nn.functional import softplus
 from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rays, Samples
-from ...components.fields.development import encoded
 from ...components.sampling.sampling import stratified
+from ...components.training.development import encoded
 from ...figures import Row, contact_sheet, save_picture
 from ...figures.charts import Series, line_chart, standalone
 from ...files import write_bytes, write_json

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.hash_field import HashNumbers
+from ...components.fields.spaces import Box
 from ...components.sampling.occupancy_sampler import StepNumbers
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import Box
 from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers, WeightVolume

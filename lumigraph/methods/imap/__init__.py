@@ -15,7 +15,7 @@ from ...budget import BY_PHOTOGRAPH, Efforts
 from ...camera.rays import Rays
 from ...color.blending import before
 from ...components.fields.hash_field import TINY_TABLE, HashNumbers
-from ...components.sampling.spaces import Box
+from ...components.fields.spaces import Box
 from ...components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
 from ...components.tracking.frames import DepthFrame, Moment
 from ...components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers

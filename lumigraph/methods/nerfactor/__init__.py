@@ -20,12 +20,12 @@ from torch import Tensor, nn
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...color.blending import over
-from ...components.fields.development import CONTROLS, decoded, encoded, exposed, toned
 from ...components.fields.hash_field import HashField, HashNumbers
+from ...components.fields.spaces import space_of
 from ...components.fields.teacher import distil, teacher_of
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ...components.sampling.spaces import space_of
+from ...components.training.development import CONTROLS, decoded, encoded, exposed, toned
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.schedules import falling, hold_and_decay
 from ...datasets.scene import Batch, Frame, Scene

@@ -17,15 +17,15 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, softplus
 
 from ...camera.rays import Look, Rays, Rendering
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.appearance import CodeWidth
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import CoordinateField, LatentField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.fields.instance_codes import InstanceCodes
+from ...components.fields.spaces import space_of
 from ...components.instances import ALONE, Edit, check_labels, edit_controls, edit_of, labels_of, layers_of
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import space_of
 from ...components.training.photometric import huber
 from ...components.training.schedules import held_decay
 from ...composition.composed import kept, union

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ...components.fields.coordinate_field import CoordinateField
 from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 

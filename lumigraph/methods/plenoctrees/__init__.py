@@ -14,9 +14,9 @@ from torch import Tensor
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
+from ...components.fields.spaces import Box
 from ...components.fields.teacher import density_of, logit, teacher_of
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
-from ...components.sampling.spaces import Box
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.row_optimizers import LazyRMSprop
 from ...components.training.schedules import falling, hold_and_decay

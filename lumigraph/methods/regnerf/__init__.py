@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import HashField, HashNumbers
+from ...components.fields.spaces import NDC, space_of
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
 from ...components.sampling.occupancy import MaskNumbers
 from ...components.sampling.occupancy_sampler import MIN_RESOLUTION, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ...components.sampling.spaces import NDC, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.regularizers import (

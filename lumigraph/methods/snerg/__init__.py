@@ -16,10 +16,10 @@ from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
+from ...components.fields.spaces import Box, contraction_of, space_of
 from ...components.fields.teacher import teacher_of
 from ...components.sampling.occupancy_sampler import OCCUPANCY_INTERVAL, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
-from ...components.sampling.spaces import Box, contraction_of, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.regularizers import cauchy
 from ...components.training.row_optimizers import LazyAdam, exchange
