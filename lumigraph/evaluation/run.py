@@ -1,4 +1,4 @@
-"""Evaluate a run or a collection under the protocol for its kind of dataset, and write the files of the outcome."""
+"""Evaluate a run or a collection under the protocol for its kind of dataset, and write the results."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ Keep = Callable[[str, Rendering], object]
 class Evaluated(Protocol):
     """Result of every protocol.
 
-    scores:   means over all that was compared, the headline first
-    compared: what that was, in a few words
+    scores:   means over all compared items, the headline first
+    compared: description of these items
     """
 
     @property
@@ -60,11 +60,11 @@ def evaluate_on(
     lpips: Lpips | None = None,
     right_halves: bool = False,
 ) -> Evaluated:
-    """A method on a dataset, under the protocol for its kind.
+    """Evaluate a method on a dataset, under the protocol for its kind.
 
-    keep: receives each view's name and rendering, where views are compared
-    most: so many views or shapes at most, evenly spread; None means all
-    right_halves: of photographs, compare those alone, whatever the method
+    keep: receives each view's name and rendering, for views
+    most: largest number of views or shapes, evenly spread; None means all
+    right_halves: compare only right halves of photographs, for any method
     """
     if isinstance(data, Shapes):
         return evaluate_shapes(method, data, split, most)
@@ -116,7 +116,7 @@ def evaluate_run(
 
 
 def claim_evaluation(run: Trained, split: str, save_images: bool, overwrite: bool | None = None) -> None:
-    """Raise LumigraphError unless what an evaluation writes may be written into its run; see `files.claim`."""
+    """Raise LumigraphError unless all outputs of an evaluation may be written into its run; see `files.claim`."""
     refuse_link(run.folder / "eval")
     for ending in (".json", ".png"):
         claim(run.folder / f"{stem(split)}{ending}", "evaluation", overwrite)
@@ -143,10 +143,10 @@ def evaluate_collection(
     lpips: Lpips | None = None,
     right_halves: bool = False,
 ) -> ViewsEvaluation | ShapesEvaluation:
-    """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
+    """Evaluate each member of a split on its own held-out views or as a shape, and combine the results.
 
     keep:  receives each view's name and rendering; names begin with the member's
-    views: of each member at most
+    views: largest number for each member
     """
     scenes: dict[str, ViewsEvaluation] = {}
     shapes: dict[str, ShapesEvaluation] = {}

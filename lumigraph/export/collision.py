@@ -1,4 +1,4 @@
-"""Convex pieces of a mesh, which engines collide with in place of its triangles."""
+"""Convex decomposition of a mesh for collision detection in game engines."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def convex_pieces(mesh: Mesh, concavity: float, count: int | None = None) -> lis
     """Vertices and faces of convex pieces that cover a mesh (CoACD: Wei 2022).
 
     concavity: largest distance between a piece and its part of the mesh, as a share of the mesh's size
-    count:     of pieces at most
-    Raises LumigraphError where CoACD is missing.
+    count:     largest number of pieces
+    Raises LumigraphError if CoACD is missing.
     """
     try:
         import coacd

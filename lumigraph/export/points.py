@@ -1,4 +1,4 @@
-"""Points where a scene is solid: what its cameras see, brought back into space and thinned evenly."""
+"""Point clouds of opaque surfaces: back-projected depth of a scene's cameras, thinned evenly."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ class PointCloud:
 def extract_points(
     method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64, crop: Crop | None = None
 ) -> PointCloud:
-    """At most `count` points in the scene's frame, spread evenly over what the cameras see.
+    """At most `count` points in the scene's frame, spread evenly over the surfaces in the cameras' view.
 
-    size:  longer side of the cameras' pictures at most, pixels
-    views: cameras at most
-    crop:  what the points lie in; None for everywhere
-    A point stays if other cameras see a surface there too, and at most half as many look through it. Raises
-    LumigraphError where nothing is solid.
+    size:  largest longer side of the cameras' pictures, pixels
+    views: largest number of cameras
+    crop:  region of the points; None for everywhere
+    A point stays if other cameras see a surface there too, and at most half as many see through it. Raises
+    LumigraphError for an empty scene.
     """
     method.eval()
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
@@ -81,7 +81,7 @@ def extract_points(
 
 
 def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
-    """Mask of pixels that show a surface squarely, inside the crop."""
+    """Mask of pixels with a surface at a steep angle, inside the crop."""
     good = seen.solid & (seen.facing > MIN_COSINE)
     if crop is not None:
         good[good.clone()] = crop.holds(seen.positions(good))
@@ -89,7 +89,7 @@ def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
 
 
 def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> Bool[Tensor, " point"]:
-    """Mask of points that enough cameras see as a surface, and not many see through."""
+    """Mask of points with enough cameras that see a surface, and few that see through."""
     agree, through = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
     for depth_map in track(depth_maps, "Comparing depth maps", len(depth_maps)):
         away = (points - depth_map.camera.position).norm(dim=-1)
@@ -100,7 +100,7 @@ def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> B
 
 
 def thinned(columns: Float[np.ndarray, "point column"], count: int) -> Float[np.ndarray, "thinned column"]:
-    """The means within cells of space just large enough that there are at most `count`. The first three are places."""
+    """Means within grid cells of the least size that gives at most `count`. The first three columns are positions."""
     if len(columns) <= count:
         return columns
     low, extent = columns[:, :3].min(0), float(np.ptp(columns[:, :3], axis=0).max())

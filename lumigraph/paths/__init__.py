@@ -22,13 +22,13 @@ PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "still", "held-out")
 def film_cameras(
     cameras: dict[str, Camera], frame: Frame, path: str | CameraPath, frames: int | None = None, size: int | None = None
 ) -> Camera:
-    """The cameras of a film, one for each frame.
+    """Cameras of a film, one for each frame.
 
-    cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
+    cameras: of the photographs by split, as in `Run.cameras`; frame: theirs
     path:   one of PATH_KINDS, or a CameraPath
-    frames: None for the default of the path: 120, every held-out view, as long as keyframes last
+    frames: None for the default of the path: 120, every held-out view, or the keyframes' duration
     size:   longer side; None as the photographs, up to a limit
-    Raises LumigraphError for held-out views where there are none, or of several sizes.
+    Raises LumigraphError for held-out views if there are none, or of several sizes.
     """
     if path != "held-out":
         train = cameras["train"]

@@ -1,4 +1,4 @@
-"""compress(): choose a rung of the ladder, tune the run there, and write it as a run of its own.
+"""compress(): choose a rung of the ladder, fine-tune the run there, and write it as a new run.
 
 References are the run's photographs where available, else its own renderings.
 """
@@ -49,10 +49,10 @@ DEFAULT_PSNR = 30.0  # dB of a run without a recorded training PSNR
 class CompressionTarget:
     """Target of a compression and its limit in time; exactly one of size and loss.
 
-    size:     bytes of the model at most
-    loss:     dB that photographs which were learnt from may lose at most
-    codebook: rows of the codebook at most, where the ladder's are not wanted
-    steps, seconds: of tuning in all; one of them
+    size:     largest model in bytes
+    loss:     largest PSNR loss on training photographs, dB
+    codebook: largest number of codebook rows, instead of the ladder's
+    steps, seconds: of fine-tuning in all; one of them
     views:    held-out views to compare; None for all
     """
 
@@ -77,13 +77,13 @@ def compress(
     device: torch.device | str = "cpu",
     show: bool = False,
 ) -> Compressed:
-    """A smaller run in a new folder, which opens like any other; gives what compress.json says.
+    """Write a smaller run in a new folder, which opens like any other. Returns the contents of compress.json.
 
-    source: where the photographs are now, if they have moved. Where they cannot be opened, the run's own renderings are
-            learnt from and compared with.
+    source: present path of the photographs, if they have moved. If they cannot be opened, the run's own renderings are
+            used for fine-tuning and comparison
     show:   whether stages are announced
-    Raises LumigraphError for a run that was compressed already, a method that cannot be, a codebook larger than what it
-    would stand for, and a size that no rung reaches.
+    Raises LumigraphError for a compressed run, a method that cannot be compressed, a codebook larger than its data, and
+    a size that no rung reaches.
     """
     if run.compressed:
         raise LumigraphError(f"{run.folder} is compressed already; compress the run that it was made of")
@@ -111,7 +111,7 @@ def about_time(truth: Truth, aim: CompressionTarget) -> str:
 
 
 class Ladder:
-    """Rungs that are tried, each from the run's own weights."""
+    """Search over rungs, each from the run's own weights."""
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class Ladder:
         self.tuned = 0.0  # share of all tuning
 
     def by_loss(self, most: float) -> CompressedModel:
-        """The highest rung on which no more is lost, by halving; the lowest, where even there more is."""
+        """The highest rung within the loss, by bisection; the lowest if none is."""
         self.stages.begin()
         low, high, best = 0, len(LADDER) - 1, None
         while low <= high:
@@ -144,8 +144,8 @@ class Ladder:
         return model
 
     def by_size(self, most: int) -> CompressedModel:
-        """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
-        take the next one."""
+        """The lowest position on the ladder within the size, on a rung or between two. Fine-tuning changes the size a
+        little, so the next one may be taken."""
         self.stages.begin()
         first = bisect_left(RUNG_POSITIONS, True, key=lambda place: len(self.at(place).packed()) <= most)
         self.stages.begin()
@@ -213,7 +213,7 @@ def row_width(tensor: Tensor, layout: str) -> int:
 def written(
     run: Run, before: Method, model: CompressedModel, truth: Truth, output: Path, aim: CompressionTarget
 ) -> Compressed:
-    """Write the run; what it says of itself is measured on what was written, opened again."""
+    """Write the run; its recorded figures are measured after reopening."""
     views = min(aim.views or len(truth.scene.splits["test"]), len(truth.scene.splits["test"]))
     settings = replace(run.settings, said=run.settings.said | {"compressed": {"source": str(run.folder.resolve())}})
     rung = model.rung
@@ -255,11 +255,11 @@ def told(size: float) -> str:
 
 @dataclass(frozen=True)
 class Truth:
-    """References for tuning and for comparison.
+    """References for fine-tuning and comparison.
 
-    photographed: whether these are photographs; renderings of the run before it was compressed otherwise
-    error:        mean squared error of the run before, on the photographs that it has learnt
-    view_seconds: time to render a view of it
+    photographed: whether these are photographs; otherwise renderings of the run before compression
+    error:        mean squared error of the run before, on its training photographs
+    view_seconds: rendering time of a view of it
     """
 
     scene: Scene
@@ -268,8 +268,8 @@ class Truth:
     view_seconds: float
 
     def loss(self, method: Method, views: int) -> float:
-        """dB that a method has lost on photographs it has learnt. Where renderings stand in for them, errors that know
-        nothing of each other are taken to add up."""
+        """PSNR loss of a method in dB on training photographs. With renderings instead, independent errors are
+        assumed to add up."""
         error = squared_error(method, self.scene, "train", views)
         return decibels(error if self.photographed else self.error + error) * -1 + decibels(self.error)
 
@@ -290,7 +290,7 @@ def truth_of(run: Run, method: Method, source: str | None, views: int) -> Truth:
 
 
 def squared_error(method: Method, scene: Scene, split: str, views: int) -> float:
-    """Mean over views of what their PSNR is the logarithm of, so that errors can be added."""
+    """Mean squared error over views, which is additive, unlike PSNR."""
     return 10 ** (-evaluate(method, scene, split, views=views).psnr / 10)
 
 
@@ -299,7 +299,7 @@ def decibels(error: float) -> float:
 
 
 def rendered(run: Run, method: Method) -> Scene:
-    """A Scene whose photographs are what a method shows from where they were taken."""
+    """A Scene of a method's renderings at its photographs' cameras."""
     cameras = run.cameras()
     some = {split: evenly(range(len(own)), RENDERED_VIEWS) for split, own in cameras.items() if len(own)}
     chosen = [cameras[split][i] for split, index in some.items() for i in index]
