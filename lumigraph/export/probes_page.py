@@ -1,4 +1,4 @@
-"""A page in which a mesh that the mouse moves is lit by probes, in a rendered picture with its depth."""
+"""Web page with a draggable mesh lit by probes, in a rendered picture with depth."""
 
 from __future__ import annotations
 
