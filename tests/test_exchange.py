@@ -700,3 +700,11 @@ def test_a_fault_leaves_the_old_file(tmp_path, monkeypatch):
 
 def _full(descriptor: int) -> None:
     raise OSError(28, "No space left on device")
+
+
+def test_spz_3_for_readers_of_it(tmp_path):
+    cloud = make(50, 2)
+    write_gaussians(tmp_path / "a.spz", cloud, spz_version=3)
+    write_gaussians(tmp_path / "b.spz", cloud)
+    assert (tmp_path / "a.spz").read_bytes()[:2] == b"\x1f\x8b" and (tmp_path / "b.spz").read_bytes()[:4] == b"NGSP"
+    torch.testing.assert_close(read_gaussians(tmp_path / "a.spz").means, read_gaussians(tmp_path / "b.spz").means)

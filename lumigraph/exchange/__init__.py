@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from ..errors import LumigraphError, LumigraphWarning
-from ..files import claim, claim_folder, exists, expanded, is_file, read_json, write_json
+from ..files import claim, claim_folder, exists, expanded, is_file, read_json, write_bytes, write_json
 from ..files.marks import is_ours
 from ..files.partials import remove
 from ..files.ply import read_header
@@ -90,9 +90,11 @@ def read_moving(path: Path | str) -> MovingGaussians:
         return moving_ply.read_sequence(path) if path.is_dir() else moving_ply.read_spacetime(path)
 
 
-def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
+def write_gaussians(
+    path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None, spz_version: int = 4
+) -> None:
     """Write a cloud in the format of the suffix, atomically; to FOLDER/meta.json, a folder of SOG; to
-    FOLDER/lod-meta.json, a streamed one, with the levels of `detail`.
+    FOLDER/lod-meta.json, a streamed one, with the levels of `detail`. spz_version: 3 or 4
 
     `.ply` is lossless; docstrings of the others give their rounding. REORDERED formats keep the set of Gaussians and
     not their order, `.splat` neither harmonics beyond degree 0 nor `antialiased`. Raises LumigraphError for a suffix
@@ -109,6 +111,8 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog
     with counting(f"Writing {path.name}"):
         if path.name == streamed_sog.META:
             streamed_sog.write(path, sound, detail)
+        elif ending == ".spz" and spz_version == 3:
+            write_bytes(path, spz.gzipped(sound), "splats")
         elif ending in PLACED and offset is not None:
             WRITERS[ending](path, sound, offset.numpy())
         else:
