@@ -22,7 +22,7 @@ from lumigraph.exchange.fourdgs import write_moving
 from lumigraph.files.ply import read_rows, write_rows
 from lumigraph.gaussians import Gaussians
 from lumigraph.large import open_any
-from lumigraph.readers import colmap, phones, transforms
+from lumigraph.readers import choose_reader, colmap, phones, transforms
 from lumigraph.readers.finding import find_named, paired
 from lumigraph.system.cache import cache_folder, temporary_cache
 
@@ -318,3 +318,17 @@ def test_caches_lie_in_the_temporary_folder_where_the_home_cannot_be_written(tmp
     with pytest.warns(LumigraphWarning):
         assert cache_folder() != found
     temporary_cache.cache_clear()
+
+
+def test_a_cloud_of_points_is_described(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=0)
+    header.offsets, header.scales = [500000, 4600000, 0], [0.001] * 3
+    made = laspy.LasData(header)
+    made.x, made.y, made.z = np.linspace(500000, 500010, 90), np.linspace(4600000, 4600020, 90), np.linspace(0, 5, 90)
+    made.write(tmp_path / "a.las")
+    with pytest.raises(LumigraphError, match=r"cloud of 90 points, 10 x 20 x 5 large, .* --depth-from"):
+        choose_reader(tmp_path / "a.las")
+    (tmp_path / "a.xyz").write_text("0 0 0")
+    with pytest.raises(LumigraphError, match="convert it to"):
+        choose_reader(tmp_path / "a.xyz")

@@ -21,6 +21,7 @@ from .part import CapturePart as CapturePart
 from .part import Places as Places
 from .part import places_of as places_of
 from .pictures import list_images
+from .surveyed import CLOUD_SUFFIXES, OTHER_CLOUDS, describe_cloud
 from .unposed import Unposed as Unposed
 from .views import multiscale as multiscale
 
@@ -32,6 +33,8 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     """The reader that recognises a folder. Raises LumigraphError if none does."""
     if not exists(folder):
         raise LumigraphError(f"{folder} does not exist; check the path")
+    if folder.suffix.lower() in (*CLOUD_SUFFIXES, *OTHER_CLOUDS) and not folder.is_dir():
+        raise LumigraphError(describe_cloud(folder))
     if not folder.is_dir():
         raise LumigraphError(
             f"{folder} is a file; name the folder that holds the photographs and their poses, "

@@ -32,6 +32,7 @@ from .capture import MAX_COORDINATE, Capture, PixelPlane, Shot
 from .pictures import stat, upright_size
 
 CLOUD_SUFFIXES = (".las", ".laz", ".e57")
+OTHER_CLOUDS = (".pcd", ".xyz", ".pts", ".ptx")  # that are known by name and not read
 SUFFIXES = (*CLOUD_SUFFIXES, *meshes.SUFFIXES)
 POINT_BYTES = 200  # of memory for each point while a photograph sees the cloud
 WORKER = Path(__file__).with_name("cloud_worker.py")
@@ -73,6 +74,22 @@ def with_surveyed(capture: Capture, path: Path) -> Capture:
         return replace(shot, planes=shot.planes | {"depth": depth_plane(shot, found, identity)})
 
     return replace(capture, shots=[with_depth(shot) for shot in capture.shots])
+
+
+def describe_cloud(path: Path) -> str:
+    """Sentence on a cloud of points that is named where photographs are needed. Raises LumigraphError for a damaged
+    one."""
+    if path.suffix.lower() in OTHER_CLOUDS:
+        return (
+            f"{path} is a cloud of points without photographs; convert it to .las or .ply, and it gives depth to "
+            "photographs with poses: lumigraph train METHOD SCENE --depth-from FILE"
+        )
+    points = read_surveyed(path).points
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))
+    return (
+        f"{path} is a cloud of {len(points):,} points, {size} large, without photographs; it gives depth to photographs "
+        f"with poses: lumigraph train METHOD SCENE --depth-from {path}"
+    )
 
 
 @reads("cannot be read as a cloud", "export it once more")
