@@ -87,8 +87,8 @@ def describe_cloud(path: Path) -> str:
     points = read_surveyed(path).points
     size = " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))
     return (
-        f"{path} is a cloud of {len(points):,} points, {size} large, without photographs; it gives depth to photographs "
-        f"with poses: lumigraph train METHOD SCENE --depth-from {path}"
+        f"{path} is a cloud of {len(points):,} points, {size} large, without photographs; it gives depth to "
+        f"photographs with poses: lumigraph train METHOD SCENE --depth-from {path}"
     )
 
 
