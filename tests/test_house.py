@@ -23,7 +23,7 @@ from lumigraph.geometry import to_quaternion
 from lumigraph.kernels._operation import operations
 
 ROOT = PACKAGE.parent
-pytestmark = budget("house", 10)
+pytestmark = budget("house", 5)
 
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.
