@@ -33,7 +33,8 @@ from budgets import MUCH, Ledger, busy, share_of  # isort: skip
 from numba.core import event  # isort: skip
 
 LIMIT = 300  # seconds of waiting, in whatever state the machine is, that a test's setup, body or end may take
-FIRST_FILES = ["test_contract", "test_bounds", "test_seeded_faults"]  # the last two run kernels as plain Python
+# The contract compiles kernels, and the others none: they run them as plain Python, or run Triton and COLMAP.
+FIRST_FILES = ["test_contract", "test_bounds", "test_seeded_faults", "test_gpu_compiles", "test_capture_motion"]
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported

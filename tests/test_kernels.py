@@ -30,7 +30,7 @@ from proofs import kept
 
 from lumigraph import kernels, metrics
 
-pytestmark = budget("kernels", 100)
+pytestmark = budget("kernels", 80)
 
 DIFFERENTIABLE = [name for name in OPERATIONS if facts(name).differentiable]
 

@@ -8,7 +8,7 @@ from budgets import budget
 from proofs import kept
 
 pytestmark = [
-    budget("kernels", 42),
+    budget("kernels", 30),
     # what Numba does silently, plain Python does aloud: hashes wrap around, 1 / 0 is infinite
     pytest.mark.filterwarnings("ignore:overflow encountered"),
     pytest.mark.filterwarnings("ignore:divide by zero encountered"),

@@ -19,7 +19,7 @@ from test_house import forget_trees, imported  # noqa: F401
 from lumigraph import methods
 from lumigraph.files.ranges import hints
 
-pytestmark = budget("house", 8)
+pytestmark = budget("house", 6)
 
 ROOT = PACKAGE.parent
 Sources = dict[str, str]  # module names, and the text of each
