@@ -190,23 +190,23 @@ def with_options_of(
     extra: dict[str, tuple[Any, Any]] = {}
     if "quality" in {x.name for x in dataclasses.fields(command)}:
         extra["quality"] = Annotated[Quality | None, asked], None
-    if in_blocks:
-        blocks = derived(BlockOptions, kind.Config, {})
-        extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
     default = default_config(command, kind, preset_device(device, preset))
+    if in_blocks:
+        blocks = derived(BlockOptions, default, {})
+        extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
     about = (
         f"What people set. `--help-all` lists all {len(option_names(default))} options."
         if hidden_options(default)
         else None
     )
     extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes, arg(help=about)], default
-    return derived(command, kind.Config, extra)
+    return derived(command, default, extra)
 
 
-def derived(base: type, config: type, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
+def derived(base: type, config: Any, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
     """A dataclass of options with further ones, annotation and default by name. Options that a method's Config has too
     are hidden in favour of the Config's."""
-    names = {x.name for x in dataclasses.fields(config) if not dataclasses.is_dataclass(x.default)}  # --steps stays
+    names = option_names(config)
     hidden = {x.name: (Annotated[Any, Fixed, Suppress], x.default) for x in dataclasses.fields(base) if x.name in names}
     options = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in (hidden | extra).items()]
     made = dataclasses.make_dataclass(base.__name__, options, bases=(base,), frozen=True)
