@@ -17,7 +17,7 @@ import torch
 
 from lumigraph import methods
 from lumigraph.components.clouds import cloud_method
-from lumigraph.components.clouds.dense_points import Points, seen_points
+from lumigraph.components.training.dense_points import Points, seen_points
 from lumigraph.datasets.scene import Scene
 from lumigraph.depth_maps.depth_map import SurfacePoints, free
 from lumigraph.depth_maps.multi_view import multi_view_depth

@@ -29,7 +29,7 @@ from torch import Tensor
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.color.srgb import linear_from_srgb
-from lumigraph.components.fields.development import encoded
+from lumigraph.components.training.development import encoded
 from lumigraph.datasets.scene import Frame
 from lumigraph.export.options import ProbesOptions
 from lumigraph.export.probes import bake_probes

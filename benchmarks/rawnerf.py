@@ -23,7 +23,7 @@ from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 from torch import Tensor
 
 from lumigraph.camera.rays import Rendering
-from lumigraph.components.fields.development import decoded, encoded
+from lumigraph.components.training.development import decoded, encoded
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation.views import LIGHT_LAYER, in_light
 from lumigraph.figures import Row, contact_sheet, save_picture

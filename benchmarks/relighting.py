@@ -24,7 +24,7 @@ import tyro
 from torch import Tensor
 
 from lumigraph.camera import Camera
-from lumigraph.components.fields.development import encoded
+from lumigraph.components.training.development import encoded
 from lumigraph.datasets.scene import Scene
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json

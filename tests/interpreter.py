@@ -21,6 +21,8 @@ def hasten() -> None:
         interpreter._patch_lang = _once(patch)
     if types := getattr(interpreter, "_get_np_dtype", None):
         interpreter._get_np_dtype = _remembered(types)
+    if {"shape", "numel", "element_ty", "name"} == vars(tl.block_type(tl.int32, [1])).keys():
+        _share_shapes()
 
 
 def _once(patch: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -45,3 +47,29 @@ def _remembered(find: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return find(element) if isinstance(element, tl.pointer_type) else found(element)
 
     return remembered
+
+
+def _share_shapes() -> None:
+    """Let all blocks of one shape, and all tensors of these, have one shape: to make it takes a quarter of the time."""
+    make_block, make_tensor = tl.block_type.__init__, tl.tensor.__init__
+    shapes: dict[tuple, tuple[str, dict[str, Any]]] = {}
+
+    @functools.wraps(make_block)
+    def block(self: Any, element_ty: Any, shape: Any) -> None:
+        key = (*shape,)
+        if key not in shapes:
+            make_block(self, element_ty, shape)
+            tensor = tl.tensor.__new__(tl.tensor)
+            make_tensor(tensor, None, self)
+            shapes[key] = str(self.shape), vars(self) | {"of_tensors": (tensor.shape, tensor.numel)}
+        said, shared = shapes[key]
+        vars(self).update(shared, element_ty=element_ty, name=f"<{said}, {element_ty}>")
+
+    @functools.wraps(make_tensor)
+    def tensor(self: Any, handle: Any, type: Any) -> None:
+        if not type.is_block():
+            return make_tensor(self, handle, type)
+        self.handle, self.type, self.dtype = handle, type, type.scalar
+        self.shape, self.numel = type.of_tensors
+
+    tl.block_type.__init__, tl.tensor.__init__ = block, tensor

@@ -990,16 +990,16 @@ class _Child:
 
 def test_an_app_serves_a_folder_alone(tmp_path):
     from lumigraph.app.projects import APP_FOLDER
-    from lumigraph.files.locks import held
+    from lumigraph.files.locks import lock_folder
 
     place = tmp_path / APP_FOLDER
     place.mkdir()
-    program = "import sys, time, pathlib; from lumigraph.files.locks import held\n"
-    program += f"with held(pathlib.Path({str(place)!r}), 'served'): print('held', flush=True); time.sleep(30)"
+    program = "import sys, time, pathlib; from lumigraph.files.locks import lock_folder\n"
+    program += f"with lock_folder(pathlib.Path({str(place)!r}), 'served'): print('held', flush=True); time.sleep(30)"
     import subprocess
 
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as other:
         assert other.stdout.readline() == b"held\n"
-        with pytest.raises(LumigraphError, match="being served"), held(place, "served"):
+        with pytest.raises(LumigraphError, match="being served"), lock_folder(place, "served"):
             pass
         other.kill()

@@ -15,7 +15,7 @@ from budgets import budget
 
 from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.fields.appearance import Appearance
-from lumigraph.components.sampling.spaces import space_of
+from lumigraph.components.fields.spaces import space_of
 from lumigraph.composition import Placed
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene

@@ -442,21 +442,29 @@ def handlers():
 RUNS = "big", "undisturbed"
 
 
-@kept(of_blocks)
-def test_a_worker_that_is_killed_loses_nothing(street, tmp_path):
-    """Two workers, one of which is killed while it learns: the same weights as undisturbed, to the bit.
+@kept(lambda: [*of_blocks(), Path(methods.__file__)])
+def test_a_worker_that_is_killed_loses_nothing(street, tmp_path, monkeypatch):
+    """Two workers that load the file of a method, one of which is killed while it learns: the same weights as
+    undisturbed, to the bit.
 
     All of them load kernels that this process has compiled, for what is compiled and not loaded rounds differently.
     """
     pytest.importorskip("ray")
-    plan = planned(street, tmp_path / "big", method="instant-ngp")
+    monkeypatch.setattr(methods, "_registered", {})
+    monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache"))
+    file = tmp_path / "mine.py"
+    file.write_text("from lumigraph.methods.instant_ngp import InstantNGP\n\n\nclass MyNGP(InstantNGP):\n    pass\n")
+    (method,) = methods.load(file)
+    (tmp_path / "cache" / methods.LOADED_FILE).unlink()  # by which other processes would find the file
+    plan = planned(street, tmp_path / "big", method=method)
     for name in ("compiled", "undisturbed"):
-        planned(street, tmp_path / name, method="instant-ngp")
+        planned(street, tmp_path / name, method=method)
     worker.train_block(tmp_path / "compiled/blocks/0")
     blocks = [str(tmp_path / "undisturbed/blocks" / name) for name in "012"]
     program = "import sys; from pathlib import Path; from lumigraph.large.worker import train_block"
-    program += "; [train_block(Path(folder)) for folder in sys.argv[1:]]"
-    subprocess.run([sys.executable, "-c", program, *blocks], check=True)
+    program += "; from lumigraph.methods import load; load(sys.argv[1])"
+    program += "; [train_block(Path(folder)) for folder in sys.argv[2:]]"
+    subprocess.run([sys.executable, "-c", program, file, *blocks], check=True)
     killed = []
 
     def kill() -> None:
@@ -480,20 +488,6 @@ def test_a_worker_that_is_killed_loses_nothing(street, tmp_path):
     for name in "012":
         one, other = (load_file(Run(tmp_path / run / "blocks" / name)._checkpoints.weights) for run in RUNS)
         assert one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
-
-
-@kept(lambda: [*of_blocks(), Path(methods.__file__)])
-def test_workers_load_the_file_of_a_method(street, tmp_path, monkeypatch):
-    pytest.importorskip("ray")
-    monkeypatch.setattr(methods, "_registered", {})
-    monkeypatch.setenv("LUMIGRAPH_CACHE", str(tmp_path / "cache"))
-    file = tmp_path / "mine.py"
-    file.write_text((Path(__file__).parent / "methods" / "voxel_grid.py").read_text().replace("VoxelGrid", "MyGrid"))
-    (name,) = methods.load(file)
-    (tmp_path / "cache" / methods.LOADED_FILE).unlink()
-    plan = planned(street, tmp_path / "big", method=name)
-    found = training.conduct(tmp_path / "big", plan, Workers(count=1), show=False)
-    assert sorted(found.done) == ["0", "1", "2"] and not found.failed
 
 
 def listing(folder: Path) -> dict[str, tuple[int, bytes]]:

@@ -48,18 +48,18 @@ def test_a_crop_is_the_same_part_of_space_in_every_frame(kind, generator):
     crop, points = CROPS[kind], 2 * torch.rand(4000, 3, generator=generator) - 1
     inside = crop.holds(points)
     assert 0.02 < inside.float().mean() < 0.3
-    moved = crop.moved(place())
+    moved = crop.transformed(place())
     assert torch.equal(moved.holds(place().points(points.double())), inside)
     low, high = torch.tensor(moved.bounds)
     there = place().points(points)[inside]
     assert (there >= low - 1e-6).all() and (there <= high + 1e-6).all()
     assert (there.amin(0) - low).max() < 0.3 and (high - there.amax(0)).max() < 0.3
-    assert moved.moved(place().inverse).holds(points).ne(inside).sum() <= 1
+    assert moved.transformed(place().inverse).holds(points).ne(inside).sum() <= 1
 
 
 @pytest.mark.parametrize("kind", CROPS)
 def test_rays_are_inside_between_where_they_enter_and_leave(kind, generator):
-    crop = CROPS[kind].moved(place())
+    crop = CROPS[kind].transformed(place())
     origins = 3 * torch.randn(300, 3, generator=generator)
     directions = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator) - origins, dim=-1)
     rays = Rays(origins, directions, torch.zeros(300))

@@ -21,8 +21,8 @@ from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
 from lumigraph.commands.convert import kept, verdict
 from lumigraph.components.clouds.initialization import rotation_to_normal
+from lumigraph.components.fields.spaces import space_of
 from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logit, teacher_of
-from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
 from lumigraph.derive import conversion
 from lumigraph.derive.conversion import between, convert, rendered_scene, ways

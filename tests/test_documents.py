@@ -195,7 +195,7 @@ def lost_options(command: str) -> list[str]:
     if words[0] == "python":
         known = names_in(ROOT / words[1])
     else:
-        known = names_in(*(PACKAGE / "commands").glob("*.py")) | {"help", "method_file"}
+        known = names_in(*(PACKAGE / "commands").glob("*.py"), *PACKAGE.glob("*/options.py")) | {"help", "method_file"}
     if words[1] in ("train", "track", "convert"):  # METHOD is any
         available = methods.available()
         known = known.union(*map(names_of, [word for word in words[2:] if word in available] or available))

@@ -13,8 +13,8 @@ from test_gaussian_splatting import new
 
 from lumigraph.components.clouds.addition import TrainingViews
 from lumigraph.components.clouds.cloud import Cloud
-from lumigraph.components.clouds.dense_points import Points
 from lumigraph.components.clouds.initialization import random_cloud, round_gaussians
+from lumigraph.components.training.dense_points import Points
 from lumigraph.components.training.regularizers import camera_between, places_between
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.methods.gaussian_splatting.few_views import (

@@ -17,7 +17,7 @@ from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.development import decoded, encoded
+from lumigraph.components.training.development import decoded, encoded
 from lumigraph.components.training.photometric import brighter, gain_between, spread_of_exposure
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame

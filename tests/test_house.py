@@ -210,6 +210,19 @@ def test_no_room_has_a_circle_of_imports():
     arrows = inner_arrows(sources, packages)
     assert sum(map(len, arrows.values())) > 200  # it sees most imports
     assert circles(arrows) == []
+    families: dict[str, set[str]] = {}
+    for module, others in arrows.items():
+        if module.startswith(COMPONENTS):
+            families.setdefault(family(module), set()).update({family(other) for other in others} - {family(module)})
+    assert len(families) > 8 and circles(families) == [], "folders of components import one way"
+
+
+COMPONENTS = "lumigraph.components."
+
+
+def family(module: str) -> str:
+    """Folder of components that a module lies in; a module beside the folders itself."""
+    return ".".join(module.split(".")[:3])
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.instance_codes import AVERAGE, FOUND, InstanceCodes
+from lumigraph.components.fields.instance_codes import FOUND, InstanceCodes
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
@@ -20,6 +20,7 @@ from lumigraph.derive.conversion import way
 from lumigraph.errors import LumigraphError
 from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels
+from lumigraph.method.controls import AVERAGE
 from lumigraph.methods import find
 from lumigraph.methods.hyp_nerf import HypNeRF, around, held, patch
 from lumigraph.methods.hyp_nerf.networks import HashInstance, HashShape, HyperNetwork

@@ -18,7 +18,7 @@ from shape_checks import PACKAGE
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import locks
-from lumigraph.files.locks import held
+from lumigraph.files.locks import lock_folder
 from lumigraph.run import Run
 from lumigraph.sfm.reconstruction import reconstruct
 from lumigraph.training import fit
@@ -28,8 +28,8 @@ pytestmark = budget("runs")
 HOLDER = """
 import sys
 from pathlib import Path
-from lumigraph.files.locks import held
-with held(Path(sys.argv[1]), "trained"):
+from lumigraph.files.locks import lock_folder
+with lock_folder(Path(sys.argv[1]), "trained"):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -49,11 +49,11 @@ def somebody(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 def test_a_second_one_hears_who_is_at_work(tmp_path):
     with somebody(tmp_path) as other:
-        with pytest.raises(LumigraphError) as told, held(tmp_path, "trained"):
+        with pytest.raises(LumigraphError) as told, lock_folder(tmp_path, "trained"):
             pass
         who = rf"{tmp_path} is being trained by process {other.pid} on \S+ since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d; wait"
         assert re.match(who, str(told.value))
-    with held(tmp_path, "trained"), held(tmp_path, "trained"):
+    with lock_folder(tmp_path, "trained"), lock_folder(tmp_path, "trained"):
         assert [path.name for path in tmp_path.iterdir()] == [locks.LOCK_FILE]
     assert not list(tmp_path.iterdir())
 
@@ -63,7 +63,7 @@ def test_what_a_killed_process_left_is_taken_over(tmp_path):
         other.kill()
         other.wait()
         assert (tmp_path / locks.LOCK_FILE).exists()
-        with held(tmp_path, "trained"):
+        with lock_folder(tmp_path, "trained"):
             assert str(os.getpid()) in (tmp_path / locks.LOCK_FILE).read_text()
 
 

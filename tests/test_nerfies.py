@@ -10,7 +10,7 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph.components.sampling.spaces import Contraction, Space, space_of
+from lumigraph.components.fields.spaces import Contraction, Space, space_of
 from lumigraph.datasets.scene import Frame
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import rotated

@@ -41,11 +41,11 @@ def test_windows_locks_a_byte(tmp_path, monkeypatch, on):
     monkeypatch.setitem(sys.modules, "msvcrt", SimpleNamespace(locking=locking, LK_NBLCK=2))
     monkeypatch.setitem(sys.modules, "fcntl", None)
     on("win32", locks)
-    with locks.held(tmp_path, "trained"):
+    with locks.lock_folder(tmp_path, "trained"):
         monkeypatch.setattr(locks, "_ours", set())  # as another process
-        with pytest.raises(LumigraphError, match="is being trained by process"), locks.held(tmp_path, "trained"):
+        with pytest.raises(LumigraphError, match="is being trained by process"), locks.lock_folder(tmp_path, "trained"):
             pass
-    with locks.held(tmp_path, "trained"):
+    with locks.lock_folder(tmp_path, "trained"):
         assert asked == [(2, 1)] * 3
 
 

@@ -18,7 +18,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.development import decoded, encoded
+from lumigraph.components.training.development import decoded, encoded
 from lumigraph.composition import LitComposition, LitMesh, Placed, ShadedMesh
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.datasets.scene import Frame

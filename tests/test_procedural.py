@@ -337,10 +337,10 @@ def test_masks_name_things_and_a_thing_can_move(still_life):
     before = render(world, camera).extra["ids"]
     ball = world.names.index("ball")
     assert (before == ball).any()
-    after = render(world.moved("ball", Pose((0.0, 0.0, 3.0))), camera).extra["ids"]
+    after = render(world.move_object("ball", Pose((0.0, 0.0, 3.0))), camera).extra["ids"]
     assert not (after == ball).any() and (after[before != ball] == before[before != ball]).all()
     with pytest.raises(KeyError, match="nothing here is called 'cat'"):
-        world.moved("cat", Pose())
+        world.move_object("cat", Pose())
 
 
 def test_a_visible_sky_leaves_no_pixel_empty():

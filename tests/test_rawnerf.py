@@ -10,7 +10,7 @@ import torch
 
 from lumigraph.camera.rays import Rendering
 from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
-from lumigraph.components.fields.development import decoded, encoded, exposed, toned, white
+from lumigraph.components.training.development import decoded, encoded, exposed, toned, white
 from lumigraph.datasets.scene import Batch
 from lumigraph.evaluation.views import evaluate, in_light
 from lumigraph.export.film import exr, film

@@ -322,7 +322,7 @@ def test_the_inside_and_the_outside_of_a_mask_are_the_field(tmp_path):
     assert (inside.rgb[inside.opacity > 0.99][:, 0] > 0.8).float().mean() > 0.97
     assert (outside.rgb[outside.opacity > 0.99][:, 0] < 0.2).float().mean() > 0.9  # but for the seam
     place = Similarity.make(1.0, None, torch.tensor([0.0, 0.5, 0.0]))
-    moved = mask.moved(place)
+    moved = mask.transformed(place)
     assert (
         moved.holds(torch.tensor([[0.0, 0.4, 0.0]])).item() and not moved.holds(torch.tensor([[0.0, 0.6, 0.0]])).item()
     )

@@ -13,7 +13,7 @@ from captures import Tiny, look_at, write_blender, write_ngp
 
 from lumigraph.camera.lens import Equirectangular, Pinhole
 from lumigraph.camera.rays import Rays
-from lumigraph.components.sampling.spaces import INFINITY, NDC, Box, Contraction, space_of
+from lumigraph.components.fields.spaces import INFINITY, NDC, Box, Contraction, space_of
 from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.opening import open_scene
 from lumigraph.readers import Capture, Shot

@@ -13,7 +13,7 @@ from budgets import budget
 
 from lumigraph.commands.cli import main
 from lumigraph.components.tracking.frames import DepthFrame, Moment
-from lumigraph.components.tracking.trajectory import moved
+from lumigraph.components.tracking.trajectory import apply_twists
 from lumigraph.methods.splat_slam import SplatSlam, axial
 from lumigraph.run import build
 
@@ -91,7 +91,7 @@ def test_the_picture_moves_with_the_pose():
     weight = ramp + 0.5 * ramp[:, None].square()
 
     def value(twist: torch.Tensor) -> torch.Tensor:
-        picture = method.seen(cloud, seen, moved(pose[None], twist[None])[0])
+        picture = method.seen(cloud, seen, apply_twists(pose[None], twist[None])[0])
         return (picture.depth * weight).mean() + (picture.rgb[..., 0] * weight).mean()
 
     twist = torch.zeros(6, requires_grad=True)
@@ -108,7 +108,7 @@ def test_keyframes_with_the_highest_overlap_are_mapped():
     shares = method.overlaps(frame(2), [frame(i) for i in (1, 3, 7)], torch.Generator().manual_seed(0))
     assert min(shares) > 0.9  # all see the whole ball's outline: overlap is by the view, not by what hides
     away = replace(frame(7), index=11)
-    method.tracker.trajectory.poses[11] = moved(SCENE.cameras.pose[7:8], torch.tensor([[0.0, 0, 0, 9, 9, 9]]))[0]
+    method.tracker.trajectory.poses[11] = apply_twists(SCENE.cameras.pose[7:8], torch.tensor([[0.0, 0, 0, 9, 9, 9]]))[0]
     assert method.overlaps(frame(2), [away], torch.Generator().manual_seed(0)) == [0.0]
     method.tracker.trajectory.poses[3] = method.tracker.trajectory.poses[11]
     moment = Moment(SCENE, frame(2), [1])

@@ -13,7 +13,7 @@ from budgets import budget
 from lumigraph.camera.lens import Pinhole
 from lumigraph.components.tracking.alignment import aligned
 from lumigraph.components.tracking.loops import KeyframePlace, Loops, motion, motion_between
-from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, moved, relative, rigid
+from lumigraph.components.tracking.trajectory import KNOWN, LOST, Trajectory, apply_twists, relative, rigid
 from lumigraph.components.training.shared_points import Seen
 from lumigraph.errors import LumigraphError
 from lumigraph.metrics.trajectory import TrajectoryErrors, position_errors, relative_errors, to_tum
@@ -30,7 +30,7 @@ def walk(count: int = 20, seed: int = 0) -> np.ndarray:
     steps = 0.1 * torch.randn(count, 6, generator=random).double()
     pose, poses = torch.eye(3, 4, dtype=torch.float64)[None], []
     for step in steps:
-        pose = moved(pose, step[None])
+        pose = apply_twists(pose, step[None])
         poses.append(pose[0])
     return torch.stack(poses).numpy()
 
@@ -41,7 +41,7 @@ def under(poses: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndar
 
 def test_errors_ignore_the_frame_of_the_world():
     truth = walk()
-    turn = moved(torch.eye(3, 4, dtype=torch.float64)[None], torch.tensor([[0.4, -0.7, 1.1, 0, 0, 0]]).double())
+    turn = apply_twists(torch.eye(3, 4, dtype=torch.float64)[None], torch.tensor([[0.4, -0.7, 1.1, 0, 0, 0]]).double())
     there = under(truth, turn[0, :, :3].numpy(), np.array([3.0, -2.0, 1.0]))
     found = TrajectoryErrors.of(there, truth)
     assert found.ate < 1e-12 and found.rpe < 1e-12 and found.rpe_degrees < 1e-5
@@ -97,7 +97,7 @@ def test_velocity_is_constant():
     trajectory, step = Trajectory(3), torch.tensor([[0.02, -0.01, 0.03, 0.1, 0.0, 0.05]])
     first = rigid(torch.from_numpy(walk(1)).float())
     trajectory.know(0, first[0], 0)
-    trajectory.know(1, moved(first, step)[0], 0)
+    trajectory.know(1, apply_twists(first, step)[0], 0)
     guess = trajectory.predicted([1, 0])
     turn, shift = relative(trajectory.poses[0], trajectory.poses[1])
     again, further = relative(trajectory.poses[1], guess)
@@ -121,7 +121,7 @@ def test_alignment_finds_the_motion(colours):
         wave = (5 * at).sin().mean(-1)
         return outside.amin(-1) / 0.3, 0.5 + 0.4 * wave[:, None].expand(-1, 3)
 
-    truth = rigid(moved(torch.eye(3, 4)[None], torch.tensor([[0.03, -0.05, 0.02, 0.04, -0.03, 0.02]])))[0]
+    truth = rigid(apply_twists(torch.eye(3, 4)[None], torch.tensor([[0.03, -0.05, 0.02, 0.04, -0.03, 0.02]])))[0]
     rgb = field(points)[1] * 0.8 + 0.05  # another exposure
     local = (points - truth[:, 3]) @ truth[:, :3]
     found = aligned(field, torch.eye(3, 4), local, rgb, torch.full((3000,), 0.03), colours, 100.0, 25)
@@ -158,11 +158,13 @@ def test_a_loop_spreads_the_drift():
     """Twenty poses around a circle, each step turned and shifted a little too far. One loop from the last to the first
     brings the largest error down to a part of the drift, and a wrong loop beside it does little harm."""
     angle = torch.arange(20) * (2 * math.pi / 20)
-    turn = moved(torch.eye(3, 4).repeat(20, 1, 1), torch.stack([0 * angle, -angle, 0 * angle, *3 * [0 * angle]], -1))
+    turn = apply_twists(
+        torch.eye(3, 4).repeat(20, 1, 1), torch.stack([0 * angle, -angle, 0 * angle, *3 * [0 * angle]], -1)
+    )
     truth = torch.cat([turn[:, :, :3], torch.stack([angle.cos(), 0 * angle, angle.sin()], -1)[:, :, None]], -1)
     drifted = [truth[0]]
     for i in range(19):
-        step = moved(motion(truth[i], truth[i + 1])[None], torch.tensor([[0.0, 0.01, 0, 0.01, 0.005, 0]]))[0]
+        step = apply_twists(motion(truth[i], truth[i + 1])[None], torch.tensor([[0.0, 0.01, 0, 0.01, 0.005, 0]]))[0]
         last = drifted[-1]
         drifted.append(torch.cat([last[:, :3] @ step[:, :3], (last[:, :3] @ step[:, 3] + last[:, 3])[:, None]], -1))
     poses, loops = torch.stack(drifted), Loops(1.0)

@@ -8,9 +8,9 @@ import torch
 from numba import njit
 
 from lumigraph.camera.rays import Look, Rays, Samples
+from lumigraph.components.fields.spaces import NDC, Contraction
 from lumigraph.components.sampling.proposal import Proposal, Proposed, edges_of, excess_of, proposal_loss
 from lumigraph.components.sampling.samplers import AIR_WEIGHT, MIN_WEIGHT, ProposalNumbers, ProposalSampler
-from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.training.regularizers import depth_loss, distortion_loss, scale_gradients
 from lumigraph.datasets.scene import Forward
 from lumigraph.kernels.sample_proposals.cpu import cube_root, exponential

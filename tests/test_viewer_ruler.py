@@ -35,14 +35,14 @@ def test_two_clicks_measure_and_set_the_scale(tmp_path):
         click(client, (3.0, 0.0, 0.0))  # before the button is pressed it is no measurement
         client.turn(ruler._button, True)
         until(lambda: "first" in ruler._about.content)
-        assert not ruler._points and not ruler.drawn
+        assert not ruler._points and not ruler.is_drawn
         click(client, (3.0, 0.0, 0.0))
         until(lambda: "second" in ruler._about.content)
         click(client, (0.0, 3.0, 0.0))
         until(lambda: ruler._set.visible)
         np.testing.assert_allclose(ruler._points, [(0.6, 0, 0), (0, 0.6, 0)], atol=0.01)
         assert ruler.length == pytest.approx(2 * 0.6 * math.sqrt(2), rel=0.01)
-        until(lambda: ruler.drawn)
+        until(lambda: ruler.is_drawn)
         assert "--scale-by" in ruler._about.content
         ends = np.array(ruler._about.content.split("--scale-by ")[1].split()[:6], float).reshape(2, 3)
         np.testing.assert_allclose(ends, [(5, 0.2, 0.5), (3.8, -1, 0.5)], atol=0.02)

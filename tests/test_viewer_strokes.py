@@ -35,12 +35,12 @@ def test_clicks_select_and_undo_takes_them_back(tmp_path):
         until(lambda: "Click along" in panel._about.content)
         client.click((0.02, 0.02), (0, 0, 3), (0, 0, 1))  # beside the ball
         client.click((0.5, 0.5), (0, 0, 3), (0, 0, 1))
-        until(lambda: panel.drawn)
+        until(lambda: panel.is_drawn)
         assert 0 < int(panel._part.sum()) and len(panel._selection) == 1
         panel._save(part=True)
         assert torch.equal(kept[panel._name.value], ~panel._part)
         client.turn(panel._undo, True)
-        until(lambda: not panel.drawn)
+        until(lambda: not panel.is_drawn)
         assert not panel._part.any()
         client.close()
 

@@ -76,8 +76,7 @@ _listings, _firsts = Finder(_listing, PAGE_SECONDS), Finder(_first)
 
 
 def files_of(folder: Path) -> dict[str, Path]:
-    """Photographs and videos of a folder by name, in natural order, within the limits of a `Search`; of a file the file
-    itself."""
+    """Photographs and videos of a folder by name, in natural order, within a `Search`'s limits; a file itself."""
     if is_file(folder):
         return {folder.name: folder}
     found = _listings(folder)
@@ -275,7 +274,7 @@ def judged(path: Path) -> tuple[Judgement, tuple[int, int]] | None:
 
 
 def advice(files: Mapping[str, Path]) -> list[Advice]:
-    """Advice on photographs before reconstruction: too few, blurred, too dark, other exposure, repeated, without
+    """Advice on photographs before reconstruction: too few, blurred, dark, of other exposure, repeated, without
     overlap."""
     photographs = {name: path for name, path in files.items() if not is_film(path) and MASKS not in Path(name).parts}
     known = {name: found for name, path in photographs.items() if (found := judged(path)) is not None}

@@ -67,9 +67,7 @@ class CaptureRecord:
 
 
 def photographs_state(item: Item) -> dict[str, dict[str, Any]]:
-    """State of each photograph by name: features, matching photographs, whether it is registered and the reason if
-    not.
-    """
+    """State of each photograph by name: features, matching photographs, whether it is registered or why not."""
     found: dict[str, dict[str, Any]] = {}
     for name, features, matched in rows_of(item.path / SCENE / DATABASE):
         found[name] = {"features": features, "matched": matched}
@@ -100,8 +98,7 @@ def rows_of(database: Path) -> list[tuple[str, int | None, int]]:
 
 
 def query(database: Path, question: str, *values: Any) -> list[tuple[Any, ...]]:
-    """Rows of COLMAP's database while COLMAP writes it. None for a missing, locked, foreign or damaged database, and
-    for a slow query."""
+    """Rows of COLMAP's database while COLMAP writes it. None if missing, locked, foreign, damaged or slow."""
     if not database.is_file():
         return []
     end = time.monotonic() + QUERY_SECONDS

@@ -252,17 +252,17 @@ def relocate(item: Item, before: str | None = None) -> None:
     scene = item.path / SCENE
     places = [scene / "work" / "sources.json", scene / "capture.json", *(run / "config.json" for run in item.runs)]
     for path in filter(Path.is_file, places):
-        write_json(path, moved(read_json(path), before, now), ours=True)
+        write_json(path, replace_folder(read_json(path), before, now), ours=True)
     item.keep(ProjectRecord(record.title, record.made, record.source, now))
 
 
-def moved(value: object, before: str, now: str) -> object:
+def replace_folder(value: object, before: str, now: str) -> object:
     """JSON with paths below one folder moved to another."""
     match value:
         case dict():
-            return {key: moved(one, before, now) for key, one in value.items()}
+            return {key: replace_folder(one, before, now) for key, one in value.items()}
         case list():
-            return [moved(one, before, now) for one in value]
+            return [replace_folder(one, before, now) for one in value]
         case str() if value == before or value.startswith(before + os.sep):
             return now + value[len(before) :]
     return value

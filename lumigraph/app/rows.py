@@ -81,8 +81,7 @@ def share_row(item: Item, share: ShareJob) -> dict[str, Any]:
 
 
 def result_of(item: Item) -> dict[str, Any] | None:
-    """Findings of the capture: registered and unregistered photographs, warnings, and advice. Raises LumigraphError for
-    a damaged capture.json."""
+    """Findings of the capture, with advice. Raises LumigraphError for a damaged capture.json."""
     result = progress.capture_result(item)
     if result is None:
         return None

@@ -31,7 +31,7 @@ from .. import methods
 from ..budget import Quality
 from ..errors import LumigraphError
 from ..files import expanded, refusal, refuse_link
-from ..files.locks import held
+from ..files.locks import lock_folder
 from ..files.ranges import Count, Downscale, Pixels
 from ..system.children import REQUESTED
 from ..viewer.address import Address
@@ -593,7 +593,7 @@ def serve(root: Path, address: Address, opened: Callable[[], object]) -> None:
     for folder in (place, projects.trash_folder(root)):
         refuse_link(folder)
     place.mkdir(parents=True, exist_ok=True)
-    with held(place, "served"):
+    with lock_folder(place, "served"):
         app = App(root, address)
         config = uvicorn.Config(
             build(app),

@@ -92,9 +92,7 @@ class Album:
         return self._count >= MAX_FILES
 
     def find(self, name: str, size: int, content: str | Path) -> str | None:
-        """Name of the file with this content among those of a requested name. content: hash, or a file of that
-        content
-        """
+        """Name of the file with this content among those of a requested name. content: hash, or a file of it"""
         key = name, size
         with self.lock:
             for one in self._unread.pop(key, ()):
@@ -216,9 +214,7 @@ class Upload:
             raise LumigraphError(f"{self.name} could not be written ({error.strerror}); drop it again") from error
 
     def _finish(self) -> str:
-        """Give a complete file its name. Raises LumigraphError, and deletes it, if its content is not of its
-        declared type.
-        """
+        """Give a complete file its name. Raises LumigraphError, and deletes it, for content of another type."""
         try:
             if fault := fault_of(self.partial, self.name):
                 raise LumigraphError(fault)

@@ -34,7 +34,7 @@ class Crop(ABC):
         """Entry and exit distances of each ray; exit is before entry for a miss."""
 
     @abstractmethod
-    def moved(self, place: Similarity) -> Crop:
+    def transformed(self, place: Similarity) -> Crop:
         """The same part of space in another frame. place: from this frame to that one"""
 
     @property
@@ -84,7 +84,7 @@ class CropBox(Crop):
         enter, leave = rays.through_box(rays.origins.new_tensor((self.lower, self.upper)))
         return enter * here.scale, leave * here.scale
 
-    def moved(self, place: Similarity) -> CropBox:
+    def transformed(self, place: Similarity) -> CropBox:
         return replace(self, place=(place @ self._place).rows)
 
     @property
@@ -109,8 +109,7 @@ class Sphere(Crop):
 
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
         """Solve |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), b the distance along the ray of its point closest to m, a
-        that point's distance from m.
-        """
+        that point's distance from m."""
         away = torch.tensor(self.middle).to(rays.origins) - rays.origins
         nearest = (away * rays.directions).sum(-1)
         beside = (away - nearest[:, None] * rays.directions).square().sum(-1)
@@ -118,7 +117,7 @@ class Sphere(Crop):
         hit = beside < self.radius**2
         return torch.where(hit, nearest - half, torch.inf), torch.where(hit, nearest + half, -torch.inf)
 
-    def moved(self, place: Similarity) -> Sphere:
+    def transformed(self, place: Similarity) -> Sphere:
         x, y, z = place.points(torch.tensor(self.middle, dtype=torch.float64)).tolist()
         return Sphere((x, y, z), self.radius * place.scale)
 

@@ -46,8 +46,7 @@ class Rays:
         return self.origins + t[:, None] * self.directions
 
     def through_box(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Entry and exit distances of each ray in a box (the slab test of Kay & Kajiya 1986); exit is before entry
-        for a miss."""
+        """Entry and exit distances of each ray in a box (slabs, Kay & Kajiya 1986); exit is before entry for a miss."""
         slow = self.directions.abs() < 1e-9
         inverse = 1 / torch.where(slow, 1e-9, self.directions)
         a, b = (box[0] - self.origins) * inverse, (box[1] - self.origins) * inverse

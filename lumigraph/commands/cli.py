@@ -30,7 +30,7 @@ from .. import __version__, methods
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import refusal
 from ..files.options import option_name
-from ..files.ranges import coherent, domain, groups_of, is_surprising, members, outside, shown
+from ..files.ranges import coherent, domain, format_value, groups_of, is_surprising, members, outside
 from ..system.signals import exit_code, listening, number_of
 from ..system.work import at_work
 from .common import say, value_of
@@ -93,7 +93,7 @@ def held(command: Any) -> Any:
     """A command as it was typed. Raises LumigraphError for a number beyond its range, and for those that disagree."""
     for name, kind, value in outside(command):
         called = option_name(name, kind).replace("_", "-")
-        typed = " ".join(map(shown, value)) if isinstance(value, tuple) else shown(value)
+        typed = " ".join(map(format_value, value)) if isinstance(value, tuple) else format_value(value)
         numbers = "numbers" if isinstance(value, tuple) else "a number"
         raise LumigraphError(f"--{called} cannot be {typed}; give it {numbers} from {domain(kind)}")
     coherent(command)

@@ -30,7 +30,7 @@ class Resume(ViewerOptions, ResumeOptions):
         if is_block_run(self.run_folder):
             return self._go_on_in_blocks(self.run_folder)
         run = Run(self.run_folder)
-        with run.held():
+        with run.lock():
             return self._go_on(run)
 
     def _go_on_in_blocks(self, folder: Path) -> int:

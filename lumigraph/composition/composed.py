@@ -88,7 +88,7 @@ class Composed(Method):
         """The same composition with each part's values of controls."""
         told = super().given(*evidence, **controls)
         assert isinstance(told, Composed)
-        told.pieces = tuple(part.given(controls) for part in self.pieces)
+        told.pieces = tuple(part.with_controls(controls) for part in self.pieces)
         return told
 
     def refined(self, cameras: Camera) -> Camera:

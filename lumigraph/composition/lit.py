@@ -27,8 +27,8 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..camera.rays import Rendering
 from ..color.blending import over
-from ..components.fields.development import decoded, encoded
 from ..components.fields.mesh_picture import picture, projected
+from ..components.training.development import decoded, encoded
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..errors import LumigraphError

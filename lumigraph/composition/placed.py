@@ -87,7 +87,7 @@ class Placed:
         seen = needs(self.method, RendersRays).render_rays(self._inward(rays, 0.0), background)
         return replace(seen, depth=seen.depth * self.place.scale)
 
-    def given(self, controls: dict[str, Value]) -> Placed:
+    def with_controls(self, controls: dict[str, Value]) -> Placed:
         """The same part with the values of controls that its method has."""
         mine = {x.name for x in self.method.controls if self.leads or not x.of_photographs} & controls.keys()
         return replace(self, method=self.method.given(**{name: controls[name] for name in mine})) if mine else self
@@ -153,9 +153,9 @@ def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, CropBox 
     farthest = lead.reach
     for frame, place, box in others:
         interest = box or CropBox(*frame.bounds)
-        corners.append(interest.moved(place).corners.float())
+        corners.append(interest.transformed(place).corners.float())
         all_of_it = interest if box or not frame.is_open else CropBox((-frame.reach,) * 3, (frame.reach,) * 3)
-        farthest = max(farthest, float(all_of_it.moved(place).corners.abs().max()))
+        farthest = max(farthest, float(all_of_it.transformed(place).corners.abs().max()))
     points = torch.cat(corners)
     lower, upper = ((x, y, z) for x, y, z in (points.amin(0).tolist(), points.amax(0).tolist()))
     reach = lead.reach

@@ -1,9 +1,8 @@
 """VoxelMask: a part of a field by voxels, as `lumigraph segment` writes it; and its file.
 
-object    (x, y, z), 1 in voxels of the part
-observed  (x, y, z), 1 in voxels that photographs saw; the colour of any other is a guess and is shown as unknown
-lower     lower corner of the grid in the frame of the method's scene
-edge      of a voxel, scene units
+object    (x, y, z), 1 in voxels of the part observed  (x, y, z), 1 in voxels that photographs saw; the colour of any
+other is a guess and is shown as unknown lower     lower corner of the grid in the frame of the method's scene edge
+of a voxel, scene units
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ class VoxelMask(Crop):
             return torch.zeros_like(rays.radius), torch.full_like(rays.radius, torch.inf)
         return self.box.through(rays)
 
-    def moved(self, place: Similarity) -> VoxelMask:
+    def transformed(self, place: Similarity) -> VoxelMask:
         return replace(self, place=place @ self.place)
 
     @property
@@ -78,7 +77,7 @@ class VoxelMask(Crop):
             (cells.amin(0), cells.amax(0) + 1) if len(cells) else (torch.zeros(3), torch.tensor(self.part.shape))
         )
         (a, b, c), (d, e, f) = ((torch.tensor(self.lower) + self.edge * x).tolist() for x in (first, last))
-        return CropBox((a, b, c), (d, e, f)).moved(self.place)
+        return CropBox((a, b, c), (d, e, f)).transformed(self.place)
 
     @property
     def bounds(self) -> tuple[Vector, Vector]:
@@ -95,8 +94,7 @@ class VoxelMask(Crop):
 def mask_of(
     chosen: Bool[np.ndarray, "x y z"], seen: Bool[np.ndarray, "x y z"], lower: Vector, edge: float
 ) -> VoxelMask:
-    """Mask of chosen voxels among those that photographs saw. Any other voxel, such as the inside of an object, follows
-    the nearest visible one."""
+    """Mask of chosen voxels among visible ones; hidden ones, such as an object's inside, follow the nearest visible."""
     nearest = distance_transform_edt(~seen, return_distances=False, return_indices=True)
     part = torch.from_numpy(chosen[tuple(nearest)].astype(np.uint8))
     return VoxelMask(part, torch.from_numpy(seen.astype(np.uint8)), lower, edge)

@@ -66,8 +66,7 @@ class Moves:
 
 
 def moves(source: Camera, target: Camera, frame: Frame) -> Moves:
-    """Distances between two lists of cameras in the same order, after alignment, since photographs do not determine the
-    common frame."""
+    """Distances between two aligned lists of cameras in the same order; photographs do not determine the frame."""
     there = source.to("cpu").transformed(aligning(source.to("cpu"), target.to("cpu")).matrix)
     low, high = torch.tensor(frame.bounds)
     apart = (there.position - target.position.cpu()).norm(dim=-1)

@@ -72,8 +72,7 @@ class Skeleton:
         return len(self.names)
 
     def check(self) -> None:
-        """Raise LumigraphError for a skeleton without bones, poses of other bones, joints all in one place, and times
-        out of order."""
+        """Raise LumigraphError for no bones, poses of other bones, joints all in one place, and times out of order."""
         count = len(self.names)
         if not count or len(self.parents) != count:
             raise LumigraphError(f"A skeleton has {count} names and {len(self.parents)} parents; give one of each bone")
@@ -104,12 +103,12 @@ class Skeleton:
     def transformed(self, frame: Similarity) -> Skeleton:
         """The same skeleton in another frame."""
 
-        def moved(pose: BonePose) -> BonePose:
+        def transform_pose(pose: BonePose) -> BonePose:
             matrices = pose.matrices
             turned = frame.rotation @ matrices[:, :, :3]
             return BonePose.of(torch.cat([turned, frame.points(matrices[:, :, 3])[:, :, None]], -1))
 
-        return replace(self, rest=moved(self.rest), poses=tuple(map(moved, self.poses)))
+        return replace(self, rest=transform_pose(self.rest), poses=tuple(map(transform_pose, self.poses)))
 
     def track(self) -> Float[Tensor, "moment bone 3 4"]:
         """Joint-to-frame matrices of all poses, in double precision."""

@@ -31,8 +31,7 @@ class Words:
 
     @staticmethod
     def read(source: str, guidance: str | Path | None = None) -> Words:
-        """The prompt of a source "words:<prompt>". Raises LumigraphError for an empty or too long one, and for
-        missing guidance."""
+        """Prompt of "words:<prompt>". Raises LumigraphError for an empty or too long one, and missing guidance."""
         prompt = " ".join(source.removeprefix(WORDS).split())
         if not prompt or len(prompt) > MAX_LETTERS:
             wrong = "is empty" if not prompt else f"has {len(prompt):,} letters"

@@ -35,9 +35,7 @@ def depth_at(depth, x, y, edge):
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def compare(pixels, valid, away, depth, edge, edge_per_distance, ahead, smooth):
-    """Loop of DepthMap.compare: distance of the surface behind each point; NaN outside the picture and for
-    unmeasured.
-    """
+    """Loop of DepthMap.compare: distance of the surface behind each point; NaN outside and for unmeasured."""
     height, width = depth.shape
     for i in prange(len(away)):
         x, y = pixels[i, 0], pixels[i, 1]

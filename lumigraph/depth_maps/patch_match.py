@@ -115,8 +115,7 @@ class PatchMatch:
     def reprojection_error(
         self, pixels: Int[Tensor, " pixel"], inverse: Float[Tensor, "pixel plane"], views: Int[Tensor, "pixel view"]
     ) -> Float[Tensor, "pixel plane view"]:
-        """Forward-backward reprojection error in pixels, through a neighbour's plane at the projection (Schönberger
-        2016, eq. 9)."""
+        """Forward-backward reprojection error in pixels, through a neighbour's plane (Schönberger 2016, eq. 9)."""
         width = self.view.trust.shape[1]
         x, y = (pixels % width + 0.5)[:, None, None], (pixels // width + 0.5)[:, None, None]
         u, v, there = warped(self.warps[views][:, None], x, y, inverse[..., None])

@@ -151,9 +151,7 @@ def sharpened(
 
 
 def jump_penalties() -> UInt8[Tensor, 256]:
-    """P2 for each difference of grey levels: less at edges, where depth discontinuities are likely (Hirschmüller
-    2008, eq. 14).
-    """
+    """P2 for each difference of grey levels: less at edges, likely depth edges too (Hirschmüller 2008, eq. 14)."""
     return (JUMP_PENALTY * torch.exp(-torch.arange(256) / JUMP_EDGE)).clamp_min(MIN_JUMP_PENALTY).to(torch.uint8)
 
 

@@ -39,9 +39,7 @@ class VoxelBlocks(nn.Module):
     table: Int32[Tensor, " slot"]
 
     def __init__(self, edge: float, truncation: float, max_weight: float = math.inf, max_blocks: int = 1 << 24):
-        """Create an empty field. edge: of a voxel, scene units; truncation: in voxels; max_blocks: limit of
-        allocation
-        """
+        """Create an empty field. edge: of a voxel, scene units; truncation: in voxels; max_blocks: limit"""
         super().__init__()
         self.edge, self.truncation, self.max_weight, self.max_blocks = edge, truncation * edge, max_weight, max_blocks
         self.register_buffer("blocks", torch.empty(0, 3, dtype=torch.int32))
@@ -76,8 +74,7 @@ class VoxelBlocks(nn.Module):
     def _new_blocks(
         self, depth: Float[Tensor, "height width"], pose: Float[Tensor, "3 4"], lens: Float[Tensor, " 4"]
     ) -> Int32[Tensor, "new 3"]:
-        """Missing blocks around surfaces: by rays of pixels, PIXELS_PER_SIDE to the side of a block at the median
-        depth."""
+        """Missing blocks around surfaces: by rays of pixels, PIXELS_PER_SIDE to a block's side at median depth."""
         side, known = SIDE * self.edge, depth[::8, ::8].nan_to_num(0.0, 0.0)
         measured = known[known > 0]
         typical = float(measured.median()) if measured.numel() else 0.0

@@ -1,1 +1,1 @@
-"""Runs made of runs: converted, compressed, aligned within a category."""
+"""Derived runs: converted, compressed, aligned within a category."""

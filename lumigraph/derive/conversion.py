@@ -1,6 +1,6 @@
-"""Conversion: a method begins as what another one holds, learns on, and is compared with it.
+"""Conversion: a student is initialised from a teacher, trained further, and compared with it.
 
-The way from one to the other follows from their capabilities, so that a new method needs no entry here.
+The way of conversion follows from capabilities, so that a new method needs no entry here.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ def convert(
     show: bool = False,
     config: Any = None,
 ) -> Converted:
-    """A run of the method of that name in a new folder, made of whatever was opened; gives what its convert.json says.
+    """Write a run of the named method in a new folder, converted from an opened model. Returns its convert.json.
 
-    output: a new or empty folder, or one in which the same conversion was interrupted, which continues
+    output: a new or empty folder, or one with the same interrupted conversion, which continues
     show:   whether stages and training are shown
     config: the student's numbers; None for its defaults on the device
     Raises LumigraphError for what cannot be converted, and Stopped after Ctrl-C, with the state saved.
@@ -141,10 +141,10 @@ def new_student(kind: type[Method], teacher: Method, device: torch.device, confi
 
 
 def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as_taken: bool) -> float:
-    """Let a student begin as its teacher, as far as it can: with what the teacher holds, and with its poses where both
-    learn them. Returns the seconds it took.
+    """Initialise a student from its teacher, as far as possible, and with its poses if both optimise them. Returns the
+    seconds it took.
 
-    as_taken: whether the data's cameras are as they were given, rather than as the teacher has refined them
+    as_taken: whether the data's cameras are the given ones, rather than the teacher's refined ones
     """
     begin = time.perf_counter()
     if can(student, RefinesPoses):
@@ -168,9 +168,9 @@ def budget_of(student: Method, data: Scene, aim: ConvertOptions) -> Budget:
 def created(
     source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, begun: ConversionStart
 ) -> Run:
-    """A run of the student as it begins, with the cameras and photographs of what it is made of.
+    """A run of the initialised student, with the teacher's cameras and photographs.
 
-    data: the photographs, or what stands in for them
+    data: the photographs, or renderings instead
     """
     options = None
     if isinstance(source, Run):
@@ -214,7 +214,7 @@ def way(teacher: type[Method], student: type[Method]) -> Way | None:
 
 
 def ways() -> dict[str, dict[str, Way | None]]:
-    """By the name of each installed method as teacher, the way into each as student."""
+    """Way of conversion by the names of teacher and student, for all installed methods."""
     kinds = {name: methods.find(name) for name in methods.available()}
     return {name: {other: way(teacher, student) for other, student in kinds.items()} for name, teacher in kinds.items()}
 
@@ -241,7 +241,7 @@ def octree_of(opened: Opened, seconds: float, device: torch.device | str) -> tup
 
 
 def check(source: Opened, student: type[Method]) -> None:
-    """Raise LumigraphError, in one sentence, unless what was opened can become a student."""
+    """Raise LumigraphError, in one sentence, unless an opened model can be converted to a student."""
     name = methods.name_of(student)
     if (reason := source.conversion_fault) is not None:
         raise LumigraphError(f"{source.path} {reason}")
@@ -264,7 +264,7 @@ class Shown:
 
 
 def shown(method: Method, scene: Scene | None, held_out: Camera, most: int) -> Shown:
-    """At most so many held-out views of a method: those of a scene with photographs, or, without one, of cameras."""
+    """At most `most` held-out views of a method: of a scene's photographs or, without one, of cameras."""
     views: dict[str, Tensor] = {}
 
     def keep(name: str, seen: Rendering) -> None:
@@ -283,16 +283,16 @@ def shown(method: Method, scene: Scene | None, held_out: Camera, most: int) -> S
 
 
 def likeness(one: Shown, other: Shown) -> float:
-    """Mean PSNR in dB of each view of one method against the other's."""
+    """Mean PSNR in dB between the views of two methods."""
     found = [psnr(one.views[name], other.views[name]) for name in one.views]
     return float(torch.tensor(found).mean())
 
 
 @torch.no_grad()
 def rendered_scene(teacher: Method, cameras: Camera, source: str, seconds: float) -> Scene:
-    """A Scene whose photographs are what a teacher shows from its cameras, and from others between them.
+    """A Scene of a teacher's renderings at its cameras, and at others between them.
 
-    seconds: that rendering may take, about
+    seconds: time for rendering, about
     """
     some = evenly(range(len(cameras)), MAX_VIEWS // 2)
     own = Camera.cat([cameras[i] for i in some])
@@ -314,7 +314,7 @@ def rendered_scene(teacher: Method, cameras: Camera, source: str, seconds: float
 
 
 def between(cameras: Camera) -> Camera:
-    """For each camera another one on the way to its nearest neighbour, which looks in between as well."""
+    """For each camera an interpolated one towards its nearest neighbour, with an intermediate direction."""
     apart = torch.cdist(cameras.position, cameras.position).fill_diagonal_(torch.inf)
     other = apart.argmin(-1)
 

@@ -1,4 +1,4 @@
-"""Completion of held-out shapes from evidence of them, beside retrieval of the training shape that fits it best."""
+"""Shape completion of held-out shapes from partial evidence, compared with retrieval of the best training shape."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RETRIEVAL_POINTS = 2000  # points of each training shape that a cloud is compare
 
 @dataclass(frozen=True)
 class Known:
-    """Evidence of a shape. piece: as `Method.given` takes it; points: of the surface, if it has them"""
+    """Evidence of a shape. piece: input of `Method.given`; points: of the surface, if it has them"""
 
     kind: Evidence
     piece: Shapes | Photograph
@@ -39,7 +39,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Completed:
-    """Scores of a held-out shape, by a method or by retrieval, and the seconds that finding it took."""
+    """Scores of a held-out shape, by a method or by retrieval, and seconds of inference."""
 
     by: str
     evidence: Evidence
@@ -76,12 +76,12 @@ def single() -> dict[str, Tensor]:
 
 
 def camera_of(shape: Shape) -> Camera:
-    """The camera of the picture, between those of pictures to learn from."""
+    """Camera of the picture, between those of training pictures."""
     return ring(shape.frame.bounds, size=PICTURE_SIZE, count=2 * PICTURE_VIEWS + 1)[PICTURE_VIEWS // 3]
 
 
 class Retrieval:
-    """The training shape that fits evidence best: nearest in mean distance of points, or in a picture's grey."""
+    """Retrieval of the training shape nearest to evidence, by mean distance of points or grey of a picture."""
 
     def __init__(self, shapes: Shapes):
         self.members = [shapes.members[i] for i in shapes.splits["train"].tolist()]
@@ -120,11 +120,11 @@ def seen(picture: Photograph) -> Float[Tensor, "height width"]:
 def completions(
     named: Sequence[tuple[str, Any]], shapes: Shapes, members: Sequence[int], points: int, cells: int
 ) -> Iterator[Completed]:
-    """Each held-out member as methods complete it from every kind of evidence that they take, and as retrieval does.
+    """Each held-out member completed by methods from every kind of evidence they accept, and by retrieval.
 
-    named:  methods by name, trained on the shapes; others than CodedSurface are passed over
-    points: in the volume and on each surface, that are compared
-    cells:  of the grid that surfaces are found with
+    named:  methods by name, trained on the shapes; others than CodedSurface are skipped
+    points: number of compared points in the volume and on each surface
+    cells:  of the grid of surface extraction
     """
     priors = [(name, method.eval()) for name, method in named if isinstance(method, CodedSurface)]
     kinds = dict.fromkeys(kind for _, method in priors for kind in method.taken_kinds)

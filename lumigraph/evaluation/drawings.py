@@ -1,4 +1,4 @@
-"""Pictures of drawn objects beside photographs: FID and KID, and cameras of both."""
+"""Generated objects compared with photographs: FID and KID, and cameras of both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_SIDE = 299  # pixels across, above which no network looks
 
 
 def photographs_of(data: Collection, count: int, seed: int, split: str = "train") -> tuple[Pictures, Camera]:
-    """Random photographs to learn from, of members of a split, as squares of one size, and their cameras."""
+    """Random training photographs of a split's members, as squares of one size, and their cameras."""
     generator, pictures, cameras = torch.Generator().manual_seed(seed), list[Tensor](), list[Camera]()
     side = 0
     for _ in track(range(count), "Reading photographs", count):
@@ -40,7 +40,7 @@ def photographs_of(data: Collection, count: int, seed: int, split: str = "train"
 
 @at_work()
 def drawn_pictures(method: Method, cameras: Camera, seed: int) -> Pictures:
-    """A picture of another drawn object through each camera; all cameras have one size."""
+    """A picture of a different generated object for each camera; all cameras have one size."""
     method.eval()
     if can(method, DrawsPictures):
         return needs(method, DrawsPictures).pictures(cameras, torch.Generator().manual_seed(seed)).clamp(0, 1)
@@ -52,8 +52,8 @@ def drawn_pictures(method: Method, cameras: Camera, seed: int) -> Pictures:
 def drawing_scores(
     method: Method, data: Collection, count: int, networks: Sequence[FeatureNetwork], seed: int = 0
 ) -> tuple[list[Score], dict[str, Any]]:
-    """FID and KID of drawn pictures against as many photographs that were learnt from, by each network; and how they
-    were computed. The drawn pictures are seen from the photographs' cameras."""
+    """FID and KID of generated pictures against as many training photographs, by each network; and the protocol.
+    Generated pictures have the photographs' cameras."""
     needs(method, CanDraw)
     real, cameras = photographs_of(data, count, seed)
     made = drawn_pictures(method, cameras, seed)

@@ -1,4 +1,4 @@
-"""Halves of held-out photographs: codes and poses are found on the left one, so that the right one is compared unseen.
+"""Halves of held-out photographs: codes and poses are fitted to the left one, and only the right one is compared.
 
 The code of a photograph outside the training set is unknown, and one fitted to all of it would include the answer
 (Martin-Brualla et al. 2021, section 5).
@@ -25,7 +25,7 @@ def judged_by_halves(method: Method) -> bool:
 
 
 def left_half(photograph: Photograph) -> Photograph:
-    """The same photograph, of which only pixels left of the middle are to be trusted."""
+    """The same photograph, with only pixels left of the centre trusted."""
     mask = photograph.mask
     trusted = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool) if mask is None else mask.clone()
     trusted[:, right_half(photograph)] = False

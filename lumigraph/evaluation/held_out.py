@@ -1,4 +1,4 @@
-"""Kinds of held-out views of a capture that moves: new cameras, new moments, or both."""
+"""Kinds of held-out views of a dynamic capture: new cameras, new times, or both."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ NAMES = {
 
 
 def held_out_kinds(scene: Scene) -> list[str | None]:
-    """For each photograph, which of its camera and its moment no photograph to learn from shares; None for all where
-    nothing says when photographs were taken."""
+    """Kind of each held-out photograph: new camera, new time or both; None for all without times."""
     cameras, times = scene.cameras, scene.frame.times
     if cameras.time is None or times is None:
         return [None] * len(scene)
@@ -34,5 +33,5 @@ def held_out_kinds(scene: Scene) -> list[str | None]:
 def among(
     rows: Float[Tensor, "row column"], others: Float[Tensor, "other column"], tolerance: float
 ) -> Bool[Tensor, " row"]:
-    """The rows that some other row equals within a tolerance."""
+    """Mask of rows that equal some other row within a tolerance."""
     return torch.cdist(rows.double(), others.double(), p=torch.inf).min(-1).values <= tolerance

@@ -1,8 +1,9 @@
-"""Poses of held-out photographs for a method that learnt poses: moved into its frame, then found on their left halves.
+"""Poses of held-out photographs for a method with pose optimisation: aligned to its frame, then fitted to their left
+halves.
 
-The protocol of Lin 2021 (BARF), section 5.1, which finds them on whole photographs. What is learnt from photographs and
-poses together has a frame of its own, so held-out cameras have other poses in it, and a picture that is off by a pixel
-would be scored as wrong.
+The protocol of Lin 2021 (BARF), section 5.1, which fits them to whole photographs. Scene and poses optimised together
+have a frame of their own, so held-out cameras have other poses in it, and a picture shifted by a pixel would score
+badly.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ PROTOCOL = (
 
 
 class HeldOutPoses:
-    """Camera poses of a scene's photographs for a method that refines poses.
+    """Camera poses of a scene's photographs for a method with pose optimisation.
 
-    `camera(i)` is photograph i's camera: as it was learnt, or if it was not learnt from, as it is found on its left
-    half. Nothing but this pose is free, and what is minimised is the error of colours alone: no regulariser, no pixel
-    left out. A method with codes of photographs shows its average, which is compared up to a gain and an offset of each
-    colour: a code that was never learnt would pull at the pose, and one found from a wrong pose takes contrast away.
+    `camera(i)` is photograph i's camera: the trained one, or for a held-out photograph the one fitted to its left half.
+    Only the pose is optimised, and only the error of colours minimised: no regulariser, no masked pixel. A method with
+    codes of photographs renders its average, which is compared up to a gain and an offset of each colour: an untrained
+    code would bias the pose, and one fitted at a wrong pose reduces contrast.
     """
 
     def __init__(self, method: Method, scene: Scene):
@@ -75,7 +76,7 @@ class HeldOutPoses:
 def colour_error(
     seen: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"], lit: bool = False
 ) -> Float[Tensor, ""]:
-    """Mean squared error of colours. lit: after the gain, not negative, and the offset of each that leave least"""
+    """Mean squared error of colours. lit: after the least-squares gain (not negative) and offset of each channel"""
     if lit:
         seen, target = seen - seen.mean(0), target - target.mean(0)
         seen = ((seen * target).mean(0) / seen.square().mean(0).clamp_min(1e-9)).clamp_min(0) * seen
@@ -83,7 +84,7 @@ def colour_error(
 
 
 def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
-    """For a method that refined poses; None for any other, which sees photographs from where they were taken."""
+    """Poses for a method that refined poses; None for any other, whose cameras are the given ones."""
     return HeldOutPoses(method, scene) if can(method, RefinesPoses) else None
 
 

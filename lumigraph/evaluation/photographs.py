@@ -1,4 +1,4 @@
-"""Examine the photographs that a run learnt from: residuals of their renderings, findings, and the five worst."""
+"""Examination of a run's training photographs: residuals of their renderings, findings, and the five worst."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def examine(run: Run, method: Method, scene: Scene, turn: Turn = nullcontext) ->
 
 
 def of_floaters(run: Run, method: Method, scene: Scene) -> list[Finding]:
-    """Finding on the floaters of a cloud of Gaussians; none for fewer than one in a thousand, and for other methods."""
+    """Finding on the floaters of a cloud of Gaussians; none below one in a thousand, and for other methods."""
     if not can(method, HasGaussians):
         return []
     gaussians = needs(method, HasGaussians).gaussians()
@@ -115,8 +115,8 @@ def examined(run: Run) -> Examined | None:
 
 @torch.no_grad()
 def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[Compared]:
-    """Each photograph beside its rendering through the refined camera, with its own exposure or appearance where the
-    method has learnt one; empty for fewer than four photographs."""
+    """Each photograph beside its rendering by the refined camera, with its own trained exposure or appearance; empty
+    for fewer than four photographs."""
     splits = {int(i): name for name, index in scene.splits.items() for i in index}
     chosen = sorted(splits)
     if len(chosen) < MIN_JUDGED:
@@ -145,9 +145,9 @@ def compare_all(method: Method, scene: Scene, turn: Turn = nullcontext) -> list[
 
 
 def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Photograph, Camera, Rendering]:
-    """A photograph reduced to a longer side, its refined camera, and the rendering with its own exposure or appearance
-    where the method has learnt one. Gaussians are drawn at the photograph's size and reduced like it: drawn small, they
-    would be widened by their low-pass filter, which costs 3 to 8 dB."""
+    """A photograph reduced to a longer side, its refined camera, and the rendering with its own trained exposure or
+    appearance. Gaussians are rendered at the photograph's size and reduced like it: at small size their low-pass filter
+    would widen them, which costs 3 to 8 dB."""
     whole = scene.photograph(index)
     factor = max(1, round(int(whole.camera.size.max()) / side))
     shot = whole.reduced(factor)
@@ -163,9 +163,9 @@ def rendered(method: Method, scene: Scene, index: int, side: float) -> tuple[Pho
 
 
 def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[int], float]:
-    """The photographs that can be rendered in about 10 s, evenly spread, and the longer side in pixels of each.
+    """Photographs that can be rendered in about 10 s, evenly spread, and the longer side in pixels of each.
 
-    camera: of one of them, with which the speed is measured
+    camera: of one of them, to measure the speed
     """
     cloud = can(method, HasGaussians)
     tried = camera if cloud else camera.resized(min(1.0, MIN_SIDE / int(camera.size.max())))
@@ -182,14 +182,14 @@ def affordable(method: Method, camera: Camera, chosen: list[int]) -> tuple[list[
 
 
 def fit(rgb: Float[Tensor, "pixel 3"], truth: Float[Tensor, "pixel 3"]) -> float:
-    """PSNR in dB of colours, after the gain, not negative, and the offset that bring them nearest to the truth."""
+    """PSNR in dB of colours after the least-squares gain (not negative) and offset."""
     mean, x = truth.mean(0), rgb - rgb.mean(0)
     gain = (x * (truth - mean)).mean(0) / x.square().mean(0).clamp_min(1e-9)
     return psnr((mean + gain.clamp_min(0) * x).clamp(0, 1), truth)
 
 
 def floating(maps: Sequence[DepthMap]) -> list[float]:
-    """Share of each map's surface that at least two of the nearest other cameras see past."""
+    """Share of each map's surface that lies in the free space of at least two of the nearest other cameras."""
     places = torch.cat([seen.camera.position for seen in maps]) if maps else torch.zeros(0, 3)
     shares = []
     for i, seen in enumerate(maps):

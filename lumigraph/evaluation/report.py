@@ -1,4 +1,4 @@
-"""A run on one page: figures, film, curves, contact sheet and settings in one HTML file that needs nothing else."""
+"""Report: a run on one self-contained HTML page with figures, film, curves, contact sheet and settings."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 
 
 def write_report(run: Run) -> Path:
-    """Write RUN/report.html from what the run's folder holds: the more commands have run, the more it shows."""
+    """Write RUN/report.html from the run's files: it shows the results of all commands so far."""
     path = claim_report(run)
     evaluation = run.evaluation()
     body = header(run, evaluation) + films(run) + previews(run) + curves(run) + views(run, evaluation) + cameras(run)
@@ -105,7 +105,7 @@ def counted(run: Run) -> str:
 
 
 def heading(title: str, sentence: str, figures: Sequence[tuple[str, str, str]]) -> str:
-    """The top of a page. figures: value, unit, and what it is the value of."""
+    """Top of a page. figures: value, unit, and name"""
     cells = "".join(
         f"<div><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(label)}</span></div>"
         for value, unit, label in figures

@@ -1,4 +1,4 @@
-"""Evaluate a run or a collection under the protocol for its kind of dataset, and write the files of the outcome."""
+"""Evaluate a run or a collection under the protocol for its kind of dataset, and write the results."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ Keep = Callable[[str, Rendering], object]
 class Evaluated(Protocol):
     """Result of every protocol.
 
-    scores:   means over all that was compared, the headline first
-    compared: what that was, in a few words
+    scores:   means over all compared items, the headline first
+    compared: description of these items
     """
 
     @property
@@ -59,7 +59,7 @@ def evaluate_on(
     keep: Keep = lambda name, rendering: None,
     lpips: Lpips | None = None,
 ) -> Evaluated:
-    """A method on a dataset, under the protocol for its kind.
+    """Evaluate a method on a dataset, under the protocol for its kind.
 
     keep: receives each view's name and rendering, where views are compared
     lpips: the network of the options' files
@@ -133,7 +133,7 @@ def evaluate_collection(
     keep: Keep = lambda name, rendering: None,
     lpips: Lpips | None = None,
 ) -> ViewsEvaluation | ShapesEvaluation:
-    """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
+    """Evaluate each member of a split on its own held-out views or as a shape, and combine the results.
 
     keep:  receives each view's name and rendering; names begin with the member's
     options: of which the views are those of each member

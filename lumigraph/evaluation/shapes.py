@@ -1,4 +1,4 @@
-"""Evaluate a trained method's surface against the shapes that it learnt, under a stated protocol."""
+"""Evaluate a trained method's surface against its training shapes, under a stated protocol."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ STEPS, TOUCHING_DISTANCE, MAX_OVERSHOOT = 200, 2e-3, 6.0
 
 @dataclass(frozen=True)
 class ShapeScore:
-    """One shape. iou is None of a cloud of points, which has no inside; normals where it has none."""
+    """Scores of one shape. iou is None for a point cloud, which has no inside; normals if it has none."""
 
     name: str
     chamfer: float
@@ -59,7 +59,7 @@ class ShapeScore:
 
 @dataclass(frozen=True)
 class ShapesEvaluation:
-    """All shapes of a split, and how they were compared. shown: some shapes' pictures: true, learnt, rendered."""
+    """Scores of all shapes of a split, and the protocol. shown: some shapes' pictures: true, learnt, rendered"""
 
     shapes: list[ShapeScore]
     protocol: dict[str, Any]
@@ -89,7 +89,7 @@ class ShapesEvaluation:
         }
 
     def contact_sheet(self, title: str) -> Image.Image:
-        """The normals of the true and of the learnt surface of the shown shapes, and what the method renders."""
+        """Normals of the true and of the learnt surface of some shapes, and the method's renderings."""
         about = {shape.name: shape for shape in self.shapes}
         rows = []
         for name, pictures in self.shown.items():
@@ -111,10 +111,10 @@ def evaluate_shapes(
     """Compare a method's surface with the shapes of a split, each in its own scene units.
 
     points: in the volume, and on each surface
-    cells:  along the longest side of the box in which the surface is looked for
+    cells:  along the longest side of the box of surface extraction
     size:   pixels of the pictures
-    Of several shapes each is told to the method first, if it accepts Shapes. Raises LumigraphError for a split without
-    shapes, and for a method in which there is no surface.
+    With several shapes, a method that accepts Shapes gets each as evidence first. Raises LumigraphError for a split
+    without shapes, and for a method without a surface.
     """
     split, most = options.split, options.views
     chosen = shapes.splits.get(split)
@@ -140,7 +140,7 @@ def evaluate_shapes(
 
 
 def compare_shapes(true: Shape, learnt: Shape, method: object, points: int) -> ShapeScore:
-    """A shape and what was learnt of it. Where the method knows distances, they say what is inside."""
+    """Compare a shape with the learnt one. A method's distances, if it has them, determine what is inside."""
     generator = torch.Generator().manual_seed(0)
     a, b = learnt.surface(points, generator), true.surface(points, generator)
     size = float(np.ptp(true.mesh.vertices, 0).max())
@@ -157,8 +157,8 @@ def compare_shapes(true: Shape, learnt: Shape, method: object, points: int) -> S
 
 
 def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
-    """The surface that a method holds: its own mesh, the zero level of its distance, or what `export mesh` makes of it.
-    Raises LumigraphError where there is none."""
+    """Surface of a method: its own mesh, the zero level of its distance, or that of `export mesh`. Raises
+    LumigraphError for an empty one."""
     if can(method, HasMesh):
         return needs(method, HasMesh).mesh()
     box = CropBox(*frame.bounds)
@@ -174,7 +174,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
 
 
 def distances(method: Any, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-    """A method's distances, asked for on its device, some at a time."""
+    """A method's distances, evaluated on its device in chunks."""
     return torch.cat([method.distance(part.to(method.device)).cpu().float() for part in points.split(POINTS_PER_CHUNK)])
 
 
@@ -188,7 +188,7 @@ def portrait(shape: Shape, camera: Camera) -> Float[Tensor, "height width 3"]:
 
 
 def seen_points(shape: Shape, camera: Camera) -> tuple[Float[Tensor, "hit 3"], Bool[Tensor, " pixel"]]:
-    """The points of a surface that a camera sees, by sphere tracing (Hart 1996), and the pixels that see one."""
+    """Visible surface points of a camera, by sphere tracing (Hart 1996), and a mask of pixels that hit."""
     rays = camera.rays(camera.pixels())
     depth, walking = torch.zeros(len(rays)), torch.arange(len(rays))
     for _ in range(STEPS):
@@ -201,7 +201,7 @@ def seen_points(shape: Shape, camera: Camera) -> tuple[Float[Tensor, "hit 3"], B
 
 
 def protocol(shapes: Shapes, split: str, compared: list[int], points: int, cells: int) -> dict[str, Any]:
-    """All that one must know to compare these figures with others."""
+    """Protocol: everything needed to compare these figures with others."""
     return {
         "split": split,
         "shapes": len(compared),

@@ -1,4 +1,4 @@
-"""Trajectories that were found by tracking: files, errors against known poses, a plot of the drift."""
+"""Trajectories of tracking: files, errors against known poses, a plot of the drift."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ MIN_POSES = 3  # frames that errors are measured on
 
 @dataclass(frozen=True)
 class Tracked:
-    """Poses that a method found, in the source's frame.
+    """Poses estimated by a method, in the source's frame.
 
     images:  their numbers in the scene, in the order of exposure; lost: those of frames where tracking failed
-    moments: seconds, or the number of the frame where the source knows no times
-    truth:   poses of the source; None where it knows none
+    moments: seconds, or frame numbers for a source without times
+    truth:   poses of the source; None if unknown
     """
 
     images: list[int]
@@ -43,7 +43,7 @@ class Tracked:
 
     @staticmethod
     def of(method: Any, scene: Scene) -> Tracked:
-        """method: one with a `tracker`"""
+        """Poses of a method with a `tracker`."""
         state, order = method.tracker.trajectory.state.cpu(), order_of(scene.cameras)
         chosen = order[state[order] == KNOWN]
         cameras = method.refined(scene.cameras[chosen]).transformed(scene.frame.to_source.matrix)
@@ -76,7 +76,7 @@ class Tracked:
 
 
 def tracks(method: Method) -> bool:
-    """True for a method that finds poses in order: see `lumigraph track`."""
+    """True for a method that tracks poses: see `lumigraph track`."""
     tracking = getattr(method.config, "tracking", None)
     return bool(tracking is not None and tracking.track)
 

@@ -1,7 +1,7 @@
 """Evaluate a trained method on held-out views, under a stated protocol.
 
-A method with a code for each photograph is given the left half of a held-out one and compared on the right (`halves`).
-Raw photographs are compared as light without noise (Mildenhall 2022, section 5.1).
+A method with a code for each photograph is fitted to the left half of a held-out one and compared on the right
+(`halves`). Raw photographs are compared as noise-free linear light (Mildenhall 2022, section 5.1).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..components.fields.development import decoded, encoded
+from ..components.training.development import decoded, encoded
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
 from ..errors import LumigraphError
@@ -55,11 +55,11 @@ Likeness = Float[Tensor, "inner_height inner_width 3"]  # SSIM of the windows wi
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view: PSNR in dB, SSIM, the seconds that rendering it took, LPIPS where its weights are at hand, PSNR
-    against the photograph without passers-by where that is known, PSNR and SSIM of what moves alone where its mask is
-    known, and fine detail where the photograph has any.
+    """Scores of one view: PSNR in dB, SSIM, rendering seconds, LPIPS if its weights are available, PSNR against the
+    photograph without transient objects if known, PSNR and SSIM of moving objects if their mask is known, and fine
+    detail if the photograph has any.
 
-    held_out: of a capture that moves, camera or moment; see `held_out_kinds`
+    held_out: of a dynamic capture, camera or time; see `held_out_kinds`
     """
 
     name: str
@@ -78,10 +78,10 @@ class ViewScore:
 
 @dataclass(frozen=True)
 class ViewsEvaluation:
-    """All views of a split, and how they were compared.
+    """Scores of all views of a split, and the protocol.
 
-    compile_seconds: spent ahead of the first view
-    members: of a collection, whose means are averaged, so that each counts the same however many views it has
+    compile_seconds: spent before the first view
+    members: of a collection, whose means are averaged, so that each has the same weight for any number of views
     """
 
     views: list[ViewScore]
@@ -112,22 +112,22 @@ class ViewsEvaluation:
 
     @property
     def clean_psnr(self) -> float | None:
-        """Mean PSNR against photographs without passers-by; None where these are not known."""
+        """Mean PSNR against photographs without transient objects; None if unknown."""
         return mean_known(each.clean_psnr for each in self._averaged)
 
     @property
     def moving_psnr(self) -> float | None:
-        """Mean PSNR of what moves alone; None where no mask of it is known."""
+        """Mean PSNR of moving objects alone; None without their mask."""
         return mean_known(each.moving_psnr for each in self._averaged)
 
     @property
     def moving_ssim(self) -> float | None:
-        """Mean SSIM of what moves alone, likewise."""
+        """Mean SSIM of moving objects alone, likewise."""
         return mean_known(each.moving_ssim for each in self._averaged)
 
     @property
     def depth_error(self) -> float | None:
-        """Mean error of depth in percent of the distance; None where none was measured."""
+        """Mean error of depth in percent of the distance; None without measurements."""
         return mean_known(each.depth_error for each in self._averaged)
 
     @property
@@ -149,7 +149,7 @@ class ViewsEvaluation:
 
     @property
     def by_held_out(self) -> dict[str, ViewsEvaluation]:
-        """The views alone of new cameras, of new moments or of both, of a capture that moves."""
+        """Views of a dynamic capture by kind: new cameras, new times or both."""
         return self._by("held_out")
 
     def _by(self, name: str) -> dict[str, ViewsEvaluation]:
@@ -337,16 +337,16 @@ def of_pixels(
 
 
 def of_windows(likeness: Likeness, mask: Bool[Tensor, "height width"]) -> float | None:
-    """Mean SSIM of the windows whose middle is in a mask; None where there are none."""
+    """Mean SSIM of the windows with centres in a mask; None without any."""
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
     return float(inner.mean()) if len(inner) else None
 
 
 def depth_error(seen: Rendering, measured: Float[Tensor, "height width"]) -> float | None:
-    """Mean error of a rendering's depth in percent of the measured distance; None where nothing was measured.
+    """Mean error of a rendering's depth in percent of the measured distance; None without measurements.
 
-    A pixel that shows nothing, or a surface at more than twice the distance, is off by 100 %.
+    The error of an empty pixel, and of a surface at more than twice the distance, is 100 %.
     """
     known = measured.isfinite() & (measured > 0)
     if not known.any():
@@ -356,7 +356,7 @@ def depth_error(seen: Rendering, measured: Float[Tensor, "height width"]) -> flo
 
 
 def warm_up(method: Method, camera: Camera) -> float:
-    """Render a very small picture, so that what is compiled on first use does not count. Returns the seconds."""
+    """Render a very small picture, to exclude compilation on first use. Returns the seconds."""
     begin = time.perf_counter()
     method.render(camera.resized(min(1.0, WARM_UP_SIZE / int(camera.size.max()))))
     return time.perf_counter() - begin
@@ -365,7 +365,7 @@ def warm_up(method: Method, camera: Camera) -> float:
 def protocol(
     scene: Scene, split: str, compared: list[int], lpips: Lpips | None, method: Method, right_halves: bool = False
 ) -> dict[str, Any]:
-    """All that one must know to compare these figures with others."""
+    """Protocol: everything needed to compare these figures with others."""
     captured = scene.cameras[torch.tensor(compared)]
     refined = not torch.equal(method.refined(captured).pose.cpu(), captured.pose)
     sizes = list(dict.fromkeys(resolution(*size) for size in scene.cameras.size[compared].tolist()))
@@ -407,9 +407,9 @@ def mean_known(values: Iterable[float | None]) -> float | None:
 
 
 def in_light(seen: Rendering, truth: Picture) -> tuple[Picture, Picture]:
-    """A rendering and the truth as pictures that can be compared, encoded in [0, 1].
+    """Rendering and truth as comparable pictures, encoded in [0, 1].
 
-    Where the rendering holds no light of its own (`radiance`), its picture is decoded.
+    A rendering without light of its own (`radiance`) is decoded.
     """
     light = seen.extra[LIGHT_LAYER] if LIGHT_LAYER in seen.extra else decoded(seen.rgb.clamp(0, 1))
     truth = truth.clamp(0, 1)
@@ -417,7 +417,7 @@ def in_light(seen: Rendering, truth: Picture) -> tuple[Picture, Picture]:
 
 
 def aligned(light: Picture, truth: Picture) -> Picture:
-    """a · light + b of each colour, with a and b that bring it nearest to the truth."""
+    """a · light + b of each colour, least squares against the truth."""
     x, y = light.double(), truth.double()
     mean_x, mean_y = x.mean((0, 1)), y.mean((0, 1))
     variance = (x - mean_x).square().mean((0, 1))
@@ -426,8 +426,8 @@ def aligned(light: Picture, truth: Picture) -> Picture:
 
 
 def reveal(method: Method, data: Dataset) -> Method:
-    """The method, told of a dataset if it accepts that kind: of photographs those to learn from, none held out,
-    and no more than `Method.evidence_views`."""
+    """The method with a dataset as evidence if it accepts that kind: of photographs training ones only, and no more
+    than `Method.evidence_views`."""
     if not isinstance(data, method.takes):
         return method
     if isinstance(data, Scene):

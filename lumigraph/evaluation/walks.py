@@ -1,6 +1,6 @@
-"""Evaluate pictures that a method imagines of a block world: how steady a walk is, and how well colours follow labels.
+"""Evaluate generated pictures of a block world: temporal consistency of a walk, and agreement of colours with labels.
 
-No photograph says how the world looks, so nothing is compared with one.
+There are no photographs to compare with.
 """
 
 from __future__ import annotations

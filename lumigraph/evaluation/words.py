@@ -1,4 +1,4 @@
-"""Evaluate a scene that was learnt from words: views that training has not drawn, judged by the guidance."""
+"""Evaluate a text-to-3D scene: views not used in training, scored by the guidance."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import shown
+from ..files.ranges import format_value
 from ..files.reading import reading
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
@@ -125,15 +125,15 @@ class Bundle:
         if self._archive is None:
             file = self.path / name
             if Path(name).name != name or file.is_symlink() or not file.is_file():
-                raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy the whole folder again")
+                raise LumigraphError(f"{self.path} lacks the file {format_value(name)}; copy the whole folder again")
             return file.read_bytes()
         if name not in self._archive.namelist():
-            raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again")
-        with reading(f"{self.path}: {shown(name)}", "is damaged", "download it again"):
+            raise LumigraphError(f"{self.path} lacks the file {format_value(name)}; copy or download it again")
+        with reading(f"{self.path}: {format_value(name)}", "is damaged", "download it again"):
             about = self._archive.getinfo(name)
             if about.file_size > max(SMALL_BYTES, MAX_RATIO * self.size):
                 size = f"{about.file_size:,} bytes"
-                raise LumigraphError(f"{self.path}: {shown(name)} would unpack to {size}; download it again")
+                raise LumigraphError(f"{self.path}: {format_value(name)} would unpack to {size}; download it again")
             with self._archive.open(about) as stream:
                 return stream.read(about.file_size)  # no more, whatever is there
 

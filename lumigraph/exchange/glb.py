@@ -23,7 +23,7 @@ from jaxtyping import Float
 from ..color.srgb import linear_from_srgb
 from ..errors import LumigraphError
 from ..files import write_bytes
-from ..files.ranges import shown
+from ..files.ranges import format_value
 from ..gaussians import Gaussians
 from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
@@ -58,7 +58,9 @@ def read(path: Path) -> Gaussians:
     """
     file = gltf.File(path)
     if unknown := sorted({*file.about.extensions_required} - KNOWN_EXTENSIONS):
-        raise LumigraphError(f"{path} needs {shown(', '.join(unknown))}, which is not read here; export it without")
+        raise LumigraphError(
+            f"{path} needs {format_value(', '.join(unknown))}, which is not read here; export it without"
+        )
     placed = [
         (primitive, matrix)
         for mesh, matrix in _placed(file)
@@ -116,14 +118,15 @@ def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
     about = primitive.extensions[EXTENSION]
     about = about if isinstance(about, dict) else {}
     if primitive.mode != POINTS or any(about.get(name) != value for name, value in KERNEL_PROPERTIES.items()):
-        found = f"mode {primitive.mode}, kernel {shown(about.get('kernel'))}, colours {shown(about.get('colorSpace'))}"
+        kernel, colours = format_value(about.get("kernel")), format_value(about.get("colorSpace"))
+        found = f"mode {primitive.mode}, kernel {kernel}, colours {colours}"
         raise LumigraphError(
             f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are "
             "read; export it as those"
         )
     if inner := about.get("extensions"):
         by = ", ".join(inner) if isinstance(inner, dict) else inner
-        raise LumigraphError(f"{file.path} packs its Gaussians by {shown(by)}; export it without compression")
+        raise LumigraphError(f"{file.path} packs its Gaussians by {format_value(by)}; export it without compression")
     bands = 1 + math.isqrt(max((i for i, name in enumerate(HARMONICS) if name in primitive.attributes), default=0))
     wanted = ["POSITION", ROTATION, SCALE, OPACITY, *HARMONICS[: bands**2]]
     if missing := [name for name in wanted if name not in primitive.attributes]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import LumigraphError
 from ..files import from_json
-from ..files.ranges import Coordinate, Tally, between, shown, typed
+from ..files.ranges import Coordinate, Tally, between, format_value, typed
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
@@ -266,8 +266,8 @@ class File:
         kind, width = KINDS.get(accessor.component_type), SHAPES.get(accessor.type)
         if kind is None or width not in widths or accessor.sparse is not None or accessor.buffer_view is None:
             raise LumigraphError(
-                f"{self.path}: accessor {index} is of a kind that is not read here ({shown(accessor.type)} of type "
-                f"{accessor.component_type}, sparse or without numbers); export it without compression"
+                f"{self.path}: accessor {index} is of a kind that is not read here ({format_value(accessor.type)} of "
+                f"type {accessor.component_type}, sparse or without numbers); export it without compression"
             )
         view = self.one(self.about.buffer_views, accessor.buffer_view, "buffer view")
         buffer = self.one(self.about.buffers, view.buffer, "buffer")

@@ -30,7 +30,7 @@ from PIL import Image
 
 from ..errors import LumigraphError
 from ..files import from_json, read_bytes, replacing_folder, write_bytes
-from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
+from ..files.ranges import Coordinate, Name, Tally, between, format_value, typed
 from ..files.reading import reading
 from ..gaussians import Gaussians
 from .checks import Bundle, check_room, zipped
@@ -159,15 +159,14 @@ def recognises(folder: Path) -> bool:
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .sog file or a folder. Raises LumigraphError for pictures that are missing, truncated, too small or too
-    large.
-    """
+    """Read a .sog file or a folder. Raises LumigraphError for pictures missing, truncated, too small or too large."""
     bundle = Bundle(path)
     fields = from_json(bundle.read(META), f"{META} of {path}")
     version = fields.get("version", 1) if isinstance(fields, dict) else None
     if version not in (1, VERSION):
         raise LumigraphError(
-            f"{path} is of version {shown(version)} of SOG, of which 1 and {VERSION} are read; save it as {VERSION}"
+            f"{path} is of version {format_value(version)} of SOG, of which 1 and {VERSION} are read; "
+            f"save it as {VERSION}"
         )
     return _read(bundle, fields) if version == VERSION else _read_old(bundle, fields)
 
@@ -231,12 +230,12 @@ class _Pictures:
         """A picture of at least so many pixels. Raises LumigraphError if it is invalid, smaller, or too large."""
         path, data = self.bundle.path, self.bundle.read(name)
         with (
-            reading(f"{path}: {shown(name)}", "cannot be read as a picture", "get it again"),
+            reading(f"{path}: {format_value(name)}", "cannot be read as a picture", "get it again"),
             Image.open(io.BytesIO(data), formats=FORMATS) as image,
         ):
             pixels = image.width * image.height
             if pixels < least:
-                found = f"{shown(name)} has {pixels:,} pixels where {least:,} are needed"
+                found = f"{format_value(name)} has {pixels:,} pixels where {least:,} are needed"
                 raise LumigraphError(f"{path}: {found}; get it again")
             check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
             return np.asarray(image.convert("RGBA"))
@@ -251,7 +250,9 @@ class _Pictures:
     def rotations(self, name: str) -> Quaternions:
         pixels = self.of(name)
         if (pixels[:, 3] < LARGEST_COMPONENT_ALPHA).any():
-            raise LumigraphError(f"{self.bundle.path}: {shown(name)} has pixels that are no rotations; export it again")
+            raise LumigraphError(
+                f"{self.bundle.path}: {format_value(name)} has pixels that are no rotations; export it again"
+            )
         largest = pixels[:, 3].astype(np.int64) - LARGEST_COMPONENT_ALPHA
         return with_largest(largest, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2))
 
@@ -265,8 +266,8 @@ class _Pictures:
         fits = image.shape[1] in widths and labels.max() < min(count or MAX_ENTRIES, PALETTE_ROW * image.shape[0])
         if not fits:
             raise LumigraphError(
-                f"{self.bundle.path}: {shown(files[0])} of {image.shape[1]} x {image.shape[0]} pixels does not hold "
-                f"the {labels.max() + 1:,} entries that {shown(files[1])} names; export it again"
+                f"{self.bundle.path}: {format_value(files[0])} of {image.shape[1]} x {image.shape[0]} pixels does not "
+                f"hold the {labels.max() + 1:,} entries that {format_value(files[1])} names; export it again"
             )
         return image[..., :3].reshape(PALETTE_ROW * image.shape[0], -1, 3)[:count], labels
 

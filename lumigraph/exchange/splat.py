@@ -26,9 +26,7 @@ RECORD = np.dtype(FIELDS)
 
 
 def read(path: Path) -> Gaussians:
-    """Read a .splat file. Raises LumigraphError for a partial last record, and for text. A file truncated between
-    records goes unnoticed.
-    """
+    """Read a .splat file. Raises LumigraphError for a partial record, and for text. Missing records go unnoticed."""
     check_room(path, path.stat().st_size // RECORD.itemsize)
     data = path.read_bytes()
     if not data[:1024].strip(string.printable.encode()):

@@ -196,9 +196,7 @@ def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Vectors:
 
 
 def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Quaternions:
-    """Quaternions of version 3: 2 bits name the largest of x, y, z, w; the others have a sign and 9 bits of
-    sqrt(1/2).
-    """
+    """Quaternions of version 3: 2 bits name the largest of x, y, z, w; others have a sign and 9 bits of sqrt(1/2)."""
     code = rotations.view("<u4").astype(np.int64)
     parts = code >> np.array([20, 10, 0])
     rest = np.where(parts & 512, -1, 1) * (parts & 511) * (math.sqrt(0.5) / 511)

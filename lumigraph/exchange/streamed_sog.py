@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 
 from ..errors import LumigraphError
 from ..files import read_json, replacing_folder
-from ..files.ranges import Name, Point, Tally, between, shown, typed
+from ..files.ranges import Name, Point, Tally, between, format_value, typed
 from ..gaussians import Gaussians, joined, simplified
 from ..geometry import to_matrix
 from ..system.progress import track
@@ -116,8 +116,8 @@ def read(folder: Path, level: int = 0) -> Gaussians:
         for row in (row for row in rows if row.file == number):
             if row.offset + row.count > len(held):
                 raise LumigraphError(
-                    f"{path} names {row.offset + row.count:,} Gaussians of {shown(meta.filenames[number])}, which "
-                    f"holds {len(held):,}; export it again"
+                    f"{path} names {row.offset + row.count:,} Gaussians of {format_value(meta.filenames[number])}, "
+                    f"which holds {len(held):,}; export it again"
                 )
             clouds.append(held[row.offset : row.offset + row.count])
     if meta.environment is not None:
@@ -138,13 +138,14 @@ def rows_of(meta: LodMeta, level: int, path: Path) -> Iterator[LodRow]:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The folder of SOG, or the .sog, that lod-meta.json names. Raises LumigraphError if it is missing or outside
-    the folder."""
+    """The folder of SOG, or the .sog, that lod-meta.json names. Raises LumigraphError if missing or outside."""
     there = folder / name
     if not there.resolve().is_relative_to(folder.resolve()):
-        raise LumigraphError(f"{folder / META} names {shown(name)}, which lies outside its folder; export it again")
+        raise LumigraphError(
+            f"{folder / META} names {format_value(name)}, which lies outside its folder; export it again"
+        )
     if not there.is_file():
-        raise LumigraphError(f"{folder} lacks the file {shown(name)}; copy the whole folder again")
+        raise LumigraphError(f"{folder} lacks the file {format_value(name)}; copy the whole folder again")
     return there.parent if there.name == sog.META else there
 
 

@@ -1,4 +1,4 @@
-"""Convex pieces of a mesh, which engines collide with in place of its triangles."""
+"""Convex decomposition of a mesh for collision detection in game engines."""
 
 from __future__ import annotations
 

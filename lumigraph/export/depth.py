@@ -50,12 +50,12 @@ def export_pair(
 
 
 def write_depth(folder: Path, scene: Scene, maps: Sequence[DepthMap], sheet: Image.Image | None = None) -> None:
-    """A folder that opens as a scene with a layer of depth: images, depth, transforms.json, and a contact sheet.
+    """Write a folder that opens as a scene with a depth layer: images, depth, transforms.json, and a contact sheet.
 
-    Depth is 16-bit distance along rays in units of a MAX_LEVEL-th of the farthest; 0 where it is not sure. Poses and
-    depth are in the capture's frame. Raises LumigraphError where nothing is sure.
+    Depth is 16-bit distance along rays in units of a MAX_LEVEL-th of the farthest; 0 for unreliable pixels. Poses and
+    depth are in the capture's frame. Raises LumigraphError if no pixel is reliable.
 
-    sheet: in place of that of `depth_sheet`
+    sheet: replaces that of `depth_sheet`
     """
     sure = [seen.depth[seen.solid] for seen in maps]
     if not any(map(len, sure)):
@@ -93,7 +93,7 @@ def about(camera: Camera, to_source: Any) -> dict[str, Any]:
 
 
 def depth_sheet(scene: Scene, maps: Sequence[DepthMap]) -> Image.Image:
-    """Photographs beside their depth, labelled with the share of sure pixels."""
+    """Photographs beside their depth, labelled with the share of reliable pixels."""
     within = depth_range(torch.cat([x.depth.flatten() for x in maps]), torch.cat([x.opacity.flatten() for x in maps]))
     rows = []
     for seen in maps:
@@ -105,7 +105,7 @@ def depth_sheet(scene: Scene, maps: Sequence[DepthMap]) -> Image.Image:
 
 
 def pair_sheet(source: str, names: tuple[str, str], pair: RectifiedPair, found: Disparity) -> Image.Image:
-    """Both rectified pictures, the disparity of the left one with holes filled, and where it is sure."""
+    """Both rectified pictures, the left one's filled disparity, and its reliable pixels."""
     z = pair.z(found.values)
     trusted = (pair.left.trust > 0.5).float()
     within = depth_range(z, trusted)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.rays import Rendering
-from ..components.fields.development import decoded
+from ..components.training.development import decoded
 from ..errors import LumigraphError
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json
@@ -85,7 +85,7 @@ def read_path(options: FilmOptions) -> CameraPath | None:
 def film(
     method: Method | Sequence[Method], cameras: Camera, path: Path, options: FilmOptions = FilmOptions()
 ) -> dict[str, Any]:
-    """Render every camera of one size. Returns what is written to the JSON file.
+    """Render every camera of one size. Returns the contents of the JSON file.
 
     method: one for all frames, or one for each, such as what `animated` makes
     options: of which frames per second, depth (path/orbit-depth.mp4) and pictures (path/orbit/0000.png and, with depth,
@@ -143,7 +143,7 @@ def film(
 def claim_film(
     path: Path, options: FilmOptions = FilmOptions(), overwrite: bool | None = None, reads: Collection[Path] = ()
 ) -> None:
-    """Raise LumigraphError unless a film, and all that goes beside it, may be written there; see `files.claim`."""
+    """Raise LumigraphError unless a film and its accompanying files may be written; see `files.claim`."""
     claim(path, "film", overwrite, reads)
     claim(path.with_suffix(".json"), "cameras of a film", overwrite, reads)
     if options.depth:
@@ -158,9 +158,9 @@ def depth_beside(path: Path) -> Path:
 
 
 def animated(method: Method, stations: Mapping[str, Sequence[Value]], frames: int) -> list[Method]:
-    """The method of each frame of a film, with controls that go from one station to the next (`Control.over`).
+    """The method for each frame of a film, with controls interpolated between stations (`Control.over`).
 
-    Raises LumigraphError for controls that the method does not have, and for values that they cannot take.
+    Raises LumigraphError for unknown controls and invalid values.
     """
     method.given(**{name: values[0] for name, values in stations.items()})
     controls = {control.name: control for control in method.controls}
@@ -169,7 +169,7 @@ def animated(method: Method, stations: Mapping[str, Sequence[Value]], frames: in
 
 
 def film_depth_range(methods: Sequence[Method], cameras: Camera) -> Range:
-    """One range for all frames, found from a few small ones, so that colours do not flicker."""
+    """One depth range for all frames, from a few small ones, so that colours do not flicker."""
     probes = evenly(range(len(cameras)), PROBES)
     chosen = cameras[torch.tensor(probes)]
     small = chosen.resized(min(1.0, PROBE_SIZE / int(chosen.size.max())))
@@ -182,12 +182,12 @@ PIXEL_FORMAT = "gbrpf32le"  # planes of 32-bit floats
 
 
 def light_of(seen: Rendering) -> Float[Tensor, "height width 3"]:
-    """The linear light of a rendering, 1 for white: its own `radiance` where it has that, else its colours decoded."""
+    """Linear light of a rendering, 1 for white: its `radiance` if it has one, else its decoded colours."""
     return seen.extra["radiance"] if "radiance" in seen.extra else decoded(seen.rgb.clamp(0, 1))
 
 
 def exr(light: Float[Tensor, "height width 3"]) -> bytes:
-    """The bytes of an OpenEXR file of linear sRGB as 32-bit floats, compressed without loss, by FFmpeg."""
+    """Bytes of an OpenEXR file of linear sRGB as 32-bit floats, losslessly compressed, by FFmpeg."""
     pixels = np.ascontiguousarray(light.detach().cpu().numpy(), np.float32)
     codec = av.CodecContext.create("exr", "w")
     assert isinstance(codec, av.VideoCodecContext)

@@ -1,8 +1,8 @@
 """Jump: a ring of cameras as a pair of omnidirectional stereo panoramas (Anderson et al. 2016).
 
-A viewer whose eyes are r from the middle of the head sees, with one eye and in every direction, along tangents of a
-circle of radius r. Such a ray meets the cameras' circle of radius R at the angle a with sin a = +- r / R aside, between
-two cameras. Their pictures are matched, and each place is drawn where that eye sees it.
+For eyes r from the centre of the head, one eye's rays in all directions are tangents of a circle of radius r. Such a
+ray meets the cameras' circle of radius R at the angle a with sin a = +- r / R aside, between two cameras. Their
+pictures are matched, and each point is drawn at its direction for that eye.
 """
 
 from __future__ import annotations
@@ -59,10 +59,10 @@ class CameraCircle:
 
 @dataclass(frozen=True)
 class StereoPanorama:
-    """Both eyes' panoramas. seen: where a camera saw something; the rest is filled
+    """Both eyes' panoramas. seen: mask of pixels seen by a camera; the rest is filled
 
     nearest: distance from which on every surface is seen by both cameras that it needs, scene units
-    trusted: share of the matched pixels whose depth is sure
+    trusted: share of the matched pixels with reliable depth
     """
 
     left: Float[Tensor, "height width 3"]
@@ -76,7 +76,7 @@ class StereoPanorama:
 
 
 def rig_of(scene: Scene) -> CameraCircle:
-    """The circle of the training cameras. Raises LumigraphError if they are on none, or one is missing."""
+    """Circle of the training cameras. Raises LumigraphError if they are not on one, or one is missing."""
     numbers = scene.splits["train"]
     positions = scene.cameras.position[numbers]
     if len(numbers) < MIN_CAMERAS:
@@ -109,7 +109,7 @@ def rig_of(scene: Scene) -> CameraCircle:
 def stereo_panorama(
     scene: Scene, options: JumpOptions = JumpOptions(), before: list[Tensor] | None = None
 ) -> tuple[StereoPanorama, list[Tensor]]:
-    """Stitch a rig's photographs of one moment.
+    """Stitch a rig's photographs of one time.
 
     before: what this function returned beside the panorama for the moment before, which keeps a film steady
     """
@@ -148,8 +148,8 @@ def stereo_panorama(
 
 @dataclass(frozen=True)
 class RingPair:
-    """Two neighbours turned to common rows: columns are angles from the plane across the baseline, rows angles around
-    the baseline, so that a place is in one row of both.
+    """Two neighbours rectified to common rows: columns are angles from the plane across the baseline, rows angles
+    around the baseline, so that a point has one row in both.
 
     rotation: to the world; x along the baseline, to the right seen from the rig; y down
     pictures, valid: of the left and the right camera
@@ -189,13 +189,13 @@ class RingPair:
 
     @property
     def limit(self) -> int:
-        """Number of disparities that are searched."""
+        """Number of searched disparities."""
         return int(MAX_DISPARITY_SHARE * self.pictures[0].shape[1])
 
     def match(self, before: Tensor | None) -> tuple[list[stereo.Disparity], Tensor]:
-        """Disparities of both pictures, and what the next moment needs. Those of the right are found in mirrored ones.
+        """Disparities of both pictures, and state for the next time. Those of the right are found in mirrored ones.
 
-        Where the left picture has not changed since the moment before, another disparity costs more.
+        Where the left picture is unchanged since the previous time, changes of disparity cost more.
         """
         left, right = (stereo.as_bytes(x) for x in self.pictures)
         now, count = stereo.grey(left), self.limit
@@ -212,7 +212,7 @@ class RingPair:
         return [found, its], torch.stack([now.float(), found.values])
 
     def places(self, disparity: Float[Tensor, "height width"], side: int) -> Float[Tensor, "height width 3"]:
-        """Places of one picture's pixels. In a row's plane, tan of the left angle less tan of the right one is the
+        """Points of one picture's pixels. In a row's plane, tan of the left angle less tan of the right one is the
         baseline over the distance across it."""
         directions = RingPair.directions(self.step)
         angle = torch.asin(directions[..., 0])
@@ -226,7 +226,7 @@ class RingPair:
 def turned(
     photograph: Photograph, directions: Float[Tensor, "pixel 3"], shape: tuple[int, int] | torch.Size
 ) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
-    """Colours of a photograph in directions of the world, and where it has some."""
+    """Colours of a photograph in directions of the world, and a mask of directions inside it."""
     camera, (height, width) = photograph.camera, photograph.rgb.shape[:2]
     pixels, valid = camera.lens.project(directions @ camera.pose[0, :, :3])
     size = torch.tensor([width, height])
@@ -237,8 +237,8 @@ def turned(
 
 
 def balanced(pairs: list[RingPair]) -> Float[Tensor, "camera 3"]:
-    """Gains of the right cameras of pairs, in their order, that make neighbours alike: least squares of the logarithms
-    of ratios of mean colours where both see, whose mean is zero."""
+    """Gains of the right cameras of pairs, in their order, that equalise neighbours: least squares of log ratios of
+    mean colours in the overlap, with zero mean."""
     count = len(pairs)
     rows, ratios = torch.zeros(count + 1, count), torch.zeros(count + 1, 3)
     for k, pair in enumerate(pairs):
@@ -259,10 +259,10 @@ def splat(
     offset: float,
     width: int,
 ) -> None:
-    """Draw one picture's surfaces as one eye sees them, and add them to its panorama where their camera counts.
+    """Draw one picture's surfaces for one eye, and add them to its panorama with its camera's weight.
 
-    A camera counts by how near to it the ray meets the cameras' circle, from 1 to 0 at its neighbour. Nearer surfaces
-    replace farther ones.
+    The weight falls from 1, where the ray meets the cameras' circle at this camera, to 0 at its neighbours. Nearer
+    surfaces replace farther ones.
     """
     rig = pair.rig
     height, spacing = width // 2, rig.spacing
@@ -307,8 +307,8 @@ def splat(
 
 
 def nearest_distance(rig: CameraCircle, photographs: list[Photograph], radius: float, limit: int) -> float:
-    """Distance from the middle beyond which both cameras see what they share, within the searched disparities;
-    infinity for lenses that are too narrow.
+    """Distance from the centre beyond which both cameras see their common surfaces, within the searched disparities;
+    infinity for too narrow lenses.
 
     Checked along the rays of both eyes, at eye level, from one camera to the next.
     """

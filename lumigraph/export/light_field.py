@@ -47,7 +47,7 @@ def export_light_field(
 
 
 def focal_distance(method: Method, camera: Camera) -> float:
-    """Depth along the axis of the middle of what a camera sees. Raises LumigraphError where it sees nothing."""
+    """Median depth along the axis in a camera's view. Raises LumigraphError for an empty view."""
     small = camera.resized(min(1.0, 64 / int(camera.size.max())))
     seen = method.render(small).cpu()
     cosine = (small.rays(small.pixels()).directions @ small.forward[0]).cpu()
@@ -72,8 +72,8 @@ def grid_of(camera: Camera, rows: int, columns: int, spacing: float, focus: floa
 def write_light_field(
     folder: Path, method: Method, camera: Camera, count: int, spacing: float, focus: float, frame: Frame
 ) -> None:
-    """A folder of count x count pictures named as in the Stanford archive, out_ROW_COLUMN_Y_X.png, and
-    transforms.json, by which it opens as a scene. Positions are in the frame of exports."""
+    """Write count x count pictures named as in the Stanford archive, out_ROW_COLUMN_Y_X.png, and transforms.json, by
+    which the folder opens as a scene. Positions are in the frame of exports."""
     grid, to_export = grid_of(camera, count, count, spacing, focus), frame.to_export
     places = [(row, column) for row in range(count) for column in range(count)]
     frames, scale = [], to_export.scale * spacing

@@ -159,7 +159,7 @@ def export_splats(
         cloud = opened.source_gaussians()
         if part.crops or part.removes:
             loaded = Loaded(opened, opened.ready("cpu"), {}, part)
-            cloud = cloud[loaded.kept(cloud, loaded.crop and loaded.crop.moved(opened.frame.to_source))]
+            cloud = cloud[loaded.kept(cloud, loaded.crop and loaded.crop.transformed(opened.frame.to_source))]
     else:
         loaded = Loaded.of(opened, "cpu", settings, part, scaling)
         cloud = loaded.gaussians().transformed(opened.frame.to_export.matrix, far=True)

@@ -1,4 +1,4 @@
-"""A mesh of a method: of its signed distance or density where it has one, otherwise of the depth that it renders."""
+"""Mesh extraction: from a method's signed distance or density if it has one, otherwise from rendered depth."""
 
 from __future__ import annotations
 
@@ -79,14 +79,13 @@ def extract_mesh(
     crop: Crop | None = None,
     photographs: Scene | None = None,
 ) -> Mesh:
-    """The surface in the middle of a scene, in the scene's frame.
+    """Extract the surface in the box of interest or a crop, in the scene's frame.
 
     cameras: the scene's own; what none of them sees is left out, or filled in
-    crop:    what is meshed instead of the box of interest, as far as the scene reaches
-    photographs: the scene whose training split `cameras` are. Pixels that its masks leave out of learning show no
-             surface, and a texture is made of its colours. None for no masks, and a texture of the method's renderings
-    Raises LumigraphError where nothing is solid, where a texture does not fit into memory, and for numbers that make
-    no sense.
+    crop:    replaces the box of interest, within the scene's reach
+    photographs: the scene whose training split `cameras` are. Pixels that its masks exclude show no
+             surface, and a texture has its colours. None for no masks, and a texture of the method's renderings
+    Raises LumigraphError for an empty scene, a texture that exceeds memory, and invalid numbers.
     """
     texture = options.texture_size if options.texture else None
     if texture is not None:
@@ -156,18 +155,18 @@ def extract_mesh(
 
 
 def without_masked(depth_maps: Sequence[DepthMap], photographs: Scene, chosen: Sequence[int]) -> list[DepthMap]:
-    """Depth maps of these training cameras, NaN in pixels that the photographs' masks leave out of learning."""
+    """Depth maps of these training cameras, NaN in pixels that the photographs' masks exclude."""
     masks = [photographs.images.mask(int(photographs.splits["train"][i])) for i in chosen]
     return [seen if mask is None else seen.within(mask) for seen, mask in zip(depth_maps, masks, strict=True)]
 
 
 def masked(depth_maps: Sequence[DepthMap]) -> bool:
-    """True if some of them have pixels without a measurement."""
+    """True if some of them have unmeasured pixels."""
     return any(bool(seen.depth.isnan().any()) for seen in depth_maps)
 
 
 def own_mesh(method: Method, holds: Holds, keep: float, smooth: int, faces: int | None) -> Mesh:
-    """The mesh that a method holds, or makes itself, within a region, with its own colours; see `extract_mesh`."""
+    """The method's own mesh within a region, with its own colours; see `extract_mesh`."""
     made = needs(method, HasMesh).mesh()
     inside = holds(torch.from_numpy(made.vertices).float()).numpy()
     corners, triangles = manifold(made.faces[inside[made.faces].all(-1)])
@@ -188,7 +187,7 @@ def own_mesh(method: Method, holds: Holds, keep: float, smooth: int, faces: int 
 
 
 def best_way(method: Method) -> tuple[Way, str]:
-    """The best source of a surface that a method offers, and why it is."""
+    """Best surface source of a method, with the reason."""
     if can(method, HasDistance):
         return "distance", "the signed distance, whose zero level is the surface that was learnt"
     if can(method, HasDensity):
@@ -199,7 +198,7 @@ def best_way(method: Method) -> tuple[Way, str]:
 
 
 def meshed_box(frame: Frame, times: float | None) -> CropBox:
-    """The frame's box of interest, larger or smaller about its middle, within the cube that holds everything."""
+    """Box of interest scaled about its centre, within the cube of the scene's reach."""
     low, high = torch.tensor(frame.bounds)
     half = 0.5 * (high - low) * ((1.0 if not frame.is_open else OPEN_BOX) if times is None else times)
     middle = 0.5 * (low + high)
@@ -207,7 +206,7 @@ def meshed_box(frame: Frame, times: float | None) -> CropBox:
 
 
 def within_reach(frame: Frame, crop: Crop) -> CropBox:
-    """The upright box around a crop, within the cube that holds everything. Raises LumigraphError for one outside."""
+    """Axis-aligned box around a crop, within the cube of the scene's reach. Raises LumigraphError for one outside."""
     corners = torch.tensor(crop.bounds).clamp(-frame.reach, frame.reach)
     if not (corners[1] > corners[0]).all():
         raise LumigraphError(
@@ -241,9 +240,8 @@ Holds = Callable[[Float[Tensor, "point 3"]], Bool[Tensor, " point"]]
 def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Value:
     """A function of points: 0 at the surface of the fused depth maps, 1 well inside, -1 well outside.
 
-    Empty is also what more of the pictures leave out than show, and what two leave out while nobody sees it: the space
-    around a silhouette.
-    closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
+    Empty space includes points outside most pictures' silhouettes, and points outside two if no camera sees them.
+    closed: points hidden from all cameras count as solid, rather than as unknown (NaN)
     """
     fused = TSDF(depth_maps, Tolerance(TRUNCATION_CELLS * cell))
     some_masked = masked(depth_maps)
@@ -273,8 +271,7 @@ def from_distance(method: Method, cell: float) -> Value:
 def from_density(method: Method, level: float) -> Value:
     """A function of points: 0 where the density is at its level, 1 well inside, -1 well outside.
 
-    It is the logarithm that counts, for it changes evenly where the density itself grows by orders of magnitude within
-    a cell.
+    It is linear in the logarithm of density, which changes evenly where density grows by orders of magnitude in a cell.
     """
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
@@ -285,9 +282,8 @@ def from_density(method: Method, level: float) -> Value:
 
 
 def near_depth(own: Value, depth: Value) -> Value:
-    """A function of points: a field's own value within a few cells of the surface that the cameras see, farther away
-    that of their depth. This removes cavities inside objects, where the field had no supervision, and transparent mist.
-    """
+    """A function of points: a field's own value within a few cells of the visible surface, elsewhere that of the
+    cameras' depth. This removes cavities inside objects, where the field had no supervision, and transparent fog."""
     inward, outward = INWARD_CELLS / TRUNCATION_CELLS, OUTWARD_CELLS / TRUNCATION_CELLS
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
@@ -298,11 +294,11 @@ def near_depth(own: Value, depth: Value) -> Value:
 
 
 def surface_level(method: Method, depth_maps: Sequence[DepthMap], holds: Holds) -> float:
-    """The density where rays begin to end, found from the field itself, for any unit and sharpness.
+    """Density level of the surface, found from the field itself, for any unit and sharpness.
 
-    At the rendered depth half of a ray's light is spent; the median density there is known. But fields begin at the
-    surface and grow behind it, where it has no supervision. On a ramp that grows exponentially the optical
-    thickness so far is proportional to the density, so a share q is spent where it is log(1 - q) / log(1 / 2) as large.
+    At the rendered depth half of a ray's light is stopped; the median density there is known. But fields begin at the
+    surface and grow behind it, without supervision. On an exponential ramp the accumulated optical thickness is
+    proportional to the density, so a share q is stopped where it is log(1 - q) / log(1 / 2) as large.
     """
     found = torch.cat([x.positions(x.solid & (x.opacity > 0.9) & (x.facing > 0.3)) for x in depth_maps])
     found = found[holds(found)]
@@ -337,10 +333,10 @@ def interpolated(value: Value, grid: Grid, step: int) -> Value:
 
 
 def find_surface(grid: Grid, step: int, holds: Holds, value: Value, beyond: float) -> tuple[Vertices, Faces]:
-    """From coarse to fine: probes find the blocks that the surface may pass through, and those are marched through.
+    """Coarse to fine: probes find the blocks that may contain the surface, and those are marched.
 
     step:   corners of the grid from one probe to the next
-    holds:  which points are inside what is meshed
+    holds:  mask of points inside the meshed region
     beyond: value outside of it: -1 closes the surface there, NaN leaves it open
     """
 

@@ -1,4 +1,4 @@
-"""Meshes as files: PLY, OBJ, GLB and USDZ, each with its colours or its texture where most programs read them."""
+"""Mesh files: PLY, OBJ, GLB and USDZ, each with colours or texture in the form that most programs read."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ CLAMP_TO_EDGE = 33071  # glTF's sampler: texels beyond the picture
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A mesh to write, and how.
+    """A mesh to write, with options.
 
-    name:    of the file, without its ending
-    upright: rotation that brings up, in the mesh's frame, to +y
-    lit:     whether the lights of a viewer act on it; otherwise it shines in its own colours
-    origin:  of the mesh's frame on Earth, where it is known
+    name:    of the file, without its suffix
+    upright: rotation of up, in the mesh's frame, to +y
+    lit:     whether a viewer's lights apply to it; otherwise it is emissive
+    origin:  of the mesh's frame on Earth, if known
     pieces:  further triangles without colours, in the same frame, by name
     """
 
@@ -61,7 +61,7 @@ class MeshFile:
 
     @property
     def normals(self) -> Float[np.ndarray, "vertex 3"]:
-        """Unit normals at vertices, the same for all copies of a vertex that a texture splits."""
+        """Unit normals at vertices, the same for all copies of a vertex split by a texture."""
         if self.mesh.texture is None:
             return vertex_normals(self.mesh.vertices, self.mesh.faces)
         places, same = np.unique(self.mesh.vertices, axis=0, return_inverse=True)
@@ -105,7 +105,7 @@ def write_mesh(
 
 
 def ending(path: Path, texture: bool = False) -> str:
-    """The ending of a mesh's file, in lower case. Raises LumigraphError for one that no mesh has."""
+    """Suffix of a mesh file, in lower case. Raises LumigraphError for an unknown one."""
     end = path.suffix.lower()
     if end not in ENCODERS:
         raise LumigraphError(f"{path} does not end like a mesh; name one that ends in {', '.join(ENCODERS)}")
@@ -115,7 +115,7 @@ def ending(path: Path, texture: bool = False) -> str:
 
 
 def files_of(path: Path, texture: bool) -> list[Path]:
-    """Every file that may be written for a mesh of this name. Raises LumigraphError as `ending` does."""
+    """All files written for a mesh of this name. Raises LumigraphError as `ending` does."""
     further = (MATERIAL, PICTURE, NORMALS) if texture and ending(path, texture) == ".obj" else ()
     return [path, *(path.with_name(path.stem + end) for end in further)]
 
@@ -157,7 +157,7 @@ def obj(file: MeshFile) -> Parts:
 
 
 def textured_obj(file: MeshFile, texture: MeshTexture) -> Parts:
-    """Text of an OBJ file, of its material, and the pictures that this names. OBJ's v points upwards."""
+    """Text of an OBJ file, of its material, and their pictures. OBJ's v points upwards."""
     held, numbers = io.StringIO(), np.repeat(file.mesh.faces.reshape(-1, 1) + 1, 3, 1).reshape(-1, 9)
     held.write(f"# written by Lumigraph\nmtllib {file.name}{MATERIAL}\nusemtl surface\n")
     np.savetxt(held, file.mesh.vertices, "v %.9g %.9g %.9g" if file.offset is None else "v %.14g %.14g %.14g")

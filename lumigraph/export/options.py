@@ -92,7 +92,7 @@ class Cropping:
             crop = Sphere(self.sphere[:3], self.sphere[3])
         else:
             return None
-        return crop if self.units == "scene" else crop.moved(frame.to_source.inverse)
+        return crop if self.units == "scene" else crop.transformed(frame.to_source.inverse)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""A page to share: one HTML file that opens from disk, with the scene and the program that draws it inside. For open
-scenes it also has a backdrop: colours of unobserved directions, from the scene's own, and the floor as camera limit.
+"""Web pages to share: one HTML file that opens from disk, with the scene and its renderer inside. For unbounded scenes
+with a backdrop: colours of unobserved directions, from the scene's own, and the floor as camera limit.
 
-The programs in web/ are built from the folder `web` of the repository. Pages with WebGL hold stage.js (three.js, camera
-and controls) before their own program; that of clouds has Spark. They are compressed into the page, as its data are.
+The programs in web/ are built from the folder `web` of the repository. Pages with WebGL have stage.js (three.js, camera
+and controls) before their own program; that of clouds has Spark. Programs and data are compressed in the page.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ MAX_SHARE_BELOW_FLOOR = 0.02  # share of the surfaces in the box of interest tha
 def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
     """Colours of sky, horizon and ground from some of the photographs' cameras.
 
-    `None` for an object, and for a scene that is not opaque: its background belongs to the picture.
+    `None` for an object, and for a scene that is not opaque: its background is part of the picture.
     """
     frame = method.frame
     if frame.has_alpha or not frame.is_open:
@@ -87,7 +87,7 @@ def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
 
 
 def median(rgb: Float[Tensor, "pixel 3"], chosen: Tensor) -> Vector | None:
-    """The colour in the middle of the chosen ones, channel by channel; None where they are few."""
+    """Median colour of the chosen ones, channel by channel; None for too few."""
     if chosen.float().mean() < MIN_SEEN_SHARE:
         return None
     red, green, blue = rgb[chosen].median(0).values.tolist()
@@ -100,7 +100,7 @@ def lighter(colour: Vector, share: float) -> Vector:
 
 
 def floor(places: Float[Tensor, "point 3"], bounds: Float[Tensor, "2 3"]) -> float:
-    """The height that nearly all surfaces above or below the box of interest's middle are above."""
+    """Height of the floor: nearly all surfaces above or below the centre of the box of interest are above it."""
     low, high = bounds
     near = places[((places >= low) & (places <= high))[:, :2].all(-1)]
     return float(near[:, 2].quantile(MAX_SHARE_BELOW_FLOOR)) if len(near) else float(low[2])
@@ -119,7 +119,8 @@ PARALLAX_HELP = "Move the mouse to look behind things", "Tilt the phone, or drag
 
 
 def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
-    """Write a page that draws a cloud in the scene's frame as splats with harmonics, held as .spz, with its loss."""
+    """Write a page that renders a cloud in the scene's frame as splats with harmonics, stored as .spz, with its
+    loss."""
     settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
     with counting(f"Packing {len(gaussians):,} Gaussians"):
         packed = spz.gzipped(gaussians, steps=HARMONICS_STEPS)
@@ -141,9 +142,10 @@ def moving_page(path: Path, moving: MovingGaussians, opening: Opening) -> None:
 
 
 def mesh_page(path: Path, mesh: Mesh, opening: Opening, reach: float = 0.0) -> None:
-    """A mesh in the scene's frame, unlit, for its colours were photographed. Positions are held in 16 bits an axis.
+    """Write a page of a mesh in the scene's frame, unlit, since its colours contain light. Positions have 16 bits an
+    axis.
 
-    reach: of the camera to all sides, scene units: then it follows the pointer or a phone's tilt, and nothing turns it
+    reach: of the camera to all sides, scene units: then it follows the pointer or a phone's tilt instead of turning
     """
     low = mesh.vertices.min(0).astype(np.float64)
     size = np.maximum(mesh.vertices.max(0) - low, 1e-12)
@@ -163,7 +165,7 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening, reach: float = 0.0) -> N
 
 
 def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
-    """A baked volume in the scene's frame, which the browser marches along the ray of each pixel.
+    """Write a page of a baked volume in the scene's frame, which the browser ray-marches.
 
     Raises LumigraphError if the page would have MAX_PAGE_BYTES bytes or more.
     """

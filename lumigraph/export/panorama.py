@@ -1,10 +1,10 @@
-"""Panoramas: the whole sphere around a place, from any method, on one equirectangular picture.
+"""Equirectangular panoramas of any method.
 
-Methods that follow every lens render it as it is, ray by ray. Gaussians are seen on flat pictures only, so the sphere
-is put together from many small ones, each rendered for a few columns and a band of rows and read between its pixels.
+Methods with rays of any lens render it directly. Gaussians are rendered on flat pictures only, so the sphere is
+assembled from many small ones, each for a few columns and a band of rows, with interpolation.
 
-Omnidirectional stereo is a panorama for each eye. All around, the rays of both eyes leave a level circle along its
-tangents (`lens.OmnidirectionalStereo`; Peleg 2001), so the eyes are side by side in every direction. At the poles depth
+Omnidirectional stereo is a panorama for each eye. The rays of both eyes are tangents of a level circle
+(`lens.OmnidirectionalStereo`; Peleg 2001), so the eyes are side by side in every direction. At the poles parallax
 fades.
 """
 
@@ -105,10 +105,9 @@ def sphere(method: Method, camera: Camera, name: str, columns: int | None = None
 
 
 def by_flat_pictures(method: Method, camera: Camera, columns: int, lap: int, name: str) -> Rendering:
-    """The sphere from flat pictures of a few columns and a band of rows; exact where these see from one place.
+    """The sphere from flat pictures of a few columns and a band of rows; exact where their rays share an origin.
 
-    lap: pixels by which each reaches beyond its edges, where it fades into its neighbours: Gaussians are drawn in
-         another order in each
+    lap: overlap in pixels, where pictures are cross-faded, since the order of Gaussians differs between them
     """
     width, height = camera.size[0].tolist()
     rgb, opacity, total = torch.zeros(height, width, 3), torch.zeros(height, width), torch.zeros(height, width)
@@ -133,16 +132,16 @@ def by_flat_pictures(method: Method, camera: Camera, columns: int, lap: int, nam
 def fading(
     begin: float, end: float, lap: int, first: int, last: int
 ) -> tuple[Int[Tensor, " pixel"], Float[Tensor, " pixel"]]:
-    """The pixels among [first, last) that a patch reaches, and how much each counts: half at the patch's edges."""
+    """Pixels among [first, last) that a patch reaches, and their weights: half at the patch's edges."""
     pixels = torch.arange(max(first, begin - lap), min(last, end + lap)).long()
     inside = torch.minimum(pixels + 0.5 - begin, end - pixels - 0.5)  # pixels from the nearer edge
     return pixels, (0.5 + inside / max(2 * lap, 1e-6)).clamp(0, 1)
 
 
 def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camera, Float[Tensor, "pixel 2"]]:
-    """A pinhole camera that looks where some neighbouring pixels of a sphere look, and where on its picture they are.
+    """A pinhole camera for some neighbouring pixels of a sphere, and their positions in its picture.
 
-    Its position is the origin of the ray in the middle of them.
+    Its position is the origin of the central ray.
     """
     assert isinstance(camera.lens, Equirectangular)
     middle = (pixels.amin(0) + pixels.amax(0))[None] / 2
@@ -163,7 +162,7 @@ def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camer
 def read(
     picture: Float[Tensor, "height width channel"], at: Float[Tensor, "pixel 2"], how: str = "bilinear"
 ) -> Float[Tensor, "pixel channel"]:
-    """Values of a picture at places (x, y) of it."""
+    """Interpolated values of a picture at (x, y)."""
     height, width = picture.shape[:2]
     share = 2 * at / torch.tensor([width, height]) - 1
     found = grid_sample(picture.permute(2, 0, 1)[None], share[None, None], how, "border", align_corners=False)
@@ -178,7 +177,7 @@ def rows_of(camera: Camera, top: int, count: int) -> Camera:
 
 
 def sphere_size(width: int) -> Float[Tensor, "1 2"]:
-    """Pixels of a panorama. Raises LumigraphError for a width that none has."""
+    """Size of a panorama in pixels. Raises LumigraphError for an invalid width."""
     if width % 2 or not MIN_WIDTH <= width <= MAX_WIDTH:
         raise LumigraphError(
             f"A panorama cannot be {width} pixels wide; give --size an even number from {MIN_WIDTH} to {MAX_WIDTH}"
@@ -196,8 +195,8 @@ def level_camera(place: Point, heading: Point, lens: Equirectangular) -> Camera:
 def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> tuple[Tensor, Tensor, str]:
     """Position and heading of a panorama in the scene's frame, and the position in words.
 
-    source: the position in the source's frame. By default that of the camera nearest to the middle of all: it is free
-            for certain, and photographs observe its surroundings.
+    source: the position in the source's frame. By default that of the camera nearest to the mean, which is certainly in
+            free space, with observed surroundings.
     """
     around = Surroundings(cameras, frame)
     if source is None:
@@ -317,9 +316,9 @@ def surrounding_distances(method: Method, place: Point, heading: Point) -> tuple
 
 
 def columns_at_once(radius: float, nearest: float) -> int:
-    """Largest number of columns that one flat picture may have.
+    """Largest number of columns of one flat picture.
 
-    Its camera is at the origin of the middle column's rays. Rays of a column k / 2 away begin k / 2 pixels' angle
+    Its camera is at the origin of the central column's rays. Rays of a column k / 2 away begin k / 2 pixels' angle
     further along the circle, which is ahead or behind by r k / 2 pixels' angle: points at a distance d and high up are
     off by up to r k / (2 d) pixels.
     """

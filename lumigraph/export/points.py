@@ -1,4 +1,4 @@
-"""Points where a scene is solid: what its cameras see, brought back into space and thinned evenly."""
+"""Point clouds of opaque surfaces: back-projected depth of a scene's cameras, thinned evenly."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def extract_points(
 
 
 def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
-    """Mask of pixels that show a surface squarely, inside the crop."""
+    """Mask of pixels with a surface at a steep angle, inside the crop."""
     good = seen.solid & (seen.facing > MIN_COSINE)
     if crop is not None:
         good[good.clone()] = crop.holds(seen.positions(good))
@@ -97,7 +97,7 @@ def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
 
 
 def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> Bool[Tensor, " point"]:
-    """Mask of points that enough cameras see as a surface, and not many see through."""
+    """Mask of points with enough cameras that see a surface, and few that see through."""
     agree, through = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
     for depth_map in track(depth_maps, "Comparing depth maps", len(depth_maps)):
         away = (points - depth_map.camera.position).norm(dim=-1)
@@ -108,7 +108,7 @@ def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> B
 
 
 def thinned(columns: Float[np.ndarray, "point column"], count: int) -> Float[np.ndarray, "thinned column"]:
-    """The means within cells of space just large enough that there are at most `count`. The first three are places."""
+    """Means within grid cells of the least size that gives at most `count`. The first three columns are positions."""
     if len(columns) <= count:
         return columns
     low, extent = columns[:, :3].min(0), float(np.ptp(columns[:, :3], axis=0).max())

@@ -1,4 +1,4 @@
-"""Light probes of any method: harmonics of what is seen around the points of a grid, and octahedral distances.
+"""Light probes of any method: spherical harmonics of radiance around grid points, and octahedral distance maps.
 
 A probe renders the six faces of a cube. Pixels are decoded to linear light, so that irradiance is the sum of light, and
 weighted by their solid angle.
@@ -98,8 +98,8 @@ def bake_probes(
 ) -> ProbeGrid:
     """Probes inside a box of the scene's frame, in the frame of exports.
 
-    cameras: of the photographs, which say what is free; None without photographs
-    Raises LumigraphError where no probe is free, or none sees anything.
+    cameras: of the photographs, which determine free space; None without photographs
+    Raises LumigraphError if no probe is free, or all are in empty space.
     """
     method.eval()
     to_export, order, face_size = method.frame.to_export, options.order, options.resolution
@@ -150,7 +150,7 @@ def bake_probes(
 
 
 def nearby(method: Method) -> Method:
-    """The method without the distance that its cameras keep free, so that a probe sees what is close to it."""
+    """The method with near distance 0, so that a probe sees close surfaces."""
     if not can(method, HasLooks):
         return method
     return compose(method.frame, [Placed(method, Similarity.make(1.0))]).to(method.device)
@@ -171,13 +171,13 @@ def octahedral_lobes(directions: Float[Tensor, "ray 3"], angles: Float[Tensor, "
 
 
 def unseen(method: Method, places: Float[Tensor, "probe 3"], cameras: Camera) -> Tensor:
-    """Mask of places that all cameras which have them in their pictures see something in front of."""
+    """Mask of positions occluded in all cameras whose pictures contain them."""
     maps = render_depth_maps(method.render, cameras, method.frame.background)
     return hidden(places, maps, SEEN_TOLERANCE) & in_pictures(places, maps)
 
 
 def in_pictures(places: Float[Tensor, "probe 3"], maps: Sequence[DepthMap]) -> Tensor:
-    """Mask of places that lie in some picture, hidden or not."""
+    """Mask of positions inside some picture, occluded or not."""
     found = torch.zeros(len(places), dtype=torch.bool)
     for seen in maps:
         pixels, valid, _ = seen.project(places)

@@ -1,4 +1,4 @@
-"""A page in which a mesh that the mouse moves is lit by probes, in a rendered picture with its depth."""
+"""Web page with a draggable mesh lit by probes, in a rendered picture with depth."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def textures(grid: ProbeGrid) -> dict[str, np.ndarray]:
     """Light and distances of probes as the page's textures: a row of tiles has PROBES_ACROSS probes."""
     count, rows = len(grid), -(-len(grid) // PROBES_ACROSS)
     light = np.zeros((rows * PROBES_ACROSS, grid.radiance.shape[1], 4), "<f4")
-    light[:count, :, :3] = grid.shown.numpy()
+    light[:count, :, :3] = grid.filled_radiance.numpy()
     light[:count, :, 3] = (grid.state == FREE).numpy()[:, None]
     wide = grid.mean.shape[1]
     maps = np.zeros((rows * PROBES_ACROSS, wide, wide, 2), "<f4")

@@ -63,7 +63,7 @@ def zero_level(
 ) -> tuple[Vertices, Faces]:
     """Triangles where a function is zero, anticlockwise seen from where it is negative; vertices in scene units.
 
-    values:    the function, about -1 to 1; NaN where it is unknown, where the surface has a border
+    values:    the function, about -1 to 1; NaN where it is unknown, which leaves a border
     active:    blocks of BLOCK^3 corners to evaluate; each corner once
     elsewhere: value of all corners of the other blocks
     """
@@ -110,8 +110,8 @@ def larger_pieces(vertices: Vertices, faces: Faces, share: float, seen: Bool[np.
 
 
 def majority(chosen: Bool[np.ndarray, " vertex"], faces: Faces, times: int) -> Bool[np.ndarray, " vertex"]:
-    """Mask of vertices with an even outline: where at least half of the surroundings is chosen, after so many rounds of
-    diffusion. Spikes and threads of it go, small gaps are filled."""
+    """Majority filter on a graph: mask of vertices with at least half of their surroundings chosen, after some rounds
+    of diffusion. It removes thin spikes and fills small gaps."""
     around = mean_of_neighbours(adjacency(len(chosen), faces))
     share = chosen.astype(np.float64)
     for _ in range(times):
@@ -120,10 +120,10 @@ def majority(chosen: Bool[np.ndarray, " vertex"], faces: Faces, times: int) -> B
 
 
 def manifold(faces: Faces) -> tuple[Int[np.ndarray, " vertex"], Int[np.ndarray, "kept 3"]]:
-    """Vertices to take, some of them several times, and the faces between these: a manifold with borders.
+    """Vertices, some duplicated, and faces of a manifold with borders.
 
-    A vertex whose faces form several fans becomes one vertex for each fan. Edges of more than two faces become borders,
-    so that no edge has more than two faces. Faces without three distinct vertices go.
+    A vertex whose faces form several fans is duplicated for each. Edges of more than two faces become borders, so that
+    no edge has more than two faces. Faces without three distinct vertices are dropped.
     """
     faces = faces[(faces != np.roll(faces, 1, 1)).all(-1)]
     corner = np.arange(faces.size).reshape(faces.shape)  # a number for each vertex of each face
@@ -141,8 +141,8 @@ def manifold(faces: Faces) -> tuple[Int[np.ndarray, " vertex"], Int[np.ndarray, 
 
 
 def smoothed(vertices: Vertices, faces: Faces, times: int) -> Vertices:
-    """Vertices moved towards the mean of their neighbours and back again (Taubin 1995). Borders move along themselves:
-    neighbours of a vertex of a border are those on the border."""
+    """Taubin smoothing (1995): vertices moved towards the mean of their neighbours and back. Border vertices move along
+    the border."""
     if not times:
         return vertices
     neighbours, rim = adjacency(len(vertices), faces), border(len(vertices), faces)
@@ -159,7 +159,7 @@ def mean_of_neighbours(neighbours: sparse.csr_array) -> sparse.csr_array:
 
 
 def simplified(vertices: Vertices, faces: Faces, count: int) -> Triangles:
-    """A mesh of about so many faces, kept where they matter most to the shape (Garland and Heckbert 1997)."""
+    """A mesh of about `count` faces by quadric error simplification (Garland and Heckbert 1997)."""
     if len(faces) <= count:
         return vertices, faces
     pair = vertices.astype(np.float64), faces.astype(np.int32)

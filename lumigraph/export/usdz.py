@@ -1,6 +1,6 @@
-"""USDZ: an archive that phones and tablets open in space, with one mesh and its pictures.
+"""USDZ: an archive of one mesh and its pictures, for augmented reality on phones and tablets.
 
-They draw no colours of vertices, so a mesh without a texture has its colours in a picture: two by two texels for each
+Viewers draw no vertex colours, so a mesh without a texture has its colours in a picture: two by two texels for each
 triangle, between whose centres a GPU interpolates as between vertices. The layer in the archive is text, so no library
 of USD is needed.
 """

@@ -1,4 +1,4 @@
-"""Films, with the format of their ending: H.264 in MP4, which plays everywhere, where PyAV has it; GIF and WebP."""
+"""Films in the format of their suffix: H.264 in MP4 with PyAV, GIF and WebP."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ MAX_GIF_FPS = 50  # per second, of a GIF: browsers slow quicker ones down to 10
 
 @contextlib.contextmanager
 def open_video(path: Path, fps: float = 30.0, what: Kind = "film") -> Iterator[Video]:
-    """A film to add frames to, in order; the file appears once the block ends well.
+    """A film to add frames to, in order; the file appears after the block succeeds.
 
     fps:  frames per second
-    what: it will be known as, see `files.replacing`
-    Raises LumigraphError for an ending that is no film's, where frames differ in size, or if the disk refuses.
+    what: kind of the file, see `files.replacing`
+    Raises LumigraphError for an unknown suffix, for frames of different sizes, or if the disk refuses.
     """
     kind = kind_of(path, fps)
     with (
@@ -67,7 +67,7 @@ def kind_of(path: Path, fps: float) -> type[Video]:
 
 
 class Video(ABC):
-    """Frames of one size go in, packets go to a container."""
+    """Encoder of frames of one size into a container."""
 
     format: ClassVar[str]
     options: ClassVar[dict[str, str]] = {}
@@ -89,7 +89,7 @@ class Video(ABC):
         self.encode(np.ascontiguousarray(pixels))
 
     def finish(self) -> None:
-        """The film's end. Raises LumigraphError if it has no frame."""
+        """Finish the film. Raises LumigraphError without a frame."""
         if self.size is None:
             raise LumigraphError(f"{self.path} would hold no frame; give it at least one")
         self.flush()
@@ -101,7 +101,7 @@ class Video(ABC):
         return stream
 
     def padded(self, pixels: np.ndarray) -> np.ndarray:
-        """The frame as large as the format needs it."""
+        """The frame padded to the format's size."""
         return pixels
 
     @abstractmethod
@@ -147,7 +147,7 @@ class Mp4(Video):
 
 
 class WebP(Video):
-    """Animated WebP, lossy, for ever."""
+    """Animated WebP, lossy, looping."""
 
     format = "webp"
     options: ClassVar[dict[str, str]] = {"loop": "0"}
@@ -161,9 +161,9 @@ class WebP(Video):
 
 
 class Gif(Video):
-    """Animated GIF, for ever: one palette for all frames, so frames wait in a file until it is known.
+    """Animated GIF, looping: one palette for all frames, so frames wait in a file until it is known.
 
-    Ordered dithering: a pixel that does not change is dithered alike in every frame, so nothing flickers.
+    Ordered dithering: a pixel that does not change is dithered equally in every frame, so nothing flickers.
     """
 
     format = "gif"

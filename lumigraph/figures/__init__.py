@@ -130,7 +130,7 @@ def contact_sheet(title: str, columns: Sequence[str], rows: Sequence[Row], cell:
     layouts = [Layout(columns, rows, size, count) for size in sizes(cell) for count in range(1, max(len(rows), 1) + 1)]
     fitting = [layout for layout in layouts if layout.fits]
     largest = max((layout.cell for layout in fitting), default=min(layout.cell for layout in layouts))
-    return min((x for x in fitting or layouts if x.cell == largest), key=lambda x: x.oddness).drawn(title)
+    return min((x for x in fitting or layouts if x.cell == largest), key=lambda x: x.oddness).draw_sheet(title)
 
 
 def sizes(cell: int) -> list[int]:
@@ -197,7 +197,7 @@ class Layout:
         """Distance of the aspect ratio from a screen's, as an absolute logarithm."""
         return abs(math.log(self.size[0] / self.size[1] * SCREEN[1] / SCREEN[0]))
 
-    def drawn(self, title: str) -> Image.Image:
+    def draw_sheet(self, title: str) -> Image.Image:
         sheet = Image.new("RGB", self.size, PAPER)
         draw, small = ImageDraw.Draw(sheet), ImageFont.load_default(SMALL_SIZE)
         draw.text((MARGIN, MARGIN - 10), title, INK, ImageFont.load_default(TITLE_SIZE))

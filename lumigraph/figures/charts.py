@@ -23,9 +23,7 @@ STYLE = (Path(__file__).parent / "charts.css").read_text("utf-8")
 
 @dataclass(frozen=True)
 class Series:
-    """Curve of a chart. colour: its number in charts.css, by default its index in the chart;  dash: 0 for an
-    unbroken line
-    """
+    """Curve of a chart. colour: its number in charts.css, by default its index;  dash: 0 for an unbroken line"""
 
     name: str
     x: Sequence[float]

@@ -55,7 +55,7 @@ def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable
     with explained(path):
         if any(one.exists() and path.exists() and one.samefile(path) for one in reads):
             raise LumigraphError(f"{path} would be replaced, and is what the command reads; choose another name")
-        there = seen(path)
+        there = path_status(path)
         if place in _granted and _granted[place] == there:
             return
         check_room(place)
@@ -77,11 +77,10 @@ def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable
 
 
 def claim_folder(path: Path, kind: Kind | None = None) -> None:
-    """Raise LumigraphError unless a whole folder may be written: the path must be free, empty, or a folder of the
-    same kind."""
+    """Raise LumigraphError unless a whole folder may be written: a path free, empty, or of the same kind."""
     with explained(path):
         check_room(Path(os.path.abspath(path)))
-        if seen(path) is None:
+        if path_status(path) is None:
             return
         if path.is_symlink() or not path.is_dir():
             raise LumigraphError(
@@ -118,7 +117,7 @@ def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[P
                 marks.note(target, kind, new)
             os.replace(new, target)
             if not ours:
-                _granted[Path(os.path.abspath(target))] = seen(target)
+                _granted[Path(os.path.abspath(target))] = path_status(target)
             sync_folder(path.parent)
         tell_if_moved(path, target)
 
@@ -145,7 +144,7 @@ def replacing_folder(path: Path, kind: Kind | None = None, ours: bool = False) -
 
 def exchange(new: Path, place: Path) -> None:
     """Rename a folder to `place`. An existing one gets the folder's name, and is deleted with it."""
-    if seen(place) is None:
+    if path_status(place) is None:
         os.replace(new, place)
     elif not swapped(new, place):  # no such call: a kill between these two costs what was there, and was to go
         with partial(place.parent, is_folder=True) as aside:
@@ -154,7 +153,7 @@ def exchange(new: Path, place: Path) -> None:
             try:
                 os.replace(new, place)
             except BaseException:
-                if seen(old) is not None:
+                if path_status(old) is not None:
                     os.replace(old, place)
                 raise
 
@@ -172,7 +171,7 @@ def place_now(path: Path, ask: Callable[[], None]) -> Path:
         return path
     except LumigraphError:
         beside = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-        return next(other for other in beside if seen(other) is None)
+        return next(other for other in beside if path_status(other) is None)
 
 
 def tell_if_moved(wanted: Path, place: Path) -> None:
@@ -180,7 +179,7 @@ def tell_if_moved(wanted: Path, place: Path) -> None:
         raise LumigraphError(f"{wanted} has been changed by somebody else meanwhile; what was made is {place}")
 
 
-def seen(path: Path) -> Seen | None:
+def path_status(path: Path) -> Seen | None:
     """Status of a path without following links; None if it does not exist."""
     try:
         about = os.lstat(path)
@@ -208,9 +207,7 @@ def refuse_links(folder: Path, read_only: Container[str] = ()) -> None:
 
 
 def open_anew(path: Path) -> BinaryIO:
-    """Create a file readable by this user alone, open for writing. An existing one is deleted; a link's target
-    stays.
-    """
+    """Create a file readable by this user alone, open for writing. An existing one is deleted, not a link's target."""
     with explained(path):
         path.unlink(missing_ok=True)
         return open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb")
@@ -345,8 +342,7 @@ def refusal(path: Path, error: OSError) -> str:
 
 
 def scene_name(source: str) -> str:
-    """Short name for files: the last part of a path, without a file's suffix, or the part after "procedural:" or
-    "words:"."""
+    """Short name for files: last part of a path, without suffix, or the part after "procedural:" or "words:"."""
     path = Path(source).resolve()
     own = path.stem if path.is_file() else path.name
     last = source.partition(":")[2] if source.startswith(("procedural:", "words:")) else own

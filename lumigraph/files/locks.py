@@ -37,7 +37,7 @@ class Holder:
 
 
 @contextlib.contextmanager
-def held(folder: Path, doing: str) -> Iterator[None]:
+def lock_folder(folder: Path, doing: str) -> Iterator[None]:
     """Lock an existing folder inside this block; reentrant within a process.
 
     doing: activity of the lock, such as "trained"
@@ -63,9 +63,7 @@ def held(folder: Path, doing: str) -> Iterator[None]:
 
 
 def check_place(folder: Path) -> None:
-    """Raise LumigraphError for a foreign file at the path of a folder's lock, since it would be replaced and
-    deleted.
-    """
+    """Raise LumigraphError for a foreign file at the path of a folder's lock, which would be replaced."""
     with explained(folder / LOCK_FILE):
         if not is_lock(folder / LOCK_FILE):
             raise LumigraphError(f"{folder / LOCK_FILE} is no lock of Lumigraph's; rename it, or choose another folder")

@@ -19,7 +19,7 @@ from numpy.lib.recfunctions import repack_fields, structured_to_unstructured
 from ..errors import LumigraphError
 from ..system.memory import ask_for
 from .atomic import Kind, replacing, without_waiting
-from .ranges import shown
+from .ranges import format_value
 from .reading import reading, reads
 
 MAX_HEADER_BYTES = 1 << 20  # headers of Gaussians have about 1500
@@ -100,7 +100,7 @@ def read_header(path: Path) -> Header:
         header = parsed(data[: end.end()])
     there, least = size - header.size, sum(element.min_bytes(header.text) for element in header.elements.values())
     if least > there:
-        rows = ", ".join(f"{count} x {shown(name)[1:-1]}" for name, count in header.counts.items())
+        rows = ", ".join(f"{count} x {format_value(name)[1:-1]}" for name, count in header.counts.items())
         raise LumigraphError(
             f"{path} ends early: its header promises {rows}, at least {least} bytes, and {there} follow; {COPY_AGAIN}"
         )
@@ -123,26 +123,24 @@ def parsed(head: bytes) -> Header:
             case ["obj_info", *_] | ["end_header"] | []:
                 pass
             case _:
-                raise ValueError(f"{shown(line)} has no meaning there")
+                raise ValueError(f"{format_value(line)} has no meaning there")
     for name, element in elements.items():
         if element.count and not element.properties:
-            raise ValueError(f"{shown(name)} has no properties")
+            raise ValueError(f"{format_value(name)} has no properties")
     return Header(order == "=", len(head), elements, comments)
 
 
 def add_property(known: list[Property], kinds: list[str], name: str, order: str) -> None:
-    """Add a property to an element. kinds: the type of a number; or `list`, the types of a list's length and of its
-    numbers
-    """
+    """Add a property to an element. kinds: type of a number; or `list`, types of a list's length and numbers"""
     match [TYPES.get(kind, kind) for kind in kinds]:
         case [code] if code in NAMES:
             length = None
         case ["list", count, code] if code in NAMES and count in NAMES and count[0] != "f":
             length = np.dtype(order + count)
         case _:
-            raise ValueError(f"{shown(' '.join(kinds))} is no type of {shown(name)}")
+            raise ValueError(f"{format_value(' '.join(kinds))} is no type of {format_value(name)}")
     if name in [p.name for p in known]:
-        raise ValueError(f"{shown(name)} is there twice")
+        raise ValueError(f"{format_value(name)} is there twice")
     known.append(Property(name, np.dtype(order + code), length))
 
 
@@ -190,7 +188,7 @@ def text_row(words: list[str], element: Element) -> Iterator[np.ndarray]:
         count = 1 if p.length is None else int(next(rest, "-1"))
         values = np.array([*islice(rest, min(count, len(words)))], p.dtype)
         if len(values) != count:
-            raise ValueError(f"a row has {len(values)} of {shown(count)} numbers")
+            raise ValueError(f"a row has {len(values)} of {format_value(count)} numbers")
         yield values
     if next(rest, ""):
         raise ValueError("a row has more numbers than properties")
@@ -203,8 +201,7 @@ class BinaryReader:
         self.data, self.at, self.path = np.asarray(np.memmap(file, np.uint8, "r")), header.size, path
 
     def rows(self, element: Element) -> np.ndarray:
-        """The next element: a view if all lists are as long as those of the first row. Raises ValueError for too few
-        bytes."""
+        """The next element: a view if all lists are as long as the first. Raises ValueError for too few bytes."""
         begin = self.at
         dtype, lengths = layout(element, [len(values) for values in self.row(element)] if element.has_lists else [])
         end = begin + element.count * dtype.itemsize

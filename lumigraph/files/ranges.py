@@ -158,7 +158,7 @@ def coherent(value: Any) -> None:
 def check(value: Any, where: Path | str) -> None:
     """Raise LumigraphError for out-of-range or inconsistent numbers of a dataclass. where: named in the error"""
     for name, kind, found in outside(value):
-        raise LumigraphError(f"{where}: {name} cannot be {shown(found)}; it is from {domain(kind)}")
+        raise LumigraphError(f"{where}: {name} cannot be {format_value(found)}; it is from {domain(kind)}")
     coherent(value)
 
 
@@ -194,10 +194,10 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
             should = "be a name" if "matching regex" in should else should
             if choices := [x for one in members(wanted) if get_origin(one) is Literal for x in get_args(one)]:
                 should = f"be {' or '.join(map(str, choices))}"
-            what = f"{name or 'it'} is {shown(found)}, and should {should}"
+            what = f"{name or 'it'} is {format_value(found)}, and should {should}"
         raise LumigraphError(f"{where} does not hold what it should: {what}") from error
     if key is not None:
-        raise LumigraphError(f"{where} does not hold what it should: nothing is known of {shown(key)}")
+        raise LumigraphError(f"{where} does not hold what it should: nothing is known of {format_value(key)}")
     return made
 
 
@@ -250,7 +250,7 @@ def members(kind: Any) -> Iterator[Any]:
         yield kind
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A value for a sentence, shortened to a line."""
     if isinstance(value, int) and abs(value) > 10**60:  # Python writes out no integer of thousands of digits
         return "an integer of more than 60 digits"

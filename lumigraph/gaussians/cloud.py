@@ -1,5 +1,4 @@
-"""Clouds of 3D Gaussians (Kerbl 2023), in training and in files; joining, cropping, and removal of floaters by opacity,
-size and isolation."""
+"""Clouds of 3D Gaussians (Kerbl 2023); joining, cropping, and removal by opacity, size and isolation."""
 
 from __future__ import annotations
 

@@ -112,8 +112,7 @@ def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:
 
 
 def _limits(lens: Pinhole | OpenCV, width: int, height: int) -> Float[Tensor, " 4"]:
-    """Bounds of the picture on the plane z = 1, with a margin. Computed on the CPU: on a GPU it would be a few numbers
-    in hundreds of launches."""
+    """Bounds of the picture on the plane z = 1, with a margin. On the CPU: a GPU would need hundreds of launches."""
     x, y = (torch.linspace(0, n, EDGE_SAMPLES) for n in (width, height))
     left, top = torch.zeros_like(y), torch.zeros_like(x)
     edges = [torch.stack(pair, -1) for pair in ((left, y), (left + width, y), (x, top), (x, top + height))]

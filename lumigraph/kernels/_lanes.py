@@ -183,9 +183,7 @@ def ahead(array, at):
 
 
 def totals(vectors):
-    """Horizontal sums: lane k is the sum of all lanes of vector k, of at most sixteen vectors; other lanes are
-    undefined.
-    """
+    """Horizontal sums: lane k is the sum of vector k, of at most sixteen vectors; other lanes are undefined."""
     return np.array([x.sum() for x in vectors] + [0] * (LANES - len(vectors)), np.float32)
 
 

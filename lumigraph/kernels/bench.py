@@ -54,7 +54,7 @@ def bench_kernels(
     names = all_operations() if operations is None else operations
     for name in track(names, "Timing kernels", len(names)):
         folder = importlib.import_module(f"{__package__}.{name}")
-        inputs = [_moved(x, device) for x in folder.benchmark_case(torch.Generator().manual_seed(0), size)]
+        inputs = [_to_device(x, device) for x in folder.benchmark_case(torch.Generator().manual_seed(0), size)]
         count = math.prod(inputs[0].shape[: folder.FACTS.unit_axes])
         run = getattr(folder, name)
         engines = {engine: _measure(run, engine, inputs, count, repeats) for engine in (fast, "reference")}
@@ -67,7 +67,7 @@ def bench_kernels(
     return result
 
 
-def _moved(x: Any, device: torch.device) -> Any:
+def _to_device(x: Any, device: torch.device) -> Any:
     if isinstance(x, Tensor):
         return x.detach().to(device).requires_grad_(x.requires_grad)
     return x.to(device) if hasattr(x, "to") else x

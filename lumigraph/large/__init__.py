@@ -4,10 +4,9 @@ layout               positions of blocks, at street crossings or evenly spread, 
 plan, planning       blocks.json, the task of each block, and a map of the plan, before any training
 worker               train one block: a restartable function of its folder
 training             train all blocks, in this process or on workers, or one of them again;  monitor  their progress
-block_run            opened run of all blocks;  block_cache  LRU cache of blocks
-compositing, weights render nearby blocks and mix their pictures; one cloud of the blocks' clouds of Gaussians
-opening              open runs, in blocks or not, and everything else that opens
-alignment            one appearance and one exposure for all blocks
+block_run            opened run of all blocks;  block_cache  LRU cache of blocks compositing, weights render nearby
+blocks and mix their pictures; one cloud of the blocks' clouds of Gaussians opening              open runs, in blocks or
+not, and everything else that opens alignment            one appearance and one exposure for all blocks
 """
 
 from .alignment import align_appearance as align_appearance

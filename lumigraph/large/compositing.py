@@ -90,8 +90,7 @@ class InBlocks(Method):
 
     @torch.no_grad()
     def weights(self, camera: Camera) -> Float[Tensor, " block"]:
-        """Weight of each block in a camera's picture; they sum to 1. Mixing by points or visibility has weights per
-        pixel instead."""
+        """Weight of each block in a camera's picture, with sum 1; points or visibility have weights per pixel."""
         c = self.config
         distance = (camera.position.to(self.centres) - self.centres).norm(dim=-1)
         weights = inverse_distance(distance, self.radii, c.power, c.most)
@@ -176,7 +175,7 @@ class InBlocks(Method):
         told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
         assert isinstance(told, InBlocks)
         passed = {name: value for name, value in told.settings.items() if name != EXPOSURE and name in controls}
-        parts = self.blocks.each(lambda part: part.given(passed))
+        parts = self.blocks.each(lambda part: part.with_controls(passed))
         if EXPOSURE in controls and self.usual is not None:
             parts = parts.each(partial(exposed, exposure=self.usual + float(told.settings[EXPOSURE])))
         for photograph in mine:

@@ -217,9 +217,7 @@ def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Floa
 
 
 def usual_step(ground: Float[np.ndarray, "photograph 2"]) -> float:
-    """Typical distance between neighbouring photographs, a quantile of their spanning tree's edges; 0 for a single
-    place.
-    """
+    """Typical distance of neighbouring photographs, a quantile of spanning tree edges; 0 for a single place."""
     if len(ground) < 3:
         return 0.0
     distance, index = cKDTree(ground).query(ground, min(GRAPH_NEIGHBOURS, len(ground)))

@@ -109,8 +109,7 @@ def place_of(run: Path, block: Block) -> Path:
 
 
 def difference(known: Plan, wanted: Plan) -> str | None:
-    """First difference between two plans, in a user's words; None if they are equivalent. Retrained blocks are
-    ignored."""
+    """First difference between two plans, for users; None if equivalent. Retrained blocks are ignored."""
     mine, other = asdict(known), asdict(wanted)
     for name in ("method", "scene", "config", "budget", "seed", "device", "upright"):
         if not alike(mine[name], other[name]):

@@ -28,7 +28,7 @@ from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
 from ..files import scene_name
-from ..files.locks import held
+from ..files.locks import lock_folder
 from ..files.names import next_free
 from ..method.capabilities import HasGaussians, can
 from ..opening import kind_of
@@ -67,7 +67,7 @@ def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Condu
     unavailable workers.
     """
     folders = {block.name: place_of(run, block) for block in plan.blocks}
-    with held(run, "trained"), Watching(run, folders, show):
+    with lock_folder(run, "trained"), Watching(run, folders, show):
         if workers.count is not None or workers.address is not None:
             return on_workers(folders, workers)
         found = Conducted({}, {})
@@ -125,7 +125,7 @@ def update(run: Path, source: str, train: TrainOptions, blocks: BlockOptions, sh
         raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
     if not files.is_file(run / PLAN_FILE):
         raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
-    with held(run, "trained"):
+    with lock_folder(run, "trained"):
         plan = Plan.read(run / PLAN_FILE)
         block = again(plan.block(name), source, train)
         task, place = plan.task(block), place_of(run, block)

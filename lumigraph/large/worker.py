@@ -26,7 +26,7 @@ from .. import files, methods
 from ..budget import Budget
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
-from ..files.locks import held
+from ..files.locks import lock_folder
 from ..files.ranges import typed
 from ..method import Method
 from ..opening import open_dataset
@@ -132,7 +132,7 @@ def patiently_held(folder: Path) -> Iterator[None]:
     with ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(held(folder, "trained"))
+                stack.enter_context(lock_folder(folder, "trained"))
                 break
             except LumigraphError:
                 if time.monotonic() > until:

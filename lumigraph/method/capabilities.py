@@ -168,8 +168,7 @@ class CanCompress(Protocol):
         compositing weights that it contributes to."""
 
     def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
-        """Remove the least important rows, which together have a share of all importance. Returns the importance of the
-        remaining rows."""
+        """Remove the least important rows, a share of all importance together. Returns the others' importance."""
 
 
 class CanDraw(Protocol):

@@ -11,6 +11,7 @@ from ..errors import LumigraphError
 
 Value = float | str
 
+AVERAGE = "average"  # the choice of the mean of all learnt codes
 NAMED = 8  # choices in a sentence at most
 
 
@@ -104,8 +105,7 @@ class Control:
 
 
 def blend(value: str) -> tuple[str, str, float]:
-    """The two choices of a value of a blending control, and its position between them; 0 for a single choice, NaN for
-    text without a position."""
+    """Two choices of a blending control's value, and its position between them; 0 for one choice, NaN if missing."""
     first, *rest = value.split(":")
     if not rest:
         return first, first, 0.0

@@ -37,9 +37,7 @@ class Lesson(Protocol):
 
 @runtime_checkable
 class Descend(Protocol):
-    """Descent of one step, provided by the trainer: gradients of summed terms, checked to be finite, then the
-    optimizers' step.
-    """
+    """Descent of one step: gradients of summed terms, checked to be finite, then the optimizers' step."""
 
     def __call__(self, terms: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer] | None = None) -> None: ...
 
@@ -105,8 +103,7 @@ class Method(nn.Module, ABC):
     # Learning
 
     def steps_per_pass(self, data: Any) -> float:
-        """Number of steps of one pass over the "train" split, on average; one photograph, shape or member a step by
-        default."""
+        """Number of steps of one pass over the "train" split, on average; by default one item a step."""
         return len(data.splits["train"])
 
     def steps_for(self, quality: Quality, data: Any) -> int:
@@ -282,14 +279,11 @@ class Method(nn.Module, ABC):
 
     @classmethod
     def of(cls, other: Method, config: Any) -> Method:
-        """A method of this kind converted from another one instead of trained on data. Raises LumigraphError if that is
-        impossible.
-        """
+        """A method of this kind converted from another one. Raises LumigraphError if that is impossible."""
         raise LumigraphError(f"{cls.__name__} cannot be made of {type(other).__name__}; it learns from data alone")
 
     def random(self, number: int) -> torch.Generator:
-        """Random generator seeded by the config's seed and a number, such as the step, so that a resumed run samples
-        the same."""
+        """Random generator seeded by the config's seed and a number, such as the step, for exact resuming."""
         return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
 
     @property

@@ -52,8 +52,7 @@ class RayMethod(Method):
         return {"coarse": getattr(self.config, "coarse_loss_weight", 1.0)}
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """Squared error of each pass's picture (Mildenhall 2020, eq. 6), for `looks` with a generator of jitter in
-        training."""
+        """Squared error of each pass's picture (Mildenhall 2020, eq. 6), for `looks` with jitter in training."""
         background = self.background
         target = batch.before(background)
         terms, taught = dict[str, Tensor](), dict[str, Tensor]()

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..budget import Effort, Efforts
 from ..camera.rays import Rays
 from ..components.fields.hash_field import HashField, HashNumbers
+from ..components.fields.spaces import space_of
 from ..components.guidance import (
     CPU_GUIDANCE,
     TINY_GUIDANCE,
@@ -22,8 +23,7 @@ from ..components.guidance import (
 )
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ..components.sampling.spaces import space_of
-from ..components.training.schedules import held
+from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Frame
 from ..datasets.words import Words
 from ..files.ranges import LearningRate, Seed, Width, between, changed
@@ -103,7 +103,7 @@ class DreamFields(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         """Warm-up, then constant, then exponential decay."""
         c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
 
 def rays_of(views: PromptedViews) -> Rays:

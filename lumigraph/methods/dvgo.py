@@ -14,12 +14,12 @@ from .. import kernels
 from ..camera import Camera
 from ..camera.rays import Look
 from ..components.fields.layers import MLP
+from ..components.fields.spaces import NDC, Space, space_of
 from ..components.fields.teacher import cells_of, logit, teacher_of
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
 from ..components.sampling.samplers import ProposalNumbers, sampler_for
-from ..components.sampling.spaces import NDC, Space, space_of
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.regularizers import opacity_entropy
 from ..components.training.row_optimizers import LazyAdam

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.hash_field import HashField, HashNumbers
+from ..components.fields.spaces import Box, space_of
 from ..components.fields.teacher import distil, teacher_of
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ..components.sampling.spaces import Box, space_of
 from ..components.training.photometric import Exposure, Setting, backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..components.training.schedules import held
+from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Batch, Frame
 from ..exchange.packing import most_important
 from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
@@ -95,7 +95,7 @@ class InstantNGP(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Table and networks, taught at points by the teacher."""

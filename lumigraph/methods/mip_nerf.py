@@ -9,12 +9,12 @@ import torch
 
 from ..camera import Camera
 from ..components.fields.coordinate_field import FrustumField, NetworkNumbers
+from ..components.fields.spaces import space_of
 from ..components.fields.teacher import POINTS_PER_RAY, distil, teacher_of
 from ..components.sampling.cone_sampler import ConeSampler
 from ..components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
 from ..components.sampling.occupancy import MaskNumbers
 from ..components.sampling.samplers import sampling_bytes
-from ..components.sampling.spaces import space_of
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import BandSchedule, exponential_decay, joining_of
 from ..datasets.scene import Frame

@@ -10,11 +10,11 @@ from torch.nn.functional import softplus
 
 from ..camera import Camera
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
+from ..components.fields.spaces import space_of
 from ..components.fields.teacher import POINTS_PER_RAY, distil, teacher_of
 from ..components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, HierarchicalSampler, RayNumbers
 from ..components.sampling.occupancy import MaskNumbers
 from ..components.sampling.samplers import sampling_bytes
-from ..components.sampling.spaces import space_of
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import exponential_decay
 from ..datasets.scene import Frame

@@ -13,20 +13,20 @@ from torch.nn.functional import softplus
 
 from .. import kernels
 from ..camera.rays import Look, Rays, Rendering, Samples
-from ..components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes, sky_for
-from ..components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ..components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ..components.fields.appearance import AppearanceCodes, CodeWidth, PhotographCodes, sky_for
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ..components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, side_by_side
 from ..components.fields.layers import MLP, Dense, in_chunks, truncated_exp
+from ..components.fields.spaces import space_of
 from ..components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
 from ..components.sampling.samplers import sampling_bytes
-from ..components.sampling.spaces import space_of
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held_decay
 from ..datasets.scene import Batch, Frame
 from ..files.ranges import Layers, NonNegative, PositiveShare, Seed, Share, Width, changed
 from ..method import FieldMethod, Pass, seeded
-from ..method.controls import Control
+from ..method.controls import AVERAGE, Control
 from ..method.field import Densities, Points
 from ..volume import composite
 

@@ -17,15 +17,15 @@ from torch import Tensor, nn
 
 from ..camera import Camera
 from ..camera.rays import Look, Rays, Rendering
-from ..components.fields.development import CONTROLS, decoded, exposed, toned
 from ..components.fields.hash_field import HashField, HashNumbers
 from ..components.fields.layers import truncated_exp
+from ..components.fields.spaces import space_of
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ..components.sampling.spaces import space_of
+from ..components.training.development import CONTROLS, decoded, exposed, toned
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.regularizers import normalized_distance
-from ..components.training.schedules import held
+from ..components.training.schedules import hold_and_decay
 from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
 from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
@@ -238,7 +238,7 @@ class RawNeRF(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
-        return held(c.learning_rate, FINAL_LEARNING_RATE, step, progress, DECAY_START)
+        return hold_and_decay(c.learning_rate, FINAL_LEARNING_RATE, step, progress, DECAY_START)
 
     # Being seen
 

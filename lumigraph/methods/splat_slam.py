@@ -22,7 +22,7 @@ from ..components.clouds.cloud import Cloud, RateNumbers
 from ..components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
 from ..components.tracking.frames import DepthFrame, Moment
 from ..components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
-from ..components.tracking.trajectory import Pose, moved
+from ..components.tracking.trajectory import Pose, apply_twists
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.ranges import CloudSize, Count, Seed, between, changed
@@ -215,7 +215,7 @@ class SplatSlam(Method):
         groups = [{"params": [turn], "lr": ROTATION_RATE}, {"params": [shift], "lr": SHIFT_RATE}]
         optimizer = torch.optim.Adam(groups)
         for _ in range(1 if self.rehearses else t.tracking_iterations):
-            at = moved(pose[None], torch.cat([turn, shift * self.unit], -1))[0]
+            at = apply_twists(pose[None], torch.cat([turn, shift * self.unit], -1))[0]
             seen = self.seen(cloud, frame, at)
             sure = known & (seen.opacity.detach() > TRACKING_SILHOUETTE)
             away = DEPTH_WEIGHT * (surface_depth(seen) - depth).abs() / self.unit
@@ -245,7 +245,7 @@ class SplatSlam(Method):
             inside = valid & (values[:, 9] > 0.99)
             return torch.where(inside, distance / (TRUNCATION * self.unit), 2.0), values[:, 6:9]
 
-        pixels = frame.drawn(ALIGNMENT_POINTS, chance, measured=True)
+        pixels = frame.sample_pixels(ALIGNMENT_POINTS, chance, measured=True)
         points = frame.rays[pixels].at(frame.depth[pixels])
         deviation = sensor_deviation(frame.depth[pixels] / self.unit) / TRUNCATION
         rgb, steps = frame.rgb[pixels], ALIGNMENT_ITERATIONS
@@ -305,18 +305,18 @@ class SplatSlam(Method):
         keyframes = tracker.keyframes
         if frame is None:
             order = torch.randperm(len(keyframes), generator=chance)[:k]
-            return [tracker.held(moment.scene, keyframes[i]) for i in order.tolist()]
+            return [tracker.load_keyframe(moment.scene, keyframes[i]) for i in order.tolist()]
         others = keyframes[:-1]
         if len(others) > k - 2:
-            shares = self.overlaps(frame, [tracker.held(moment.scene, i) for i in others], chance)
+            shares = self.overlaps(frame, [tracker.load_keyframe(moment.scene, i) for i in others], chance)
             best = torch.tensor(shares).argsort(descending=True, stable=True)[: k - 2]
             others = [others[i] for i in best.tolist()]
-        return [frame, *(tracker.held(moment.scene, i) for i in [*others, *keyframes[-1:]])]
+        return [frame, *(tracker.load_keyframe(moment.scene, i) for i in [*others, *keyframes[-1:]])]
 
     @torch.no_grad()
     def overlaps(self, frame: DepthFrame, others: Sequence[DepthFrame], chance: torch.Generator) -> list[float]:
         """Share of a frame's measured points that each of other frames sees."""
-        pixels, pose = frame.drawn(OVERLAP_PIXELS, chance, measured=True), self.pose(frame)
+        pixels, pose = frame.sample_pixels(OVERLAP_PIXELS, chance, measured=True), self.pose(frame)
         points = frame.rays[pixels].at(frame.depth[pixels]) @ pose[:, :3].T + pose[:, 3]
         shares = []
         for other in others:

@@ -13,9 +13,9 @@ from scipy.ndimage import binary_fill_holes, gaussian_filter
 from torch import Tensor, nn
 
 from ..components.fields.level_set import level_set
+from ..components.fields.spaces import space_of
 from ..components.fields.voxels import VoxelGrid
 from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
-from ..components.sampling.spaces import space_of
 from ..components.training.photometric import backdrop
 from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling

@@ -204,8 +204,7 @@ class Inception:
         return relu(x * gain[:, None, None] + (bias - mean * gain)[:, None, None])
 
     def _weight(self, name: str, shape: Sequence[int]) -> Tensor:
-        """A tensor by name, or a meta tensor while shapes are compared. Raises LumigraphError for another
-        architecture."""
+        """A tensor by name, or a meta tensor to compare shapes. Raises LumigraphError for another architecture."""
         found = self.weights.get(name)
         if self._fits and (found is None or tuple(found.shape) != tuple(shape)):
             fault = f"lacks {name}" if found is None else f"has {name} of shape {tuple(found.shape)}"

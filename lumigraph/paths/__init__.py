@@ -21,13 +21,13 @@ DEFAULT_FRAMES = 120  # of a film along a path without a length
 def film_cameras(
     cameras: dict[str, Camera], frame: Frame, path: str | CameraPath, frames: int | None = None, size: int | None = None
 ) -> Camera:
-    """The cameras of a film, one for each frame.
+    """Cameras of a film, one for each frame.
 
     cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
     path:   name of one (`export/options.py`), or a CameraPath
     frames: None for the default of the path: 120, every held-out view, as long as keyframes last
     size:   longer side; None as the photographs, up to a limit
-    Raises LumigraphError for held-out views where there are none, or of several sizes.
+    Raises LumigraphError for held-out views if there are none, or of several sizes.
     """
     if path != "held-out":
         train = cameras["train"]

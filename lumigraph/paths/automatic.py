@@ -1,9 +1,8 @@
-"""Camera paths for films. They follow where the photographs were taken from, so that nothing unseen is shown.
+"""Automatic camera paths. They stay close to the photographs' cameras, so that only observed parts are shown.
 
-Cameras that look at something are described by their position around it: azimuth, elevation and distance about the
-point that they look at. Photographs taken all around it give a full circle; those from one side, a sway to and fro.
-Cameras that look outward give a turn on the spot, where one of them stood. All paths but `held_out` close upon
-themselves or end smoothly.
+Cameras that look at a subject are described relative to it: azimuth, elevation and distance. Photographs from all
+around give a full circle; those from one side a sway. Cameras that look outward give a turn on the spot. All paths but
+`held_out` are closed or end smoothly.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ MIN_FACING_SHARE = 0.4  # of the cameras that must look at the focus; gazes in a
 
 
 def camera_path(kind: str, cameras: Camera, frame: Frame, frames: int, size: tuple[int, int]) -> Camera:
-    """The cameras of a film: one for each frame, behind a pinhole lens.
+    """Cameras of a film: one for each frame, with a pinhole lens.
 
     kind:    one of `PATHS`
-    cameras: where the photographs were taken from
+    cameras: of the photographs
     size:    (width, height) of the film
     """
     if frames < 1:
@@ -60,7 +59,7 @@ def film_size(camera: Camera, longest: int) -> tuple[int, int]:
 
 
 def angle_of_view(cameras: Camera) -> float:
-    """Radians across the smaller side of the picture, in the middle of what the cameras have; a pinhole can show it."""
+    """Median angle of view across the smaller side, radians, limited to that of a pinhole."""
     angles = []
     for camera in (cameras[i] for i in range(0, len(cameras), max(1, len(cameras) // 16))):
         width, height = camera.size[0].tolist()
@@ -87,7 +86,7 @@ class Surroundings:
 
     @cached_property
     def focus(self) -> Float[Tensor, " 3"]:
-        """The point nearest to all optical axes; where they leave it open, nearest to the middle of the bounds."""
+        """Point nearest to all optical axes; where undetermined, nearest to the centre of the bounds."""
         middle = torch.tensor(self.frame.bounds, dtype=torch.double).mean(0)
         return nearest_to_lines(self.position, self.forward, middle)
 
@@ -98,12 +97,12 @@ class Surroundings:
 
     @cached_property
     def middle(self) -> int:
-        """Number of the camera nearest to the middle of all: its place is free for certain."""
+        """Number of the camera nearest to the mean of all: its position is certainly free."""
         return int((self.position - self.position.median(0).values).norm(dim=-1).argmin())
 
     @cached_property
     def axes(self) -> Float[Tensor, "3 3"]:
-        """Rows: towards azimuth 0, towards azimuth 90 degrees, up. Azimuth 0 is where the cameras are, on average."""
+        """Rows: towards azimuth 0, towards azimuth 90 degrees, up. Azimuth 0 is the cameras' mean direction."""
         towards = self._offset.mean(0)
         level = torch.stack([towards[0], towards[1], torch.zeros((), dtype=torch.double)])
         first = unit(level) if level.norm() > 1e-6 else torch.tensor([1.0, 0.0, 0.0], dtype=torch.double)
@@ -117,7 +116,7 @@ class Surroundings:
 
     @property
     def alike(self) -> bool:
-        """True if all cameras look about the same way: at a front, or down from a drone."""
+        """True for cameras with about the same direction: at a front, or down from a drone."""
         return float(self.forward.mean(0).norm()) > ALIKE_GAZE_LENGTH
 
     @cached_property
@@ -153,13 +152,13 @@ class Surroundings:
         return near @ self.polar[:, 1], near @ self.polar[:, 2]
 
     def spread(self, column: int) -> float:
-        """Half of what the middle two thirds of the cameras span."""
+        """Half the range of the middle two thirds of the cameras."""
         low, high = torch.quantile(self.polar[:, column], torch.tensor([1 / 6, 5 / 6], dtype=torch.double)).tolist()
         return (high - low) / 2
 
     def poses(self, azimuth: Tensor, elevation: Tensor, log_distance: Tensor) -> Poses:
-        """Cameras standing there and looking at the focus; looking that way from the middle camera's place, if all look
-        outward."""
+        """Poses at these positions, looking at the focus; for outward cameras, directions at the middle camera's
+        position."""
         elevation = elevation.clamp(math.radians(-85), math.radians(85))
         level = elevation.cos()
         outward = torch.stack([level * azimuth.cos(), level * azimuth.sin(), elevation.sin()], -1) @ self.axes
@@ -169,7 +168,7 @@ class Surroundings:
 
 
 def orbit(around: Surroundings, frames: int) -> Poses:
-    """Once around at the cameras' height and distance, or to and fro along the arc that they cover."""
+    """Once around at the cameras' height and distance, or to and fro along their arc."""
     angle = turn(frames)
     middle, half = around.arc
     if half == math.pi:
@@ -180,7 +179,7 @@ def orbit(around: Surroundings, frames: int) -> Poses:
 
 
 def spiral(around: Surroundings, frames: int) -> Poses:
-    """Twice around while rising and sinking again; before a scene seen from one side, loops that also come nearer."""
+    """Twice around, rising and sinking; for a scene seen from one side, loops with varying distance."""
     angle = turn(frames)
     middle, half = around.arc
     if half == math.pi:
@@ -193,7 +192,7 @@ def spiral(around: Surroundings, frames: int) -> Poses:
 
 
 def interpolate(around: Surroundings, frames: int) -> Poses:
-    """Smoothly through photographs, at an even pace."""
+    """Smooth interpolation through photographs, at constant speed."""
     keys = key_order(around, max(2, frames // FRAMES_PER_KEY))
     position, forward = around.position[keys], around.forward[keys]
     up = -around.cameras.pose[:, :, 1].double().cpu()[keys]
@@ -211,7 +210,7 @@ def interpolate(around: Surroundings, frames: int) -> Poses:
 
 
 def sweep(around: Surroundings, frames: int) -> Poses:
-    """An oval among cameras that look the same way, seen as those nearby see it."""
+    """An ellipse among parallel cameras, with directions of nearby ones."""
     angle, gaze = turn(frames), unit(around.forward.mean(0))
     up = -around.cameras.pose[around.middle, :, 1].double().cpu()
     down_picture = unit(up - (up @ gaze) * gaze)
@@ -230,12 +229,12 @@ def sweep(around: Surroundings, frames: int) -> Poses:
 
 
 def still(around: Surroundings, frames: int) -> Poses:
-    """The photograph's camera that is nearest to the middle of all, for what moves by itself."""
+    """The fixed camera of the central photograph, for dynamic scenes."""
     return around.cameras.pose[around.middle].double().cpu().expand(frames, 3, 4)
 
 
 def fitting(cameras: Camera, frame: Frame) -> str:
-    """The path of `PATHS` that a capture supports: a sweep where cameras look the same way, else an orbit."""
+    """Path of `PATHS` for a capture: a sweep for parallel cameras, else an orbit."""
     return "sweep" if Surroundings(cameras, frame).alike else "orbit"
 
 
@@ -254,7 +253,7 @@ def turn(frames: int) -> Float[Tensor, " frame"]:
 
 
 def key_order(around: Surroundings, count: int) -> Int[Tensor, " key"]:
-    """Photographs to pass through: in the order given where that is a walk, otherwise by a short tour of a few."""
+    """Photographs to interpolate: in their order if that is a walk, otherwise by a short tour of a few."""
     position = around.position
     hop = (position[1:] - position[:-1]).norm(dim=-1)
     distances = torch.cdist(position, position) + torch.cdist(around.forward, around.forward) * position.std()
@@ -271,7 +270,7 @@ def key_order(around: Surroundings, count: int) -> Int[Tensor, " key"]:
 
 
 def tour(places: list[int], distances: list[list[float]]) -> list[int]:
-    """A short way through all places: always the nearest next, then stretches reversed while that shortens it."""
+    """Short tour through all positions: nearest neighbour, then 2-opt."""
     way, left = [places[0]], set(places[1:])
     while left:
         way.append(min(left, key=lambda place: distances[way[-1]][place]))
@@ -290,7 +289,7 @@ def tour(places: list[int], distances: list[list[float]]) -> list[int]:
 
 
 def catmull_rom(knots: Float[Tensor, "key value"], at: Float[Tensor, " point"]) -> Float[Tensor, "point value"]:
-    """The curve through knots 0, 1, 2, ... with slopes taken from each knot's neighbours (Catmull & Rom 1974)."""
+    """Catmull-Rom curve through knots 0, 1, 2, ... (Catmull & Rom 1974)."""
     padded = torch.cat([2 * knots[:1] - knots[1:2], knots, 2 * knots[-1:] - knots[-2:-1]])
     i = at.long().clamp(max=len(knots) - 2)
     t = (at - i)[:, None]

@@ -1,9 +1,8 @@
-"""Camera paths that a person made: a few keyframes with their times, and a smooth flight through them.
+"""User-made camera paths: a few keyframes with times, and a smooth flight through them.
 
-Keyframes lie in the frame of the photographs' source, so that one path fits every run of the same capture. Between them
-position, log angle of view and quaternion follow one curve, Catmull-Rom with the keyframes' own times as its knots:
-it passes each keyframe exactly when it should, its velocity never jumps, and it stands still where two neighbouring
-keyframes are alike.
+Keyframes are in the frame of the photographs' source, so that one path fits every run of a capture. Between them
+position, log angle of view and quaternion follow one Catmull-Rom curve with the keyframes' times as knots: it passes
+each keyframe at its time, velocity is continuous, and it stops between two equal keyframes.
 """
 
 from __future__ import annotations
@@ -64,9 +63,9 @@ class FilmRecord:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Keyframes in the order of their times. Raises LumigraphError for what no camera can follow.
+    """Keyframes in the order of their times. Raises LumigraphError for an invalid path.
 
-    loop: whether the path goes on from the last keyframe to the first, in the mean time between two keyframes
+    loop: whether the path returns from the last keyframe to the first, in the mean time between two keyframes
     fps:  frames per second of the film
     """
 
@@ -146,7 +145,7 @@ class CameraPath:
         return torch.cat([rotation, position[:, :, None]], -1), curve[:, 3].exp()
 
     def times_at(self, seconds: Float[Tensor, " time"]) -> Float[Tensor, " time"] | None:
-        """The moments of a moving scene that are seen then, evenly from keyframe to keyframe; None without times."""
+        """Scene times at film times, interpolated between keyframes; None without times."""
         times = [key.time for key in self.keyframes if key.time is not None]
         if not times:
             return None
@@ -226,7 +225,7 @@ def through(
 
 
 def check(key: Keyframe, name: str) -> None:
-    """Raises LumigraphError unless a camera can be there."""
+    """Raise LumigraphError for an invalid keyframe."""
     pose = torch.tensor(key.pose, dtype=torch.double)
     if not (pose.isfinite().all() and all(map(math.isfinite, (key.fov, key.seconds, key.time or 0.0)))):
         raise LumigraphError(f"{name} holds a number that is not finite; put the camera somewhere else")

@@ -1,4 +1,4 @@
-"""Opening: the camera that pages and the viewer begin with, and limits of its movement; the subject of a capture."""
+"""Opening: initial camera of pages and the viewer, and limits of its movement; the subject of a capture."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ class Backdrop:
 class Opening:
     """Camera, limits and colours of a page or the viewer: lengths in scene units, angles in degrees.
 
-    background: colour behind everything, sRGB in [0, 1]
-    position, target: of the camera, and the point that it looks at and turns about
+    background: background colour, sRGB in [0, 1]
+    position, target: of the camera, and its centre of rotation, at which it looks
     angle:      of view, across the window's smaller side
-    near, far:  distances along the optical axis between which the scene is drawn
-    nearest, farthest: distances from the target that zooming keeps to
+    near, far:  near and far plane
+    nearest, farthest: limits of the distance from the target in zooming
     lowest:     largest angle between up and the direction from the target to the camera
-    inward:     whether the camera goes around the target; otherwise it turns on the spot
-    within:     two corners of the box that the target stays in, where it is moved sideways
-    floor:      height that the camera stays above; None for any
+    inward:     whether the camera orbits the target; otherwise it turns on the spot
+    within:     two corners of the box that limits the target in panning
+    floor:      least height of the camera; None for any
     sky:        colours overhead and underfoot, with the background at the horizon; None for the background everywhere
     """
 

@@ -96,12 +96,12 @@ def assemble(
     # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
     away = poses[:, :, 3].mean(0)
     centred = similarity(np.eye(3), away, 1.0)
-    cameras = make_cameras(shots, moved(poses, centred), lenses, images.sizes)
+    cameras = make_cameras(shots, transform_poses(poses, centred), lenses, images.sizes)
     upright = None if before is None else before.upright
     with counting("Looking for what the cameras look at"):
         place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
     matrix = place.scene_from_source @ centred
-    cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
+    cameras = make_cameras(shots, transform_poses(poses, matrix), lenses, images.sizes)
     frame = replace(
         place.frame,
         has_alpha=images.has_alpha,
@@ -149,9 +149,7 @@ def in_order(shots: list[Shot], before: Before | None) -> list[Shot]:
 
 
 def split(source: str, shots: list[Shot], whole: bool = True) -> dict[str, Int[Tensor, " image"]]:
-    """Image numbers by purpose: as published, else every 8th held out. whole: False for a part, which needs no
-    held-out views
-    """
+    """Image numbers by purpose: as published, else every 8th held out. whole: False for a part, without held-out"""
     if any(shot.split for shot in shots):
         names = [shot.split for shot in shots]
     else:
@@ -203,7 +201,9 @@ def span(times: Float[Tensor, " camera"] | None) -> tuple[float, float] | None:
     return None if found is None or found[0] == found[1] else found
 
 
-def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "camera 3 4"]:
+def transform_poses(
+    poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "camera 3 4"]:
     """Poses transformed by a similarity: positions scale, rotations stay rotations."""
     rotation = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ poses[:, :, :3]
     position = poses[:, :, 3] @ matrix[:3, :3].T + matrix[:3, 3]

@@ -19,15 +19,13 @@ BONES_FILE = "bones.json"
 
 
 def with_bones(capture: Capture, folder: Path) -> Capture:
-    """The capture with the skeleton of its folder's bones.json, instead of the reader's. Raises LumigraphError for an
-    invalid file."""
+    """The capture with the skeleton of its folder's bones.json. Raises LumigraphError for an invalid file."""
     path = folder / BONES_FILE
     return replace(capture, skeleton=read_bones(path)) if path.is_file() else capture
 
 
 def scene_skeleton(capture: Capture, to_scene: Similarity, cameras: Camera) -> Skeleton | None:
-    """The skeleton in the scene's frame; None without one. Raises LumigraphError for poses at several times with
-    photographs without times."""
+    """The skeleton in the scene's frame, or None. Raises LumigraphError for several poses without times of views."""
     skeleton = capture.skeleton
     if skeleton is None:
         return None

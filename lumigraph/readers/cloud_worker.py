@@ -52,8 +52,7 @@ def read_las(path: Path, memory: int) -> np.ndarray:
 
 
 def check_records(path: Path) -> None:
-    """Raise ValueError for more records of variable length than the file has room for: the library would loop over all
-    of them."""
+    """Raise ValueError for more records of variable length than fit into the file: the library would loop."""
     with open(path, "rb") as file:
         head = file.read(LAS_HEADER_BYTES).ljust(LAS_HEADER_BYTES, b"\0")
         size = file.seek(0, 2)

@@ -66,9 +66,7 @@ def border(picture: Tensor) -> Tensor:
 
 
 def filled(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Mask filled between inside pixels of a row or a column, since parts of the object may look like the
-    background.
-    """
+    """Mask filled between inside pixels of a row or a column, where an object may look like the background."""
 
     def between(x: Tensor, axis: int) -> Tensor:
         before, after = x.cummax(axis).values, x.flip(axis).cummax(axis).values.flip(axis)

@@ -72,8 +72,7 @@ def lens_of(width: float, height: float, focal: float, bend: tuple[float, float]
 
 
 def bend_of(path: Path) -> tuple[float, float] | None:
-    """Focal length, in widths of the picture, and radial distortion of the one camera in a COLMAP file; None for any
-    other file."""
+    """Focal length, in widths, and radial distortion of the one camera in a COLMAP file; None for others."""
     data = path.read_bytes() if path.is_file() else b""
     if len(data) != CAMERA_RECORD.size:
         return None

@@ -245,8 +245,7 @@ def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | N
 
 
 def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, "camera 2"] | None:
-    """Near (2nd percentile) and median distance of the points inside each picture. NaN for a picture without points,
-    None if all are."""
+    """Near (2nd percentile) and median distance of the points in each picture. NaN without points, None if all are."""
     chosen = evenly(range(len(cloud.points)), SAMPLED_POINTS)
     points, weights = cloud.points[chosen], cloud.weights[chosen]
     sampled = torch.from_numpy(points).float()

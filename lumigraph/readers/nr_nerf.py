@@ -36,9 +36,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder. Raises LumigraphError for malformed JSON, and for different numbers of poses and
-    images.
-    """
+    """The capture in a folder. Raises LumigraphError for malformed JSON, and unequal numbers of poses and images."""
     path = folder / "precomputed.json"
     found = read_json(path, Precomputed)
     names = list_images(folder / "images")

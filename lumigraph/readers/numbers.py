@@ -75,8 +75,7 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
 
 
 def load_array(path: Path) -> Any:
-    """Load a file by np.load without pickles, limited by the file's bytes and free memory. Raises ValueError, and the
-    errors of np.load."""
+    """Load a file by np.load without pickles, within the file's bytes and free memory. Raises ValueError and others."""
     if not zipfile.is_zipfile(path):
         return np.load(path, mmap_mode="r", allow_pickle=False)
     with zipfile.ZipFile(path) as packed:

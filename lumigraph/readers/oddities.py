@@ -53,9 +53,7 @@ def about_double(shots: list[Shot]) -> str | None:
 
 
 def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
-    """Warning of cameras in one place, and of implausible units. LumigraphError for positions too small to compute
-    with.
-    """
+    """Warning of cameras in one place, and of implausible units. LumigraphError for vanishing distances."""
     place = poses[:, :, 3]
     spread = float(np.linalg.norm(place - place.mean(0), axis=-1).max())
     if spread <= MIN_RELATIVE_SPREAD * float(np.abs(place).max()):

@@ -83,8 +83,7 @@ class Places:
 
 
 def places_of(capture: Capture) -> Places:
-    """Camera positions of a capture by name, 2 before 10. Raises LumigraphError for a capture without photographs, and
-    for invalid poses."""
+    """Camera positions by name, 2 before 10. Raises LumigraphError without photographs, and for invalid poses."""
     shots = with_splits(in_order(capture.shots, None))
     if not shots:
         raise LumigraphError(f"{capture.source} has no photograph with a pose; add some")

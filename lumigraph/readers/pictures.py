@@ -224,8 +224,7 @@ def digest_of(path: Path) -> str:
 
 @cache
 def reads_heic() -> bool:
-    """Register HEIC support in Pillow, with orientation applied by the decoder. False if the package for it is
-    missing."""
+    """Register HEIC support in Pillow, with orientation applied by the decoder. False without the package."""
     try:
         import pi_heif
     except ImportError:

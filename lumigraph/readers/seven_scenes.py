@@ -36,8 +36,7 @@ def poses(folder: Path) -> Iterator[Path]:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder, without frames whose pose is not finite (lost tracking). Raises LumigraphError for files
-    without a matrix."""
+    """The capture in a folder, without frames of lost tracking. Raises LumigraphError for files without a matrix."""
     matrix = folder / "camera-intrinsics.txt"
     camera = read_matrix(matrix, 3) if matrix.is_file() else KINECT_INTRINSICS
     lens = Pinhole(

@@ -65,8 +65,7 @@ def write_tracks(path: Path, tracks: tuple[BoxTrack, ...]) -> None:
 
 
 def with_tracks(capture: Capture, folder: Path) -> Capture:
-    """The capture with the tracks of its folder's tracks.json, instead of the reader's. Raises LumigraphError for an
-    invalid file."""
+    """The capture with the tracks of its folder's tracks.json. Raises LumigraphError for an invalid file."""
     path = folder / TRACKS_FILE
     return replace(capture, tracks=read_tracks(path)) if path.is_file() else capture
 

@@ -369,9 +369,7 @@ def published_splits(whole: Whole) -> dict[str, str]:
 
 
 def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str]) -> SparsePoints | None:
-    """The points a file names, else those of a COLMAP model of the same photographs, transformed into this file's
-    frame.
-    """
+    """The points a file names, else those of the photographs' COLMAP model, in this file's frame."""
     if (name := whole.ply_file_path) is not None:
         if is_file(found := find_named(folder, name)):
             return read_ply(found)

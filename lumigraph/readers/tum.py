@@ -40,9 +40,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder, without photographs that have no pose at their time. Raises LumigraphError for
-    malformed lists.
-    """
+    """The capture in a folder, without photographs that have no pose. Raises LumigraphError for malformed lists."""
     poses = read_rows(folder / "groundtruth.txt", POSE_COLUMNS)
     moments = np.array([float(row[0]) for row in poses])
     pictures = read_rows(folder / "rgb.txt", 2)

@@ -22,8 +22,7 @@ def with_fewer_views(scene: Scene, views: int) -> Scene:
     """The scene with `views` photographs in its "train" split, spread evenly over the cameras; see `spread_out`.
 
     Held-out photographs, sparse points, and the frame except `train_count` stay those of all photographs, so that
-    scores can be compared.
-    Raises LumigraphError for fewer than one, and for more than there are.
+    scores can be compared. Raises LumigraphError for fewer than one, and for more than there are.
     """
     train = scene.splits["train"]
     if not 1 <= views <= len(train):

@@ -131,8 +131,7 @@ def params_file(folder: Path, frame: int) -> Path | None:
 
 
 def skeleton_of(folder: Path, frames: list[int]) -> Skeleton:
-    """The skeleton of the body in the world, at rest where it is in its first frame. Raises LumigraphError for missing
-    or damaged files."""
+    """The skeleton in the world, at rest as in its first frame. Raises LumigraphError for invalid files."""
     files = folder / "lbs" / "joints.npy", folder / "lbs" / "parents.npy"
     if not all(map(is_file, files)):
         raise LumigraphError(

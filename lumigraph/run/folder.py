@@ -34,7 +34,7 @@ from ..datasets.scene import Frame, Scene
 from ..datasets.world import BlockWorld
 from ..errors import LumigraphError
 from ..files import marks
-from ..files.locks import LOCK_FILE, check_place, held
+from ..files.locks import LOCK_FILE, check_place, lock_folder
 from ..files.marks import MARKS_FILE
 from ..files.partials import PARTIAL_NAME
 from ..files.plain import alike, understood
@@ -109,7 +109,7 @@ class Run(Trained):
         )
         with files.explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        with held(folder, "made a run"), taken_back(folder, lambda: not files.is_file(folder / "config.json")):
+        with lock_folder(folder, "made a run"), taken_back(folder, lambda: not files.is_file(folder / "config.json")):
             check_new(folder)  # again, for another process may have been quicker
             if isinstance(data, Scene):
                 files.write_json(folder / "cameras.json", cameras_json(data))
@@ -123,11 +123,11 @@ class Run(Trained):
         with taken_back(self.folder, lambda: not self.has_state):
             yield
 
-    def held(self) -> AbstractContextManager[None]:
+    def lock(self) -> AbstractContextManager[None]:
         """Block with a lock on this run against training by other processes. Raises LumigraphError, naming the process,
         if it is locked, and for symbolic links in the run, which would write elsewhere."""
         files.refuse_links(self.folder)
-        return held(self.folder, "trained")
+        return lock_folder(self.folder, "trained")
 
     def set_budget(self, **budget: Any) -> None:
         """Set another budget in config.json, as `Budget.to_json` gives it."""

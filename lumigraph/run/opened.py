@@ -106,8 +106,7 @@ class Opened(ABC):
 
     @property
     def open_scene(self) -> Callable[..., Scene] | None:
-        """Function that opens the photographs again, given their present path if they have moved; None without
-        photographs."""
+        """Function that opens the photographs again, given their present path; None without photographs."""
         return None
 
     def photographs(self, source: str | None, instead: str | None) -> Scene | None:

@@ -16,7 +16,7 @@ from .. import files, methods
 from ..budget import Budget
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, hints, numbers, shown, typed, value_of
+from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, format_value, hints, numbers, typed, value_of
 from ..files.reading import reads
 from ..method import Method
 from ..readers import CapturePart, Unposed
@@ -140,7 +140,8 @@ def of_this_version(said: dict[str, Any], kind: Any, file: Path | str) -> dict[s
         if not (values := constants(name)):
             made[name] = value
         elif value not in map(msgspec.to_builtins, values):
-            text = f"{file}: {name} was {shown(value)} in this training, and is always {shown(values[0])} now"
+            was, now = format_value(value), format_value(values[0])
+            text = f"{file}: {name} was {was} in this training, and is always {now} now"
             warnings.warn(text, LumigraphWarning, stacklevel=2)
     return made
 

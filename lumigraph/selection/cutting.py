@@ -1,4 +1,4 @@
-"""Cutting: a part of a cloud and the rest of it, apart. Surfaces that no photograph shows are grey, not invented."""
+"""Splitting of a cloud into a selected part and the rest. Unobserved surfaces are grey, not invented."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ MAX_DISCS = 20_000  # of a closing
 
 @dataclass(frozen=True)
 class Cut:
-    """A part and the rest, in the frame of the cloud; closings are among them."""
+    """Selected part and rest, in the frame of the cloud, with closing discs."""
 
     part: Gaussians
     rest: Gaussians
 
 
 def cut(gaussians: Gaussians, chosen: Bool[Tensor, " gaussian"], points: Distilled) -> Cut:
-    """Part and rest of a cloud. Gaussians that no photograph shows, and a closing where both touched, are grey."""
+    """Part and rest of a cloud. Unobserved Gaussians, and the discs that close the cut, are grey."""
     cloud = painted(gaussians.to("cpu"), ~points.is_seen, UNKNOWN_COLOUR)
     perimeter = between(chosen, points)
     pieces = []
@@ -46,7 +46,7 @@ def cut(gaussians: Gaussians, chosen: Bool[Tensor, " gaussian"], points: Distill
 
 
 def between(chosen: Bool[Tensor, " gaussian"], points: Distilled) -> Float[np.ndarray, "pair 3"]:
-    """Middles of neighbours of which one belongs to the part and the other does not."""
+    """Midpoints of neighbours on different sides of the cut."""
     neighbours, distances = points.graph
     positions = points.positions[points.is_seen].numpy()
     inside = chosen[points.is_seen].numpy()
@@ -58,9 +58,9 @@ def between(chosen: Bool[Tensor, " gaussian"], points: Distilled) -> Float[np.nd
 def closed(
     perimeter: Float[np.ndarray, "pair 3"], own: Float[np.ndarray, "point 3"], like: Gaussians
 ) -> Gaussians | None:
-    """Grey discs over the flat patch that a cut leaves open; None where its perimeter is not flat, or nothing is open.
+    """Grey discs that close a flat cut; None for a cut that is not flat, or not open.
 
-    own: centres of the Gaussians that photographs show on this side of the cut
+    own: centres of the observed Gaussians on this side of the cut
     """
     if len(perimeter) < MIN_PERIMETER or len(own) <= SPACING_NEIGHBOURS:
         return None
@@ -108,7 +108,7 @@ def tinted(gaussians: Gaussians, colour: tuple[float, float, float]) -> Gaussian
 
 
 def motion(points: Float[Tensor, "point 3"], shift: Vector, degrees: float) -> Similarity:
-    """A turn about the vertical through the middle of points, counterclockwise from above, and a shift."""
+    """Rotation about the vertical through the centre of points, counterclockwise from above, and a shift."""
     angle = torch.tensor(degrees, dtype=torch.float64).deg2rad()
     cosine, sine = float(angle.cos()), float(angle.sin())
     rotation = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

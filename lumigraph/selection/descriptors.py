@@ -1,8 +1,8 @@
-"""Descriptors: features of each pixel from colours and contrast around it at several scales. They need no training.
+"""Untrained descriptors: features of each pixel from colours and contrast around it at several scales.
 
-They separate surfaces by colour and texture, and know nothing of objects: two chairs of one fabric are alike, and a
-figure's face is unlike its coat. Strokes on each material, and growth in space, make up for it; a network's features
-(`networks.py`) need fewer strokes.
+They separate surfaces by colour and texture, not objects: two chairs of one fabric are alike, and a figure's face is
+unlike its coat. Strokes on each material, and growth in space, compensate; a network's features (`networks.py`) need
+fewer strokes.
 """
 
 from __future__ import annotations

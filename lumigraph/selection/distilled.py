@@ -1,9 +1,9 @@
-"""Distilled: features of photographs on points of a scene, the mean of all pixels by their compositing weights.
+"""Distillation: features of photographs on points of a scene, averaged over all pixels by compositing weights.
 
     f_i = sum_p w_ip F_p / sum_p w_ip        w_ip: share of Gaussian or voxel i in the colour of pixel p
 
 That mean minimises the squared error of composited features for each point alone, as training does in ISRF (Goel 2023,
-section 3.1), in one pass over the photographs. The sum of the weights says which points photographs have seen.
+section 3.1), in one pass over the photographs. The sum of weights tells which points are observed.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class SelectionGrid:
 class Distilled:
     """Points of a scene with features.
 
-    positions: of Gaussians, or the middles of voxels that photographs see
-    features:  zero of points that were not seen
+    positions: of Gaussians, or centres of observed voxels
+    features:  zero for unobserved points
     seen:      weight over all photographs, in pixels
     grid:      of a field's voxels; None for Gaussians
     voxels:    numbers of the points in the grid
@@ -97,12 +97,12 @@ class Distilled:
 
     @property
     def is_seen(self) -> Bool[Tensor, " point"]:
-        """True for points that photographs have seen; of others the colour is a guess."""
+        """Mask of observed points; the colour of others is a guess."""
         return self.seen >= MIN_WEIGHT
 
     @cached_property
     def graph(self) -> tuple[Int[np.ndarray, "point neighbour"], Float[np.ndarray, "point neighbour"]]:
-        """Nearest seen neighbours of each seen point, as indices into the seen ones, and their distances."""
+        """Nearest observed neighbours of each observed point, as indices into the observed ones, and distances."""
         positions = self.positions[self.is_seen].numpy()
         count = min(NEIGHBOURS + 1, len(positions))
         distances, neighbours = cKDTree(positions).query(positions, count, workers=-1)
@@ -110,7 +110,7 @@ class Distilled:
 
     @cached_property
     def nearest_seen(self) -> Int[np.ndarray, " point"]:
-        """Index, among the seen points, of the one nearest to each point: itself where it is seen."""
+        """Index, among the observed points, of the nearest to each point; its own if observed."""
         seen = self.is_seen
         found = np.zeros(len(self), np.int64)
         found[seen.numpy()] = np.arange(int(seen.sum()))
@@ -120,7 +120,7 @@ class Distilled:
         return found
 
     def spread(self, chosen: Bool[Tensor, " seen"]) -> Bool[Tensor, " point"]:
-        """A choice among the seen points for all: a hidden one goes with the nearest seen one."""
+        """Extend a choice among observed points to all: a hidden one follows the nearest observed one."""
         return chosen[torch.from_numpy(self.nearest_seen)]
 
 
@@ -156,8 +156,8 @@ class CloudWeigher:
         self.gaussians, self.near = gaussians, near
 
     def sums(self, camera: Camera, values: Float[Tensor, "height width channel"]) -> Float[Tensor, "gaussian channel"]:
-        """sum_p w_ip V_p: the derivative, in what each Gaussian shows, of a picture's product with the values. One pass
-        of the rasteriser forward and one back give four channels."""
+        """sum_p w_ip V_p: the derivative, by each Gaussian's value, of a picture's product with the values. One forward
+        and one backward pass of the rasteriser give four channels."""
         cloud = replace(self.gaussians, harmonics=self.gaussians.harmonics[:, :1])
         with torch.no_grad():
             seen = splat(cloud, view_of(camera, self.near).to(cloud.means.device), 1)

@@ -24,12 +24,12 @@ MIN_SPREAD = 0.3  # distance in feature space within which features are alike, h
 
 @dataclass(frozen=True)
 class GrowthNumbers:
-    """Numbers of the growth.
+    """Numbers of region growing.
 
     tolerance: of a match without negative strokes, in spreads of the features under the strokes
     sharpness: of the match, as a logistic function
     feature_deviation, space_deviation: of the bilateral weights, in spreads and in local spacings of points
-    match_weight: of a point's own match, in terms of its neighbours' weights
+    match_weight: of a point's own match, relative to its neighbours' weights
     reach:     distance from the wanted strokes beyond which nothing matches, in extents of these strokes
     max_gap:   largest distance of neighbours over which the part grows, in local spacings
     """
@@ -67,9 +67,9 @@ def nearest(features: Features, centres: Float[np.ndarray, "cluster feature"]) -
 def matched(
     positions: Float[np.ndarray, "point 3"], features: Features, wanted: Seeds, unwanted: Seeds, numbers: GrowthNumbers
 ) -> tuple[Float[np.ndarray, " point"], float]:
-    """Match of each point in [-1, 1], above 0 where it is nearer to wanted clusters, and the spread of the features
-    under the wanted strokes. Without unwanted strokes, a fixed distance of `tolerance` spreads stands in for theirs.
-    The match falls with the distance from the strokes, which users draw about as long as what they want."""
+    """Match of each point in [-1, 1], above 0 for points nearer to wanted clusters, and the spread of the features
+    under the wanted strokes. Without unwanted strokes, a fixed distance of `tolerance` spreads replaces theirs. The
+    match falls with the distance from the strokes, which users draw about as long as the object."""
     near = nearest(features, clusters(features, wanted))
     spread = max(float(np.quantile(near[wanted], 0.9)), MIN_SPREAD)
     limit = numbers.tolerance * spread
@@ -131,7 +131,7 @@ def grown(
     unwanted: Seeds,
     numbers: GrowthNumbers = GrowthNumbers(),
 ) -> Bool[np.ndarray, " point"]:
-    """Points of the part that strokes mark.
+    """Mask of the points of the part selected by strokes.
 
     positions, features: of each point
     neighbours, distances: the graph; see `Distilled.graph`

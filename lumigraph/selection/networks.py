@@ -42,10 +42,10 @@ Maps = Callable[[Float[Tensor, "1 3 height width"]], Float[Tensor, "1 channel h 
 
 
 def feature_network(path: Path, pictures: Sequence[Float[Tensor, "height width 3"]]) -> Any:
-    """A function from a picture to features of each pixel, by a network of a file.
+    """Function from a picture to features of each pixel, by a network in a file.
 
-    pictures: from which the principal components are found
-    Raises LumigraphError for a file that is no network, or that needs what is not installed.
+    pictures: for the principal components
+    Raises LumigraphError for an invalid file, and for missing packages.
     """
     maps = onnx_maps(path) if path.suffix.lower() == ".onnx" else convolution_maps(path)
     some = torch.cat([raw_features(maps, picture).flatten(2)[0].T for picture in pictures])
@@ -64,7 +64,7 @@ def feature_network(path: Path, pictures: Sequence[Float[Tensor, "height width 3
 
 
 def raw_features(maps: Maps, rgb: Float[Tensor, "height width 3"]) -> Float[Tensor, "1 channel h w"]:
-    """Features of a picture, each place's of length one."""
+    """Features of a picture, normalised to unit length at each pixel."""
     picture = (rgb.cpu() - torch.tensor(MEAN)) / torch.tensor(DEVIATION)
     with torch.no_grad():
         return normalize(maps(picture.movedim(-1, 0)[None]).float(), dim=1)
@@ -138,7 +138,7 @@ def onnx_maps(path: Path) -> Maps:
 
 
 def patches(tokens: int, size: Sequence[int]) -> tuple[int, int] | None:
-    """Rows and columns of square patches that a number of tokens covers a picture with, class tokens aside."""
+    """Rows and columns of square patches of a picture for a number of tokens, without class tokens."""
     for side in range(4, min(size) + 1):
         rows, columns = size[0] // side, size[1] // side
         if size[0] % side == 0 and size[1] % side == 0 and 0 <= tokens - rows * columns <= MAX_CLASS_TOKENS:

@@ -1,4 +1,4 @@
-"""Selection: the strokes of a user, and the part of the scene that they mark; one after the other, with undo."""
+"""Selection: a user's strokes, and the selected part of the scene, with undo."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Selection:
         self._seeds.append(seeds)
 
     def undo(self) -> None:
-        """Take the last strokes back; nothing where there are none."""
+        """Undo the last strokes, if any."""
         del self._seeds[-1:]
 
     def chosen(self) -> Bool[Tensor, " point"]:

@@ -30,17 +30,18 @@ class Strokes:
     unwanted: Bool[Tensor, "height width"]
 
     def over(self, segments: Int[Tensor, "height width"]) -> Strokes:
-        """The strokes over the whole segments that they cross; one that both kinds cross goes by its strokes alone."""
+        """Strokes extended to the whole segments that they cross; a segment crossed by both kinds keeps its strokes
+        alone."""
         crossed = [set(segments[x].unique().tolist()) - {UNKNOWN_INDEX} for x in (self.wanted, self.unwanted)]
         either = [torch.isin(segments, torch.tensor(sorted(a - b), dtype=segments.dtype)) for a, b in pairs(crossed)]
         return replace(self, wanted=self.wanted | either[0], unwanted=self.unwanted | either[1])
 
 
 def read_strokes(path: Path, camera: Camera, name: str) -> Strokes:
-    """Strokes of a PNG: green pixels are wanted, red ones unwanted; all others, and transparent ones, say nothing.
+    """Strokes of a PNG: green pixels are wanted, red ones unwanted; all others, and transparent ones, are ignored.
 
-    camera: of the view they were drawn on; its name is for messages
-    Raises LumigraphError for a file that is no picture, a picture of another size, and one without strokes.
+    camera: of the annotated view; its name is for messages
+    Raises LumigraphError for an invalid file, a picture of another size, and one without strokes.
     """
     with reading(path, "is no picture that opens", "give a PNG with green and red strokes"), Image.open(path) as image:
         rgba = np.asarray(image.convert("RGBA"))

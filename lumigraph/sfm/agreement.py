@@ -36,9 +36,7 @@ class Agreement:
 
 
 def agreement(model: pycolmap.Reconstruction, database: Path, matched: Matches) -> Agreement:
-    """Agreement of a model of perspective photographs with the matches in COLMAP's database. matched: contents of
-    the database
-    """
+    """Agreement of a model of perspective photographs with the matches in COLMAP's database, read as `matched`."""
     placed = {image.name: image for image in model.images.values() if image.has_pose}
     near = {name for group in matched.groups() if not group.isdisjoint(placed) for name in group}
     matches = confirmed = 0

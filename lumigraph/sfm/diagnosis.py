@@ -275,9 +275,7 @@ def folds(
 
 
 def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
-    """Warnings of photographs more than 1.5 stops from their neighbours, or without an order, from the median of
-    all.
-    """
+    """Warnings of photographs more than 1.5 stops from their neighbours, or without an order, from the median."""
     found = [photos[i].name for i in exposure_jumps([photo.brightness for photo in photos], in_order)]
     if not found:
         return []

@@ -369,8 +369,7 @@ def deviations(values: Array, least: float) -> Array:
 
 
 def grouped(found: Sequence[Finding]) -> dict[str, list[str]]:
-    """Lines for display, by fault; photographs with the same evidence and advice in one line. Evidence on the whole
-    capture is not repeated."""
+    """Lines for display, by fault; photographs with the same evidence and advice in one line, without repetition."""
     lines: dict[str, dict[Finding, list[str]]] = {}
     for finding in found:
         alike = lines.setdefault(finding.fault, {})

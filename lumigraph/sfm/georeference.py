@@ -1,6 +1,4 @@
-"""Georeferencing by GPS: up direction, metric scale and position on Earth; without GPS only up, from camera
-orientations.
-"""
+"""Georeferencing by GPS: up, metric scale and position on Earth; without GPS only up, from camera orientations."""
 
 from __future__ import annotations
 

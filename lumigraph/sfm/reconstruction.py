@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import LumigraphError
 from ..files import claim as claim_file
 from ..files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
-from ..files.locks import held
+from ..files.locks import lock_folder
 from ..files.names import counted, natural
 from ..files.ranges import typed
 from ..readers.colmap import poses_of
@@ -103,7 +103,7 @@ def reconstruct(
             raise LumigraphError(f"{source} does not exist; check the path")
     fresh = not folder.exists()
     work = claim(folder, sources)
-    with held(work, "worked in"):
+    with lock_folder(work, "worked in"):
         try:
             intake, photos = taken_in(sources, work, options, track)
         except LumigraphError:
@@ -575,8 +575,8 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
 
 
 def made_otherwise(first: float, mapper: str, seed: int, share: float) -> str:
-    """Sentence on a model made by other means than requested. first, share: share of the matches confirmed by the first
-    model and by this one"""
+    """Sentence on a model made otherwise than requested. first, share: confirmed matches of the first model, this
+    one"""
     why = f"the first model contradicted {1 - first:.0%} of the matches" if first else "there was no model at first"
     how = f"{WAYS[mapper]}, from another pair" if seed else WAYS[mapper]
     return f"{why}, so photographs were placed {how}; this one contradicts {1 - share:.0%}"

@@ -67,9 +67,7 @@ def evenly(names: list[str], count: int) -> list[str]:
 
 
 def add_coarse(job: dict[str, Any], names: list[str]) -> int:
-    """Add the features of the photographs that have enough without the octave of twice their size. Returns their
-    number.
-    """
+    """Add features of photographs with enough of them without the octave of twice their size; their number."""
     if not names:
         return 0
     with tempfile.TemporaryDirectory(dir=os.path.dirname(job["database"])) as place:

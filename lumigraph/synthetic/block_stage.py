@@ -71,8 +71,7 @@ def hash_of(labels: np.ndarray) -> str:
 
 
 def cuboids(labels: np.ndarray, unit: float):
-    """Cuboids of merged blocks of one label, along z, then y, then x, in the tracer's unit. Hidden blocks are left
-    out."""
+    """Cuboids of merged blocks of one label, along z, y, then x, in the tracer's unit, without hidden blocks."""
     middle = np.array(labels.shape) / 2
     for label, name in enumerate(LABELS[1:], 1):
         low, high = COLOURS[name]

@@ -24,8 +24,7 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> Float[np.ndarray, "3 4"]:
 def pinhole(
     poses: Float[np.ndarray, "camera 3 4"], size: int | tuple[int, int], field_of_view: float | np.ndarray
 ) -> Camera:
-    """Cameras with pinhole lenses. size: (width, height) in pixels, or a number for squares; field_of_view: degrees
-    across, of all or of each"""
+    """Cameras with pinhole lenses. size: (width, height) or side in pixels; field_of_view: degrees, of all or each"""
     count = len(poses)
     shape = torch.tensor([size, size] if isinstance(size, int) else size)
     angles = np.broadcast_to(np.radians(field_of_view), count)

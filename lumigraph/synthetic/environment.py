@@ -60,10 +60,8 @@ def pixel_at(table, d):
 
 
 @njit(**INNER_OPTIONS)
-def drawn(table, u, v, w):
-    """Importance-sampled direction of the map from three numbers in [0, 1): its pixel by probability, and the
-    position in it.
-    """
+def sample_direction(table, u, v, w):
+    """Importance-sampled direction of the map from three numbers in [0, 1): pixel and position within it."""
     rows, columns = table.density.shape
     pixel, last = 0, rows * columns - 1
     while pixel < last:
@@ -126,7 +124,11 @@ def direct(objects, nodes, table, found, p, n, v, base, mirror, alpha, samples, 
     for k in range(samples * (2 if glossy else 1)):
         s = k % samples
         a, b = (v0 + s * GOLDEN[0]) % 1.0, (w0 + s * GOLDEN[1]) % 1.0
-        way = drawn(table, (s + u0) / samples, a, b) if k < samples else highlight(n, v, alpha, (s + u0) / samples, b)
+        way = (
+            sample_direction(table, (s + u0) / samples, a, b)
+            if k < samples
+            else highlight(n, v, alpha, (s + u0) / samples, b)
+        )
         if dot(n, way) <= 1e-6:
             continue
         f, by_highlight = reflected(base, mirror, alpha, n, v, way)

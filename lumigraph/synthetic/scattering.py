@@ -37,8 +37,7 @@ def _build(sources: int):
 
     @njit(cache=True, **COMPILE_OPTIONS)
     def light(arrays, fog, origins, directions, radius, first, samples, out):
-        """Radiance of each ray. fog: sigma_s, sigma_t, g, and radius of its ball around the origin; samples: along the
-        ray for each lamp"""
+        """Radiance of each ray. fog: sigma_s, sigma_t, g, radius of its ball; samples: along the ray for each lamp"""
         objects, materials, lights, _, nodes = arrays
         scattering, extinction, g, reach = fog[0], fog[1], fog[2], fog[3]
         for i in range(len(origins)):

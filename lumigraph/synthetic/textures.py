@@ -159,9 +159,7 @@ def noise(x, y, z):
 
 @njit(**INNER_OPTIONS)
 def clouds(p, size, finest, footprint):
-    """Fractal noise over octaves from `size` down to `finest`, each half as strong; octaves below the footprint
-    fade.
-    """
+    """Fractal noise over octaves from `size` to `finest`, each half as strong; those below the footprint fade."""
     total, strength, shift = 0.0, 0.5, 0.0
     while size > 0.99 * finest:
         keep = 1.0 - smooth(footprint / size, 0.25, 0.6)
@@ -174,9 +172,7 @@ def clouds(p, size, finest, footprint):
 
 @njit(**INNER_OPTIONS)
 def band(x, period, share, footprint):
-    """Square wave: 1 on `share` of each period, 0 elsewhere, edges as wide as the footprint; x = 0 is the middle of
-    a band.
-    """
+    """Square wave: 1 on `share` of each period, else 0, edges as wide as the footprint; x = 0 is a band's middle."""
     from_edge = 0.5 * share * period - abs(x - period * math.floor(x / period + 0.5))
     sharp = clamp(0.5 + from_edge / max(footprint, 1e-6), 0.0, 1.0)
     blur = smooth(footprint / period, 0.3, 1.0)

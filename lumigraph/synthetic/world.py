@@ -143,7 +143,7 @@ class Lamp:
     def describe(self):
         return 0, self.position, self.radius, linear_from_srgb(self.colour) * self.power
 
-    def moved(self, pose: Pose) -> Lamp:
+    def transformed(self, pose: Pose) -> Lamp:
         return replace(self, position=(pose @ Pose(self.position)).position)
 
 
@@ -165,7 +165,7 @@ class Sun:
         toward = np.array(self.direction) / np.linalg.norm(self.direction)
         return 1, toward, self.radius, linear_from_srgb(self.colour) * self.power
 
-    def moved(self, pose: Pose) -> Sun:
+    def transformed(self, pose: Pose) -> Sun:
         return replace(self, direction=(Pose(rotation=pose.rotation) @ Pose(self.direction)).position)
 
 
@@ -235,7 +235,7 @@ class World:
         """Names of the numbers in a mask."""
         return tuple(dict.fromkeys(o.name for o in self.objects))
 
-    def moved(self, name: str, motion: Pose) -> World:
+    def move_object(self, name: str, motion: Pose) -> World:
         """The world with the object of this name transformed."""
         if name not in self.names:
             raise KeyError(f"nothing here is called {name!r}; there are {', '.join(self.names)}")
@@ -259,7 +259,7 @@ class World:
     def transformed(self, motion: Pose) -> World:
         """The world with everything in it, lights included, transformed; the sky stays."""
         objects = (replace(o, pose=motion @ o.pose) for o in self.objects)
-        return replace(self, objects=tuple(objects), lights=tuple(x.moved(motion) for x in self.lights))
+        return replace(self, objects=tuple(objects), lights=tuple(x.transformed(motion) for x in self.lights))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of the box around all objects; infinite where a plane is."""

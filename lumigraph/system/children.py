@@ -32,9 +32,7 @@ class Request:
     options: dict[str, Any] = field(default_factory=dict)
 
     def start(self, program: Sequence[str] = REQUESTED, **pipes: Any) -> subprocess.Popen[Any]:
-        """Start a child process that runs the request. program: words of Python before it; pipes: of
-        subprocess.Popen
-        """
+        """Start a child process that runs the request. program: words of Python before it; pipes: of Popen"""
         child = start_python(program, stdin=subprocess.PIPE, **pipes)
         assert child.stdin is not None
         with contextlib.suppress(BrokenPipeError), child.stdin:  # a child that has ended already

@@ -71,8 +71,7 @@ def considerate() -> Iterator[None]:
 
 
 class ContentionWatch:
-    """Thread that reduces spinning under contention during work, and a little longer, since work comes in short pieces
-    such as pictures."""
+    """Thread that reduces spinning under contention during work, and a little longer, for work in short pieces."""
 
     def __init__(self) -> None:
         self._lock, self._over = threading.Lock(), threading.Event()
@@ -93,7 +92,7 @@ class ContentionWatch:
             self._workers += 1
             if not self.running or self._over.is_set():
                 self._over = threading.Event()
-                look = partial(self._held, self._over, Contention())
+                look = partial(self._measure_contention, self._over, Contention())
                 self._thread = threading.Thread(
                     target=make_way, args=(self._over, look), name="considerate", daemon=True
                 )
@@ -109,10 +108,8 @@ class ContentionWatch:
         if self.running and self._thread is not None:
             self._thread.join()
 
-    def _held(self, over: threading.Event, contention: Callable[[], float]) -> float:
-        """Share of the time that our threads waited for a processor; after a while without work 0, and `over` is
-        set.
-        """
+    def _measure_contention(self, over: threading.Event, contention: Callable[[], float]) -> float:
+        """Share of the time that our threads waited for a processor; after a while without work 0, with `over` set."""
         with self._lock:
             if self._workers == 0 and time.monotonic() > self._left + LINGER_SECONDS:
                 over.set()
@@ -124,8 +121,7 @@ WATCH = ContentionWatch()
 
 
 class Contention:
-    """Contention meter: each call returns the share of runnable time, since the last call, in which other programs had
-    the processor."""
+    """Contention meter: each call returns the share of runnable time since the last one lost to other programs."""
 
     def __init__(self) -> None:
         self._before = self._now()

@@ -52,9 +52,7 @@ class CaptionNumbers:
 
 @dataclass(frozen=True)
 class Learned:
-    """Trained model, and its accuracy: share of held-out pictures whose own caption scores best among those of all
-    pairs.
-    """
+    """Trained model, and its accuracy: share of held-out pictures whose own caption scores best of all pairs."""
 
     network: Clip
     tokenizer: Tokenizer

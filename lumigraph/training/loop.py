@@ -64,8 +64,7 @@ class Watch(Protocol):
         """Render, in eval mode; return at once where stopping() is true."""
 
     def note(self, step: int, progress: float, row: dict[str, Any]) -> bool | None:
-        """Report a completed step. row: the line of metrics.jsonl, empty for most steps. Returns true to end training
-        as a first Ctrl-C does."""
+        """Report a completed step. row: line of metrics.jsonl, mostly empty. Returns true to stop, as by Ctrl-C."""
 
 
 @at_work()
@@ -96,15 +95,14 @@ def fit(
     watch:      observer, such as the viewer
     rehearsal:  compile all kernels by a step on a copy before the clock starts; tests without timing skip it
     Seconds are those of training alone; compiling kernels before it, saving, and pauses for the observer are counted
-    apart.
-    Ctrl-C and SIGTERM finish the current step, save and return; a second one aborts.
-    Raises LumigraphError for a dataset of another kind than the method learns from, for a run that another process
-    trains, and for a loss or gradient that is not finite, after saving the last good state.
+    apart. Ctrl-C and SIGTERM finish the current step, save and return; a second one aborts. Raises LumigraphError for a
+    dataset of another kind than the method learns from, for a run that another process trains, and for a loss or
+    gradient that is not finite, after saving the last good state.
     """
     budget = budget or Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
     check_memory(type(method), method.frame, method.config, method.device, learning=True)
-    with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
+    with run.lock() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
         fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
         display.begin(data, about_memory(method, data))
         compile_seconds = state.compile_seconds

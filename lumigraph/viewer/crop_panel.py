@@ -121,7 +121,7 @@ class CropPanel:
         return vector(sphere.middle), round(sphere.radius, DIGITS), vector(lower), vector(upper)
 
     @property
-    def drawn(self) -> bool:
+    def is_drawn(self) -> bool:
         """True if the handles or the outline of the crop are drawn."""
         return bool(self._nodes)
 
@@ -143,9 +143,7 @@ class CropPanel:
         self._changed()
 
     def _listen(self, wanted: bool) -> None:
-        """Handle clicks in the scene while a crop is shown. viser reports single clicks, and shows a hand cursor
-        meanwhile.
-        """
+        """Handle clicks in the scene while a crop is shown. viser reports single clicks, with a hand cursor."""
         if wanted and not self._listening:
             self._client.scene.on_click()(self._clicked)
         elif self._listening and not wanted:

@@ -72,7 +72,7 @@ class PathPanel:
         self._loop.on_update(lambda _: self._choose())
 
     @property
-    def drawn(self) -> bool:
+    def is_drawn(self) -> bool:
         """True if keyframes are drawn in the scene."""
         return bool(self._nodes)
 
@@ -97,7 +97,7 @@ class PathPanel:
         if camera.aspect < 1:  # from the angle down a tall window to that across it
             angle = 2 * math.atan(math.tan(angle / 2) * camera.aspect)
         pose = torch.tensor([pose_of(camera.wxyz, camera.position)], dtype=torch.double)
-        (rows,) = moved(pose, source_from_scene(self._subject.frame)).tolist()
+        (rows,) = transform_poses(pose, source_from_scene(self._subject.frame)).tolist()
         a, b, c = (tuple(row) for row in rows)
         return Keyframe((a, b, c), math.degrees(angle), 0.0, self._controls.time)
 
@@ -149,11 +149,11 @@ class PathPanel:
         seconds = max(path.duration, 0.1)
         poses, angles, moments = self._views(path, max(2, round(30 * seconds)))
 
-        def shown(frame: int) -> None:
+        def show_moment(frame: int) -> None:
             if moments is not None:
                 self._controls.show_time(moments[frame])
 
-        self._flight.play(poses, self._distance, angles, seconds, shown)
+        self._flight.play(poses, self._distance, angles, seconds, show_moment)
 
     @property
     def _distance(self) -> float:
@@ -198,7 +198,7 @@ class PathPanel:
         path = self.path()
         scene = self._client.scene
         keys = torch.tensor([stop.key.pose for stop in self._stops], dtype=torch.double)
-        poses = moved(keys, torch.linalg.inv(source_from_scene(self._subject.frame)))
+        poses = transform_poses(keys, torch.linalg.inv(source_from_scene(self._subject.frame)))
         for i, pose in enumerate(poses):
             frustum = scene.add_camera_frustum(
                 f"/path/{i}",
@@ -269,7 +269,7 @@ def source_from_scene(frame: Frame) -> Float[Tensor, "4 4"]:
     return torch.tensor(frame.source_from_scene, dtype=torch.double)
 
 
-def moved(poses: Float[Tensor, "pose 3 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "pose 3 4"]:
+def transform_poses(poses: Float[Tensor, "pose 3 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "pose 3 4"]:
     """Camera-to-world poses in another frame, as in `Camera.transformed`."""
     count = len(poses)
     lens, size = Pinhole(torch.ones(count, 2), torch.ones(count, 2)), torch.ones(count, 2, dtype=torch.long)

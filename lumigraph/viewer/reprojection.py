@@ -94,9 +94,7 @@ def _blend(picture, x, y, out):
 
 @njit(inline="always")
 def _found(x, y, distance, depth, sharp_pose, sharp_lens, pose, lens):
-    """Pixel coordinates in the sharp picture of the surface at a distance along the ray of (x, y), and True if it is
-    visible there.
-    """
+    """Pixel in the sharp picture of the surface at a distance along the ray of (x, y), and True if visible there."""
     far = not distance < FAR
     point = _point(x, y, min(distance, FAR), pose, lens)
     u, v, z, expected = _seen_at(point, sharp_pose, sharp_lens)

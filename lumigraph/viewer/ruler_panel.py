@@ -51,7 +51,7 @@ class RulerPanel:
         self._set.on_click(lambda _: self._keep())
 
     @property
-    def drawn(self) -> bool:
+    def is_drawn(self) -> bool:
         """True if points are drawn in the scene."""
         return bool(self._nodes)
 

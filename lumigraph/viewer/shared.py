@@ -151,7 +151,7 @@ class Shared:
     def cloud(self, request: ViewRequest) -> Gaussians:
         """Gaussians of the method with the controls, crop and cleaning of a client; visible floaters are coloured.
         Raises LumigraphError without Gaussians. Call it inside `turns.turn`."""
-        cloud = needs(self._given(request), HasGaussians).gaussians()
+        cloud = needs(self._with_settings(request), HasGaussians).gaussians()
         if not request.part:
             return cloud
         wanted = self.step, request.settings, request.crop, request.strength, request.cleaned
@@ -169,27 +169,25 @@ class Shared:
 
     def unwanted(self, request: ViewRequest) -> Masks:
         """Masks of the Gaussians that a client has cropped or removed, by reason. Call it inside `turns.turn`."""
-        cloud = needs(self._given(request), HasGaussians).gaussians()
+        cloud = needs(self._with_settings(request), HasGaussians).gaussians()
         max_scale = None if request.crop is None else CROPPED_MAX_SCALE
         return unwanted(cloud, request.crop, max_scale, self.floaters(request) if request.cleaned else None)
 
     def floaters(self, request: ViewRequest) -> Bool[Tensor, " gaussian"] | None:
-        """Mask of floaters at a client's strength; None at 0. Evidence takes seconds, and is computed once for each
-        cloud.
-        """
+        """Mask of floaters at a client's strength; None at 0. Evidence takes seconds, once for each cloud."""
         if not request.strength:
             return None
         wanted = self.step, request.settings
         if self._evidence is None or self._evidence[0] != wanted:
             photographed = self.subject.open_scene is not None
             cameras = self.subject.cameras["train"] if photographed else None
-            cloud = needs(self._given(request), HasGaussians).gaussians()
+            cloud = needs(self._with_settings(request), HasGaussians).gaussians()
             self._evidence = wanted, evidence(cloud, cameras, self.subject.frame)
         return self._evidence[1].floaters(request.strength)
 
     def render(self, camera: Camera, request: ViewRequest) -> Rendering:
         """Rendering of the method with a client's controls and crop, on the CPU. Call it inside `turns.turn`."""
-        method = self._given(request)
+        method = self._with_settings(request)
         if not request.part:
             return method.render(camera).cpu()
         if request.crop is not None and not self.is_cloud:
@@ -197,7 +195,7 @@ class Shared:
         cloud, frame = self.cloud(request), method.frame
         return splatting.render(cloud, camera.to(method.device), frame.background, frame.near).cpu()
 
-    def _given(self, request: ViewRequest) -> Method:
+    def _with_settings(self, request: ViewRequest) -> Method:
         return self.method.given(**dict(request.settings)) if request.settings else self.method
 
     def subject_crops(self) -> tuple[Sphere, tuple[Vector, Vector]]:

@@ -71,7 +71,7 @@ class StrokesPanel:
         self._undo.on_click(lambda _: self.undo())
 
     @property
-    def drawn(self) -> bool:
+    def is_drawn(self) -> bool:
         """True if a part is shown."""
         return self._node is not None
 

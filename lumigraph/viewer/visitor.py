@@ -179,7 +179,7 @@ class Visitor:
             controls.background,
             controls.exact,
             self.crop.crop,
-            controls.surrounded or self.path.drawn or self.crop.drawn or self.ruler.drawn or self.selected,
+            controls.surrounded or self.path.is_drawn or self.crop.is_drawn or self.ruler.is_drawn or self.selected,
             self.method_controls.values,
             self.crop.strength,
             self.crop.cleaned,
@@ -188,7 +188,7 @@ class Visitor:
     @property
     def selected(self) -> bool:
         """True if a part selected by strokes is shown."""
-        return self.strokes is not None and self.strokes.drawn
+        return self.strokes is not None and self.strokes.is_drawn
 
     def locate(self, origin: Vector, direction: Vector) -> Vector | None:
         """First visible surface point along a ray: the median depth of a few pixels around it."""
@@ -289,8 +289,7 @@ class Visitor:
         request: ViewRequest,
         moving: bool,
     ) -> Float[Tensor, "rows columns 3"]:
-        """A moving picture with reprojected detail of the last one at rest, if that is much larger. One at rest is
-        stored for that."""
+        """A moving picture with reprojected detail of the last one at rest, if much larger. One at rest is stored."""
         settings = self._shared.step, replace(request, pose=(), angle=0.0, depth=False)
         if not moving:
             self._sharp = SharpPicture(shown, depth, camera, settings)

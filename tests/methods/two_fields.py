@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 from lumigraph.components.fields.hash_field import HashField, HashNumbers
+from lumigraph.components.fields.spaces import space_of
 from lumigraph.components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from lumigraph.components.sampling.samplers import TINY_HASH, ProposalNumbers, sampler_for
-from lumigraph.components.sampling.spaces import space_of
 from lumigraph.files.ranges import LearningRate, Seed
 from lumigraph.method import Field, FieldMethod
 

@@ -6,8 +6,8 @@ import torch
 
 from lumigraph.components.fields.hash_field import TINY_TABLE, HashField, HashNumbers
 from lumigraph.components.fields.layers import MLP
+from lumigraph.components.fields.spaces import contraction_of
 from lumigraph.components.sampling.samplers import ProposalNumbers, ProposalSampler
-from lumigraph.components.sampling.spaces import contraction_of
 from lumigraph.files.ranges import LearningRate, Seed
 from lumigraph.method import Field, FieldMethod
 

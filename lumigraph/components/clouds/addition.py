@@ -16,8 +16,8 @@ from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted
 from ...method import Part
 from ...method.controls import Configured
+from ..training.dense_points import Points
 from .cloud import Cloud
-from .dense_points import Points
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Addition(Part):
 
     # Rendering
 
-    def shown(
+    def apply_appearance(
         self, method: Configured, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
     ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "... 3"]]:
         """Colours over black and the background, under the method's settings."""

@@ -102,7 +102,7 @@ class SplatAppearance(Addition):
 
     # Rendering
 
-    def shown(
+    def apply_appearance(
         self, method: Configured, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
     ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "... 3"]]:
         code = self.code(method)

@@ -25,12 +25,12 @@ from ...method import Method
 from ...method.capabilities import ColourPairs
 from ...method.depth import depth_layers, depth_terms
 from ..fields.teacher import teacher_of
+from ..training.dense_points import Points, compile_sweep, seen_points
 from ..training.pose_refinement import PoseRefinement
 from .adaptive import AdaptiveNumbers
 from .addition import Addition, Step, TrainingViews
 from .appearance import AppearanceNumbers, SplatAppearance
 from .cloud import Cloud, HasteNumbers, picture_share, thinned
-from .dense_points import Points, compile_sweep, seen_points
 from .density_control import BYTES_PER_GAUSSIAN, DensityControl, RefineNumbers
 from .initialization import cloud_of, initial_cloud, may_sweep, random_cloud, surface_cloud
 from .interval_schedule import intervals
@@ -272,13 +272,13 @@ class CloudMethod(Method, ABC):
 
     def render(self, camera: Camera) -> Rendering:
         camera = camera.to(self.device)
-        return self.shown(self.rasterized(camera), camera)
+        return self.apply_settings(self.rasterized(camera), camera)
 
-    def shown(self, seen: Rendering, camera: Camera) -> Rendering:
+    def apply_settings(self, seen: Rendering, camera: Camera) -> Rendering:
         """A rendering over black in the appearance of the settings, and the background."""
         background = self.background[0]
         for part in self.additions:
-            rgb, background = part.shown(self, seen, camera, background)
+            rgb, background = part.apply_appearance(self, seen, camera, background)
             seen = replace(seen, rgb=rgb)
         return replace(seen, rgb=over(seen.rgb, seen.opacity, background)) if background.any() else seen
 
@@ -290,7 +290,7 @@ class CloudMethod(Method, ABC):
         def pairs(poses: Any, generator: torch.Generator) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
             moved, camera = seen_from(poses, cloud, photograph.camera)
             picture = splat(moved, view_of(camera, self.near_plane))
-            seen = self.shown(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
+            seen = self.apply_settings(Rendering(picture.rgb, picture.depth, picture.opacity), camera)
             return photograph.trusted(seen.rgb), target
 
         return pairs

@@ -18,7 +18,7 @@ from ...kernels.spherical_harmonics import K00
 from ...method.capabilities import HasGaussians, can
 from ..fields.teacher import Teacher
 from ..sampling.occupancy import visual_hull
-from .dense_points import Points, seen_points, thinned
+from ..training.dense_points import Points, seen_points, thinned
 
 Initialization = Literal["dense", "sparse", "random"]
 
@@ -158,8 +158,7 @@ DISC_THICKNESS = 0.2  # of the width
 
 
 def surface_cloud(teacher: Teacher, max_count: int, degree: int, generator: torch.Generator) -> Gaussians:
-    """Overlapping discs on the surfaces seen by cameras, with their normals and colours. Raises LumigraphError without
-    a surface."""
+    """Overlapping discs on surfaces seen by cameras, with normals and colours. Raises LumigraphError without any."""
     seen = teacher.surface
     seen = seen[torch.randperm(len(seen), generator=generator)[:max_count]]
     if len(seen) < 2:
@@ -176,9 +175,7 @@ def surface_cloud(teacher: Teacher, max_count: int, degree: int, generator: torc
 
 
 def cloud_of(teacher: object, max_count: int, degree: int) -> Gaussians | None:
-    """The teacher's largest, most opaque Gaussians, with harmonics of another degree; None for a teacher without
-    Gaussians.
-    """
+    """The teacher's largest, most opaque Gaussians, with harmonics of another degree; None without Gaussians."""
     if not can(teacher, HasGaussians):
         return None
     cloud: Gaussians = teacher.gaussians()  # type: ignore[attr-defined]

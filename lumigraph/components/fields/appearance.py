@@ -20,7 +20,7 @@ from ...datasets.scene import Batch, Frame, Photograph
 from ...errors import LumigraphError
 from ...files.ranges import between
 from ...method import Part
-from ...method.controls import Control, blend
+from ...method.controls import AVERAGE, Control, blend
 from ...volume import composite, weights_of
 from .hash_field import side_by_side
 from .layers import MLP
@@ -59,7 +59,7 @@ def fitted(
 
 CodeWidth = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
 APPEARANCE = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
-AVERAGE = "average"  # the choice of the mean of all learnt codes
+
 FIT_STEPS, FIT_RATE = 100, 0.1  # the rate in deviations of the learnt codes
 FIT_PRIOR = 2e-5  # of squared error, for a deviation from the average
 FIT_WEIGHT = 5e-3  # weight in its pixel above which a sample counts

@@ -14,11 +14,11 @@ from torch.nn.functional import softplus
 from ...files.ranges import Depth, Layers, Octaves
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
-from ..sampling.spaces import Space
 from .coordinate_network import CoordinateNetwork
 from .encodings import FrequencyEncoding, IntegratedEncoding
 from .hash_field import Joining
 from .layers import in_chunks
+from .spaces import Space
 
 Places = tuple[Tensor, ...]  # what is encoded: coordinates of points, or means and variances of frustums
 Activation = Callable[[Tensor], Tensor]

@@ -16,9 +16,9 @@ from ...exchange.packing import Stored
 from ...files.ranges import Layers, between
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
-from ..sampling.spaces import Space
 from ..training.row_optimizers import LazyAdam
 from .layers import MLP, truncated_exp
+from .spaces import Space
 
 OPEN_RATE = 0.5  # of the table's learning rate, for networks in the open: at 1, one seed in three never learns a hue
 CODES_RATE = 0.25  # of the learning rate, that of codes beside a hash table

@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ...errors import LumigraphError
-from ...method.controls import Control, blend
+from ...method.controls import AVERAGE, Control, blend
 from .appearance import axes_of
 
-AVERAGE, FOUND = "average", "found"  # choices beside the members: the mean of all codes, and one that evidence gave
+FOUND = "found"  # the choice that evidence gave
 
 
 class InstanceCodes(nn.Module):

@@ -23,8 +23,8 @@ from ...kernels import spherical_harmonics
 from ...method.capabilities import HasDensity, HasField, can
 from ...method.field import Colours, Densities, Directions, Points
 from ...system.progress import track
-from ..sampling.spaces import Space
-from ..training.schedules import held
+from ..training.schedules import hold_and_decay
+from .spaces import Space
 
 AT_ONCE = 1 << 17  # points
 VIEWS, SIZE = 24, 128  # depth maps of a teacher at most, and pixels of their longer side
@@ -262,7 +262,7 @@ def distil(
     with torch.enable_grad():
         for step in track(range(STEPS), "Teaching points", STEPS):
             for group, rate in rates:
-                group["lr"] = rate * held(1.0, FINAL, step, step / STEPS, START)
+                group["lr"] = rate * hold_and_decay(1.0, FINAL, step, step / STEPS, START)
             chosen = torch.randint(len(places), (points,), generator=chance).to(device)
             place, direction, colour, sees, wanted, d = (x[chosen] for x in lessons)
             density, found = field(place, direction)

@@ -146,9 +146,7 @@ def depth_grid(camera: Camera, distance: Float[Tensor, "height width"], confiden
 
 
 def continued(distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Distances of a surface extrapolated by one pixel into empty space: photographs' alpha has its edge more
-    exactly.
-    """
+    """Distances of a surface extrapolated by one pixel into empty space: alpha has its edge more exactly."""
     there = distance.isfinite()
     stacked = torch.stack([torch.where(there, distance, 0), there.float()])[None]
     total, share = avg_pool2d(stacked, 3, 1, 1)[0]

@@ -11,9 +11,9 @@ from torch.nn.functional import max_pool1d, pad
 
 from ...camera.rays import Rays, Samples
 from ..fields.coordinate_field import Places
+from ..fields.spaces import Space
 from .hierarchical_sampler import RESAMPLE_PADDING, HierarchicalSampler
 from .sampling import inverse_transform, stratified
-from .spaces import Space
 
 
 class ConeSampler(HierarchicalSampler):

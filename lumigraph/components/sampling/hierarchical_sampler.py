@@ -15,9 +15,9 @@ from ...method import Pass, Sampler
 from ...method.sampler import RayCodes, codes_at
 from ...volume import weights_of
 from ..fields.coordinate_field import Places
+from ..fields.spaces import Space
 from .occupancy import MaskNumbers, OccupancyMask
 from .sampling import inverse_transform, midpoints, stratified
-from .spaces import Space
 
 RESAMPLE_PADDING = 0.01  # alpha, least weight of a frustum of a cone (Barron 2021, eq. 17)
 RAYS_WITH_FEATURES = 1024  # rays that are rendered at once where the features of all their samples are kept

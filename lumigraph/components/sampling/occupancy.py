@@ -19,7 +19,7 @@ from ...datasets.scene import Scene
 from ...files.ranges import Cells
 from ...geometry import evenly
 from ...method import Part
-from .spaces import Space
+from ..fields.spaces import Space
 
 VIEWS = 24  # photographs asked at most: more cut little further
 

@@ -17,8 +17,8 @@ from ...files.ranges import NonNegative, Share, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import visible_weights, weights_of
+from ..fields.spaces import Space
 from .occupancy import OccupancyGrid, visual_hull
-from .spaces import Space
 
 FIRST_RAYS = 256  # rays of the first step, before the number of samples per ray is known
 MIN_RAYS = 64  # rays of a step

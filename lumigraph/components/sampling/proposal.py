@@ -12,10 +12,10 @@ from ... import kernels
 from ...camera.rays import Rays, Samples
 from ...volume import weights_of
 from ..fields.layers import LIMIT, truncated_exp
+from ..fields.spaces import NDC, Contraction, Space, fits_kernels
 from ..fields.voxels import VoxelGrid
 from .loops import sum_excess
 from .sampling import FAINT, inverse_transform, loops_fit
-from .spaces import NDC, Contraction, Space, fits_kernels
 
 FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
 LITTLE = 1e-5  # weight that counts as none in the loss

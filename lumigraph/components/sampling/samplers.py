@@ -26,8 +26,9 @@ from ...method import Field, Pass, Sampler
 from ...method.field import Points as Places
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import weights_of
-from ..clouds.dense_points import Points, compile_sweep, seen_points
 from ..fields.hash_field import CPU_TABLE, TINY_TABLE
+from ..fields.spaces import Space
+from ..training.dense_points import Points, compile_sweep, seen_points
 from ..training.regularizers import depth_loss, distortion_loss, places_between, scale_gradients
 from ..training.row_optimizers import LazyAdam
 from ..training.schedules import falling
@@ -41,7 +42,6 @@ from .occupancy_sampler import (
     rows_of,
 )
 from .proposal import Proposal, proposal_loss
-from .spaces import Space
 
 CELLS = 96  # of the proposal grid, along each axis
 PROPOSAL_SAMPLES = 64  # samples of a ray in that grid

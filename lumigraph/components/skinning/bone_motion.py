@@ -156,7 +156,7 @@ class BoneMotion(Part):
         second = torch.where((first * second).sum(-1, keepdim=True) < 0, -second, second)
         return torch.lerp(first, second, share), torch.lerp(self.positions[before], self.positions[after], share)
 
-    def shown(
+    def pose_joints(
         self, settings: Mapping[str, Value], times: Float[Tensor, " time"]
     ) -> tuple[Float[Tensor, "time bone 4"], Float[Tensor, "time bone 3"]]:
         """The same under settings: of the capture, or of a user's poses."""
@@ -183,7 +183,7 @@ class BoneMotion(Part):
 
     def at(self, settings: Mapping[str, Value], time: float) -> Float[Tensor, "bone 3 4"]:
         """Transforms of the bones at a moment under settings."""
-        return self.transforms(*self.shown(settings, torch.tensor([time], device=self.times.device)))[0]
+        return self.transforms(*self.pose_joints(settings, torch.tensor([time], device=self.times.device)))[0]
 
     # Learning
 

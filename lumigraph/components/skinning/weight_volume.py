@@ -113,9 +113,7 @@ class WeightVolume(Part):
 def segments(
     parents: tuple[int, ...], joints: Float[Tensor, "bone 3"]
 ) -> list[tuple[Float[Tensor, "segment 3"], Float[Tensor, "segment 3"]]]:
-    """Bones as segments from their joint to those of their children; a bone without children extends its parent's
-    direction.
-    """
+    """Bones as segments from their joint to their children's; a bone without any extends its parent's direction."""
     found = []
     for number, parent in enumerate(parents):
         children = [child for child, own in enumerate(parents) if own == number]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .trajectory import Pose, moved
+from .trajectory import Pose, apply_twists
 
 HUBER = 1.5  # deviations from which on a residual counts by its size, not its square
 DAMPING = 1e-4  # of the normal matrix's diagonal
@@ -80,7 +80,7 @@ def aligned(
         hessian, gradient = hessian + known.diag(), gradient + known * motion
         damped = hessian + DAMPING * hessian.diagonal().diag() + 1e-9 * torch.eye(6).to(hessian)
         step = -torch.linalg.solve(damped, gradient)
-        pose, motion = moved(pose[None], step[None].to(pose))[0], motion + step
+        pose, motion = apply_twists(pose[None], step[None].to(pose))[0], motion + step
         if step[:3].norm() < SMALL_TURN and step[3:].norm() < SMALL_SHIFT:
             break
     return Aligned(pose, share)

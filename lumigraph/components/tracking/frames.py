@@ -51,7 +51,7 @@ class DepthFrame:
     def measured(self) -> Bool[Tensor, " pixel"]:
         return self.depth.isfinite()
 
-    def drawn(self, count: int, generator: torch.Generator, measured: bool = False) -> Int[Tensor, " chosen"]:
+    def sample_pixels(self, count: int, generator: torch.Generator, measured: bool = False) -> Int[Tensor, " chosen"]:
         """Random pixels; with `measured`, among those with depth."""
         if not measured:
             return torch.randint(len(self.depth), (count,), generator=generator).to(self.depth.device)

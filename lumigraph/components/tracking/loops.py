@@ -23,7 +23,7 @@ from ...method import Part
 from ..training.bundle_adjustment import rotation_vector
 from ..training.shared_points import Seen, features, matched
 from .frames import DepthFrame
-from .trajectory import Pose, moved, relative
+from .trajectory import Pose, apply_twists, relative
 
 THUMBNAIL = 12, 16  # rows and columns of a picture by which places are compared
 MIN_LIKENESS = 0.5  # correlation of thumbnails of one place
@@ -113,9 +113,7 @@ def motion(first: Pose, second: Pose) -> Pose:
 def motion_between(
     first: KeyframePlace, second: KeyframePlace, tolerance: float, chance: torch.Generator
 ) -> Pose | None:
-    """Pose of the second place's camera in the frame of the first, by RANSAC over matched points; None for too few
-    inliers.
-    """
+    """Pose of the second camera in the frame of the first, by RANSAC over matched points; None for too few inliers."""
     pairs = matched(first.seen, second.seen)
     a, b = first.points[pairs[:, 0]], second.points[pairs[:, 1]]
     known = (a.isfinite() & b.isfinite()).all(-1)
@@ -158,7 +156,7 @@ def optimised(
 
     def at(twists: np.ndarray) -> Tensor:
         moves = torch.cat([torch.zeros(1, 6).double(), torch.from_numpy(twists).view(-1, 6)])
-        return moved(poses, torch.cat([moves[:, :3], moves[:, 3:] * unit], -1))
+        return apply_twists(poses, torch.cat([moves[:, :3], moves[:, 3:] * unit], -1))
 
     def residuals(twists: np.ndarray) -> np.ndarray:
         there = at(twists)

@@ -78,7 +78,7 @@ class Tracker(Part):
             return DepthFrame.of(data, index, self.turn.device, like, self.side)
         return self._held[index]
 
-    def held(self, data: Scene, index: int) -> DepthFrame:
+    def load_keyframe(self, data: Scene, index: int) -> DepthFrame:
         """Load a keyframe and store it."""
         if index not in self._held:
             self._held[index] = self.frame(data, index)
@@ -93,7 +93,7 @@ class Tracker(Part):
     def close_loop(self, frame: DepthFrame, data: Scene, chance: torch.Generator) -> bool:
         """Search a loop for the latest keyframe, and correct the trajectory. True if one was found."""
         keyframes = [i for i in self.sequence(data) if self.is_keyframe[i]]
-        older = [self.held(data, i) for i in keyframes if i != frame.index]
+        older = [self.load_keyframe(data, i) for i in keyframes if i != frame.index]
         if self.loops is None or not self.loops.find(frame, older, chance):
             return False
         self.trajectory.place(keyframes, self.loops.closed(keyframes, self.trajectory.poses[keyframes]))

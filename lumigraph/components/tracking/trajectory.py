@@ -61,7 +61,7 @@ class Trajectory(Part):
 
     def correct(self, keyframes: Int[Tensor, " keyframe"], twists: Twist) -> None:
         """Correct keyframes by twists, and the frames anchored to them."""
-        self.place(keyframes.tolist(), moved(self.poses[keyframes], twists))
+        self.place(keyframes.tolist(), apply_twists(self.poses[keyframes], twists))
 
     @torch.no_grad()
     def place(self, keyframes: list[int], poses: Float[Tensor, "keyframe 3 4"]) -> None:
@@ -90,7 +90,7 @@ def relative(first: Pose, second: Float[Tensor, "*frame 3 4"]) -> tuple[Tensor, 
     return back @ second[..., :3], (second[..., 3] - first[:, 3]) @ back.T
 
 
-def moved(poses: Float[Tensor, "pose 3 4"], twists: Twist) -> Float[Tensor, "pose 3 4"]:
+def apply_twists(poses: Float[Tensor, "pose 3 4"], twists: Twist) -> Float[Tensor, "pose 3 4"]:
     """Poses turned about their own positions and shifted; differentiable in the twists."""
     omega, shift = twists.split(3, -1)
     axes = [rotated(poses[:, :, i], omega) for i in range(3)]

@@ -25,9 +25,7 @@ Logits = Float[Tensor, " picture"]
 
 
 def generator_loss(fake: Float[Tensor, "*logits"]) -> Tensor:
-    """-log sigmoid(D(G(z))), the non-saturating loss (Goodfellow 2014, section 3). fake: logits of generated
-    pictures
-    """
+    """-log sigmoid(D(G(z))), the non-saturating loss (Goodfellow 2014, section 3). fake: logits of generated ones"""
     return softplus(-fake).mean()
 
 

@@ -18,9 +18,8 @@ from ...depth_maps.flat_view import FlatView, flat_view
 from ...errors import LumigraphWarning
 from ...geometry import evenly
 from ...method import Part
-from ...method.controls import Control, Value
-from ..fields.appearance import AVERAGE
-from ..fields.development import decoded, encoded
+from ...method.controls import AVERAGE, Control, Value
+from .development import decoded, encoded
 
 MAX_PHOTOGRAPHS = 32  # photographs, each beside its neighbour
 MAX_SIDE = 200  # pixels along their longer side
@@ -65,8 +64,7 @@ def spread_of_exposure(scene: Scene) -> float:
 
 
 def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
-    """Nearest neighbour of each camera: distance relative to the extent of all, plus one minus the cosine of
-    directions."""
+    """Nearest neighbour of each camera: distance over the extent of all, plus one minus the cosine of directions."""
     position, forward = cameras.position, cameras.forward
     apart = torch.cdist(position, position)
     unlike = apart / apart.amax().clamp_min(1e-9) + 1 - forward @ forward.T
@@ -147,8 +145,7 @@ class Exposure(Part):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Brightness in stops, and the reference photograph. By default stops are relative to the trained scene, whose
-        overall gain is arbitrary."""
+        """Brightness in stops, and the reference photograph, by default the trained scene, of arbitrary gain."""
         if not bool(self.differ):
             return ()
         photographs = tuple(str(i) for i in range(len(self.log_gain)))
@@ -206,8 +203,7 @@ class Exposure(Part):
 
 @torch.no_grad()
 def gain_between(rgb: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"]) -> Float[Tensor, " 3"]:
-    """Gain from colours to a photograph's: the median ratio of each channel, over pixels that are neither too dark nor
-    too bright; 1 without any."""
+    """Gain from colours to a photograph's: median ratio of each channel over well exposed pixels; 1 without any."""
     inside = ((rgb > MIN_COLOUR) & (target > MIN_COLOUR) & (target < MAX_COLOUR)).all(-1)
     return (target[inside] / rgb[inside]).median(0).values if inside.any() else torch.ones_like(target[:1].sum(0))
 

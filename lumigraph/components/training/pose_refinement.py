@@ -87,9 +87,7 @@ class PoseRefinement(Part):
 
     @torch.no_grad()
     def find(self, scene: Scene, matching: bool = True) -> None:
-        """Initialise with the given poses or, with matching and enough shared points, with adjusted ones; see
-        `adjusted`.
-        """
+        """Initialise with the given poses or, if matching gives enough shared points, with those of `adjusted`."""
         self.choose_axes(scene.cameras, scene.frame)
         if not matching:
             return

@@ -105,8 +105,7 @@ SIDEWAYS = 0.1  # deviation of a camera between two others, of their distance
 
 
 def camera_between(cameras: Camera, generator: torch.Generator) -> Camera:
-    """A camera interpolated between one of the given ones and one of its nearest neighbours, with a small offset, with
-    the lens of the first."""
+    """A camera between a given one and one of its nearest neighbours, slightly shifted, with the first's lens."""
     poses = cameras.pose.cpu()
     position = poses[:, :, 3]
     first = int(torch.randint(len(poses), (1,), generator=generator))

@@ -25,7 +25,7 @@ def falling(first: float, last: float, progress: float, warmup: float = 0.0) -> 
     return rate * (FIRST_SHARE + (1 - FIRST_SHARE) * min(1.0, progress / warmup) if warmup else 1.0)
 
 
-def held(first: float, last: float, step: int, progress: float, start: float, rise: int = RISE) -> float:
+def hold_and_decay(first: float, last: float, step: int, progress: float, start: float, rise: int = RISE) -> float:
     """Learning rate with a warm-up of some steps, constant until a share `start` of the budget is spent, then decaying
     exponentially to `last`.
 
@@ -43,9 +43,9 @@ def exponential_decay(method: Any, step: int, progress: float) -> float:
 
 
 def held_decay(method: Any, step: int, progress: float) -> float:
-    """`Method.learning_rate` that is `held`, by the numbers of the Config or of its backbone."""
+    """`Method.learning_rate` that is `hold_and_decay`, by the numbers of the Config or of its backbone."""
     c, rise = getattr(method.config, "backbone", method.config), getattr(method.config, "warmup_steps", RISE)
-    return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start, rise)
+    return hold_and_decay(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start, rise)
 
 
 INITIAL_BANDS = 1 / 4  # share of the bands that are there from the beginning

@@ -111,8 +111,7 @@ def matched(a: Seen, b: Seen) -> Int[Tensor, "match 2"]:
 
 
 def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "kept 2"]:
-    """Inlier matches of two-view geometry (RANSAC on the essential matrix, Nister 2004); none if too few to exclude
-    chance."""
+    """Inlier matches of the essential matrix (RANSAC, Nister 2004); none if too few to exclude chance."""
     ends = a.bearings[pairs[:, 0]], b.bearings[pairs[:, 1]]
     ahead = (ends[0][:, 2] > FLAT) & (ends[1][:, 2] > FLAT)
     pairs, (first, second) = pairs[ahead], [(FOCAL * end[:, :2] / end[:, 2:])[ahead].double().numpy() for end in ends]
@@ -137,8 +136,7 @@ def neighbours(cameras: Camera) -> list[tuple[int, int]]:
 
 
 def shared_points(scene: Scene) -> tuple[list[Seen], Matches]:
-    """Features of the training photographs, in the order of the split, and their matches by pairs of photographs. Poses
-    only select the pairs."""
+    """Features of the training photographs, in order of the split, and matches of pairs selected by poses."""
     learnt = scene.splits["train"].tolist()
     cameras = scene.cameras[scene.splits["train"]].to("cpu")
     seen = [

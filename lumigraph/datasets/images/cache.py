@@ -36,9 +36,7 @@ def key(parts: Iterable[str | None]) -> str:
 
 @contextmanager
 def filled(folder: Path, size: int) -> Iterator[Path]:
-    """Block that fills a cache folder with `size` bytes and MARK_FILE; it appears complete under its name or not at
-    all.
-    """
+    """Block that fills a cache folder with `size` bytes and MARK_FILE; it appears complete or not at all."""
     part = folder.with_name(f"{folder.name}.{os.getpid()}.part")
     try:
         shutil.rmtree(part, ignore_errors=True)

@@ -38,8 +38,7 @@ def resized(
 
 
 def in_phase(values: Shaped[np.ndarray, "height width"], size: Size) -> np.ndarray:
-    """A mosaic at another size: each new pixel is the mean of the pixels within it under the same filter of the 2 x 2
-    pattern; NaN for none."""
+    """A mosaic at another size: means over pixels under the same filter of the 2 x 2 pattern; NaN for none."""
     found = np.empty(size[::-1], values.dtype)
     for phase in np.ndindex(2, 2):
         own = tuple(slice(first, None, 2) for first in phase)
@@ -94,8 +93,7 @@ def picked(own: Size, size: Size, known: Bool[np.ndarray, "height width"] | None
 
 
 def middles(own: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Source pixels of each of `count` pixels along an axis of `own`: the one at its centre, and the range of those
-    inside."""
+    """Source pixels of each of `count` pixels along an axis: the one at its centre, and the range inside."""
     edges = np.arange(count + 1) * (own / count)
     first = np.ceil(edges - 0.5).astype(np.int64)
     centre = np.minimum(((edges[:-1] + edges[1:]) / 2).astype(np.int64), own - 1)

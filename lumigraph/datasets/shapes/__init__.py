@@ -94,8 +94,7 @@ class Shape:
 
     @cached_property
     def closed(self) -> bool:
-        """True for an almost everywhere integer winding number. Unlike in a watertight mesh, closed parts may
-        intersect."""
+        """True for an almost everywhere integer winding number. Unlike in a watertight mesh, parts may intersect."""
         if self.is_cloud:
             return False
         low, high = np.array(self.frame.bounds)
@@ -128,8 +127,7 @@ class Shape:
         return PointBatch(points, torch.full((len(points),), member), distance, occupancy)
 
     def surface(self, count: int, generator: torch.Generator, member: int = 0) -> PointBatch:
-        """Random points of the surface, uniformly by area, with their normals; for a cloud, random ones of its points.
-        Their distance is 0."""
+        """Random surface points, uniform by area, with normals; of a cloud random points. Their distance is 0."""
         members, zero = torch.full((count,), member), torch.zeros(count)
         if self.is_cloud:
             chosen = torch.randint(len(self.mesh.vertices), (count,), generator=generator).numpy()

@@ -47,7 +47,7 @@ MAX_ROUNDS = 12  # rounds over all instances
 
 @dataclass(frozen=True)
 class RunInstance:
-    """A run with its method and what is opaque in it, in a frame of its own that leads to the run's scene."""
+    """A run with its method and its opaque region, in a frame with a similarity to the run's scene."""
 
     run: Run
     method: Method
@@ -100,10 +100,10 @@ def canonicalise(
     found: Sequence[RunInstance], config: CanonicalConfig, output: Path, like: str | None = None
 ) -> Solution:
     """Write a file for each run, NAME.json, that opens as this run in the canonical frame, and a picture before and
-    after. The runs stay as they are.
+    after. The runs are not changed.
 
-    like: the run that stays as it stands in its scene; the first unless said
-    Raises LumigraphError where there is no such run.
+    like: the run that keeps its orientation; the first by default
+    Raises LumigraphError if there is no such run.
     """
     names = [one.name for one in found]
     if like is not None and like not in names:
@@ -130,7 +130,7 @@ def placed(instance: Instance, rotation: Float[Tensor, "3 3"]) -> Similarity:
 
 
 def before_and_after(found: Sequence[RunInstance], places: Sequence[Similarity]) -> Image.Image:
-    """Some of the runs from one side, as they stood in their scenes, and in the canonical frame."""
+    """Some of the runs from one side, in their scenes' frames and in the canonical frame."""
     cube = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     camera = ring(cube, angle=FIELD_OF_VIEW, size=PICTURE_SIDE)[-CAMERA_INDEX]
     some = evenly(list(zip(found, places, strict=True)), MAX_SHOWN)
@@ -147,10 +147,9 @@ def before_and_after(found: Sequence[RunInstance], places: Sequence[Similarity])
 @dataclass(frozen=True)
 class Solution:
     """rotations: of each instance into the canonical frame
-    predicted: what the network alone says, in a frame of its own
+    predicted: the network's prediction alone, in a frame of its own
     agreement: of each instance with the mean shape, 1 for the same
-    explained: share of all instances' squared moments that the mean shape has
-    """
+    explained: share of all instances' squared moments that the mean shape has"""
 
     rotations: Float[Tensor, "some 3 3"]
     predicted: Float[Tensor, "some 3 3"]
@@ -160,10 +159,10 @@ class Solution:
 
 
 def solve(instances: Sequence[Instance], config: CanonicalConfig) -> Solution:
-    """Learn what the instances share, and turn each onto it.
+    """Learn the common shape, and align each instance to it.
 
-    The mean shape is found from several beginnings: what the network says, and each of a few instances taken for it;
-    the one that explains most of all instances is kept.
+    The mean shape is found from several initialisations: the network's prediction, and a few instances; the one that
+    explains most of all instances is kept.
     """
     network = learn(instances, config)
     predicted = found_rotations(network, instances)
@@ -192,8 +191,8 @@ def described(instances: Sequence[Instance]) -> Float[Tensor, "some shell basis"
 
 
 def aligned(shapes: Float[Tensor, "some shell basis"], start: Float[Tensor, "some 3 3"]) -> Alignment:
-    """Instances on their mean shape, from rotations to begin with: all are turned onto the mean of what they are then,
-    by the best of all rotations, until that helps no more (congealing, Learned-Miller 2006)."""
+    """Instances aligned to their mean shape from initial rotations: each is rotated to the current mean by the best of
+    all rotations, until convergence (congealing, Learned-Miller 2006)."""
     rotations, explained = start, 0.0
     for _ in range(MAX_ROUNDS):
         mean = turn(shapes, rotations).mean(0)
@@ -215,7 +214,7 @@ def best_alignment(shapes: Float[Tensor, "some shell basis"], starts: Sequence[F
 def best_rotations(
     target: Float[Tensor, "shell basis"], shapes: Float[Tensor, "some shell basis"]
 ) -> Float[Tensor, "some 3 3"]:
-    """The rotation of each shape that brings it onto the target: of the lattice, then refined."""
+    """Rotation of each shape that best matches the target: of the lattice, then refined."""
     entries, table = correlations(target, shapes), lattice()
     which = (entries @ table.flat.T).argmax(-1)
     return refined(table.take(which), entries)
@@ -230,7 +229,7 @@ def correlations(
 
 
 def refined(found: BandRotations, entries: Float[Tensor, "some entry"]) -> Float[Tensor, "some 3 3"]:
-    """Rotations a little further on, as long as the correlation grows."""
+    """Rotations refined as long as the correlation grows."""
     for degrees in STEP_DEGREES:
         around = steps(degrees)
         for _ in range(STEP_ROUNDS):
@@ -283,6 +282,6 @@ def steps(degrees: float) -> BandRotations:
 
 
 def turn(shapes: Float[Tensor, "some shell basis"], rotations: Float[Tensor, "some 3 3"]) -> Tensor:
-    """The moments of shapes that are turned, each by its rotation."""
+    """Moments of rotated shapes."""
     matrices = turning(rotations, BANDS)
     return torch.cat([shapes[..., band(n)] @ matrices[n].mT for n in range(BANDS)], -1)

@@ -23,9 +23,9 @@ Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 class Instance:
     """Opaque cells of a grid as weighted points, normalised: weighted mean at the origin, spread one.
 
-    points:  centres of the cells that are not empty
-    weights: how much light each cell stops, 1 - exp(-density times its side); they add up to one
-    place:   the similarity from that frame back to the one that the grid was sampled in
+    points:  centres of the non-empty cells
+    weights: opacity of each cell, 1 - exp(-density times its side); they add up to one
+    place:   the similarity from that frame to the grid's
     """
 
     points: Float[Tensor, "cell 3"]
@@ -33,17 +33,17 @@ class Instance:
     place: Similarity
 
     def turned(self, rotation: Float[Tensor, "3 3"]) -> Instance:
-        """The same thing turned about its middle."""
+        """The same instance rotated about its centre."""
         back = Similarity.make(1.0, rotation.T)
         return Instance(self.points @ rotation.T.to(self.points), self.weights, self.place @ back)
 
 
 def sampled(density: Density, bounds: tuple[Vector, Vector], cells: int, name: str = "It") -> Instance:
-    """The instance that a density has within bounds.
+    """Instance of a density within bounds.
 
     density: per unit of the frame of the bounds
     cells:   of the grid along the longest side
-    Raises LumigraphError, naming it, where there is nothing.
+    Raises LumigraphError, naming it, if it is empty.
     """
     low, high = torch.tensor(bounds, dtype=torch.float64)
     side = float((high - low).max()) / cells

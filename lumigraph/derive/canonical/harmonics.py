@@ -1,5 +1,5 @@
-"""Real spherical harmonics of any band, what a rotation does to their coefficients, and moments of shapes in them:
-how much of a shape lies in each direction, at several distances from its middle. Rotations, evenly spread or random."""
+"""Real spherical harmonics of any band, their rotation, and moments of shapes in them by direction and radius.
+Rotations, evenly spread or random."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def band(degree: int) -> slice:
 
 
 def turning(rotations: Float[Tensor, "*rotation 3 3"], bands: int) -> list[Float[Tensor, "*rotation _ _"]]:
-    """Wigner's matrices D of each band: harmonics(R x) = D(R) harmonics(x), so that what has coefficients f has D f
-    once it is turned. Found from directions, of which there are more than enough to determine them."""
+    """Wigner's matrices D of each band: harmonics(R x) = D(R) harmonics(x), so that rotation maps coefficients f to D
+    f. Least squares over sufficiently many directions."""
     generator = torch.Generator().manual_seed(0)
     some = torch.randn(4 * (2 * bands - 1), 3, generator=generator, dtype=torch.float64).to(rotations)
     some = some / some.norm(dim=-1, keepdim=True)
@@ -81,7 +81,7 @@ def moments(
 
 
 def spread(count: int) -> Float[Tensor, "rotation 3 3"]:
-    """Rotations all over SO(3), about equally far from their neighbours: super-Fibonacci spirals (Alexa 2022)."""
+    """Evenly spread rotations over SO(3): super-Fibonacci spirals (Alexa 2022)."""
     s = torch.arange(count, dtype=torch.float64) + 0.5
     t = s / count
     inner, outer = t.sqrt(), (1 - t).sqrt()
@@ -98,7 +98,7 @@ def near(degrees: float) -> Float[Tensor, "rotation 3 3"]:
 
 
 def random(count: int, generator: torch.Generator) -> Float[Tensor, "rotation 3 3"]:
-    """Rotations, all equally likely."""
+    """Uniformly random rotations."""
     return to_matrix(torch.randn(count, 4, generator=generator, dtype=torch.float64))
 
 

@@ -82,7 +82,7 @@ class Canonicaliser(nn.Module):
 
 
 class BandMix(nn.Module):
-    """Channels of features mixed, each band by itself, and brought to size one all together."""
+    """Linear map over channels within each band, followed by normalisation over all."""
 
     def __init__(self, inner: int, outer: int, bands: int):
         super().__init__()
@@ -110,8 +110,8 @@ def perceptron(inner: int, hidden: int, outer: int) -> nn.Sequential:
 def rotations_of(
     found: Canonical, points: Float[Tensor, "some point 3"], weights: Float[Tensor, "some point"]
 ) -> Float[Tensor, "some 3 3"]:
-    """The rotation that brings each instance into the canonical frame: least squares between points and their canonical
-    coordinates (Kabsch 1976)."""
+    """Rotation of each instance into the canonical frame: least squares between points and canonical coordinates
+    (Kabsch 1976)."""
     return nearest_rotation((weights[..., None] * found.coordinates).mT @ points)
 
 
@@ -167,7 +167,7 @@ def learn(instances: Sequence[Instance], config: CanonicalConfig) -> Canonicalis
 def drawn(
     instances: Sequence[Instance], config: CanonicalConfig, generator: torch.Generator
 ) -> tuple[Float[Tensor, "some point 3"], Float[Tensor, "some point"]]:
-    """Points of some instances, each turned at random, with equal weights."""
+    """Points of some instances, each randomly rotated, with equal weights."""
     which = torch.randperm(len(instances), generator=generator)[: config.batch].tolist()
     turns = random(len(which), generator).float()
     chosen = [
@@ -178,8 +178,8 @@ def drawn(
 
 
 def losses(found: Canonical, points: Tensor, weights: Tensor, config: CanonicalConfig) -> dict[str, Tensor]:
-    """Canonical consistency: the frame brings canonical coordinates back to the points. Orthonormality: the frame is
-    near to a rotation. Siamese: what different instances look like in the canonical frame is alike."""
+    """Canonical consistency: the frame maps canonical coordinates to the points. Orthonormality: the frame is close to
+    a rotation. Siamese: canonical coordinates of different instances are similar."""
     back = found.coordinates @ found.frame.mT
     consistency = (weights * (points - back).square().sum(-1)).sum(-1).mean()
     orthonormality = (found.frame - nearest_rotation(found.frame.detach())).square().sum((1, 2)).mean()
@@ -193,7 +193,7 @@ def losses(found: Canonical, points: Tensor, weights: Tensor, config: CanonicalC
 
 
 def upright(frame: Float[Tensor, "some 3 3"]) -> Float[Tensor, "some 3 3"]:
-    """The rotation of a frame's first two axes (Gram-Schmidt), which gradients pass through."""
+    """Rotation from a frame's first two axes (Gram-Schmidt), differentiable."""
     x = torch.nn.functional.normalize(frame[..., 0], dim=-1)
     along = frame[..., 1] - (frame[..., 1] * x).sum(-1, keepdim=True) * x
     y = torch.nn.functional.normalize(along, dim=-1)

@@ -1,4 +1,4 @@
-"""Compression: a trained run becomes a smaller one, tuned to look the same (Li 2023, VQRF)."""
+"""Compression of a trained run, with fine-tuning (Li 2023, VQRF)."""
 
 from .compress import compress as compress
 from .model import LADDER as LADDER

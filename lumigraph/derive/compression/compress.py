@@ -1,4 +1,4 @@
-"""compress(): choose a rung of the ladder, tune the run there, and write it as a run of its own.
+"""compress(): choose a rung of the ladder, fine-tune the run there, and write it as a new run.
 
 References are the run's photographs where available, else its own renderings.
 """
@@ -56,7 +56,7 @@ def compress(
     device: torch.device | str = "cpu",
     show: bool = False,
 ) -> Compressed:
-    """A smaller run in a new folder, which opens like any other; gives what compress.json says.
+    """Write a smaller run in a new folder, which opens like any other. Returns the contents of compress.json.
 
     show: whether stages are announced
     Where the photographs cannot be opened, the run's own renderings are learnt from and compared with.
@@ -89,7 +89,7 @@ def about_time(truth: Truth, aim: CompressOptions) -> str:
 
 
 class Ladder:
-    """Rungs that are tried, each from the run's own weights."""
+    """Search over rungs, each from the run's own weights."""
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class Ladder:
         self.tuned = 0.0  # share of all tuning
 
     def by_loss(self, most: float) -> CompressedModel:
-        """The highest rung on which no more is lost, by halving; the lowest, where even there more is."""
+        """The highest rung within the loss, by bisection; the lowest if none is."""
         self.stages.begin()
         low, high, best = 0, len(LADDER) - 1, None
         while low <= high:
@@ -122,8 +122,8 @@ class Ladder:
         return model
 
     def by_size(self, most: int) -> CompressedModel:
-        """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
-        take the next one."""
+        """The lowest position on the ladder within the size, on a rung or between two. Fine-tuning changes the size a
+        little, so the next one may be taken."""
         self.stages.begin()
         first = bisect_left(RUNG_POSITIONS, True, key=lambda place: len(self.at(place).packed()) <= most)
         self.stages.begin()
@@ -191,7 +191,7 @@ def row_width(tensor: Tensor, layout: str) -> int:
 def written(
     run: Run, before: Method, model: CompressedModel, truth: Truth, output: Path, aim: CompressOptions
 ) -> Compressed:
-    """Write the run; what it says of itself is measured on what was written, opened again."""
+    """Write the run; its recorded figures are measured after reopening."""
     views = min(aim.views or len(truth.scene.splits["test"]), len(truth.scene.splits["test"]))
     compared = EvaluationOptions("test", views)
     settings = replace(run.settings, said=run.settings.said | {"compressed": {"source": str(run.folder.resolve())}})
@@ -234,11 +234,11 @@ def told(size: float) -> str:
 
 @dataclass(frozen=True)
 class Truth:
-    """References for tuning and for comparison.
+    """References for fine-tuning and comparison.
 
-    photographed: whether these are photographs; renderings of the run before it was compressed otherwise
-    error:        mean squared error of the run before, on the photographs that it has learnt
-    view_seconds: time to render a view of it
+    photographed: whether these are photographs; otherwise renderings of the run before compression
+    error:        mean squared error of the run before, on its training photographs
+    view_seconds: rendering time of a view of it
     """
 
     scene: Scene
@@ -247,8 +247,8 @@ class Truth:
     view_seconds: float
 
     def loss(self, method: Method, views: int) -> float:
-        """dB that a method has lost on photographs it has learnt. Where renderings stand in for them, errors that know
-        nothing of each other are taken to add up."""
+        """PSNR loss of a method in dB on training photographs. With renderings instead, independent errors are
+        assumed to add up."""
         error = squared_error(method, self.scene, "train", views)
         return decibels(error if self.photographed else self.error + error) * -1 + decibels(self.error)
 
@@ -278,7 +278,7 @@ def decibels(error: float) -> float:
 
 
 def rendered(run: Run, method: Method) -> Scene:
-    """A Scene whose photographs are what a method shows from where they were taken."""
+    """A Scene of a method's renderings at its photographs' cameras."""
     cameras = run.cameras()
     some = {split: evenly(range(len(own)), RENDERED_VIEWS) for split, own in cameras.items() if len(own)}
     chosen = [cameras[split][i] for split, index in some.items() for i in index]

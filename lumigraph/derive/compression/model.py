@@ -1,4 +1,4 @@
-"""Model: a method whose tensors are tables in few bytes, tuned as such; and the ladder of its sizes."""
+"""Model: a method with packed tensors, fine-tuned as such; and the ladder of its sizes."""
 
 from __future__ import annotations
 
@@ -50,19 +50,19 @@ class CompressedModel:
         return {name: x for name, x in self.tensors.items() if isinstance(x, Table)}
 
     def show(self) -> None:
-        """Let the method have the numbers as they will be read."""
+        """Set the method's tensors to the decoded numbers."""
         own = self.method.state_dict()
         for name, table in self.tables.items():
             if table.forms:
                 table.put(own[name])
 
     def packed(self) -> bytes:
-        """The file of it."""
+        """Packed bytes of the model."""
         return packing.write(self.tensors)
 
     def tune(self, scene: Scene, steps: int | None, seconds: float | None) -> None:
-        """Learn from photographs with the rows' codes as they are: codebooks, rows apart from them and scaled numbers
-        descend together, through the rounding, at a pace that falls with progress."""
+        """Fine-tune on photographs with fixed codes: codebooks, separate rows and scaled numbers are optimised through
+        the rounding, at a decaying rate."""
         forms = [form for _, table in self.tuned for form in table.forms]
         rates = [(latent.requires_grad_(), unit) for form in forms for latent, unit in form.learning()]
         optimizer = torch.optim.Adam([{"params": [x], "lr": 0.0, "unit": unit} for x, unit in rates], betas=BETAS)
@@ -83,7 +83,7 @@ class CompressedModel:
         self.seconds += time.perf_counter() - begin
 
     def _descend(self, batch: Any, optimizer: torch.optim.Optimizer) -> None:
-        """One step: gradients reach the method's own tensors, and from there what their rows were made of."""
+        """One step: gradients of the method's tensors are passed on to their encoded form."""
         values = [table.values() for _, table in self.tuned]
         for (parameter, table), some in zip(self.tuned, values, strict=True):
             table.put(parameter.data, some.detach())
@@ -112,7 +112,7 @@ def progress(step: int, passed: float, steps: int | None, seconds: float | None)
 
 @dataclass(frozen=True)
 class Rung:
-    """pruned: share of all importance whose rows go, the least important ones first"""
+    """pruned: share of all importance to prune, the least important rows first"""
 
     pruned: float
     recipe: Recipe
@@ -136,7 +136,7 @@ RUNG_POSITIONS = [i / STEPS_BETWEEN_RUNGS for i in range(STEPS_BETWEEN_RUNGS * (
 
 
 def rung_at(place: float) -> Rung:
-    """A rung, or what lies between two: the lower one's recipe, with more pruned and fewer rows kept apart."""
+    """A rung, or an interpolation of two: the lower one's recipe, with more pruned and fewer separate rows."""
     low, high = LADDER[int(place)], LADDER[min(int(place) + 1, len(LADDER) - 1)]
     share = place - int(place)
     pruned = low.pruned + share * (high.pruned - low.pruned)

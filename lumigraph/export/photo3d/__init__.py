@@ -1,8 +1,8 @@
 """3-D photographs: neighbouring photographs as one layered panorama with depth, and as a textured mesh of two layers
 (Hedman et al. 2017, Casual 3D Photography; Hedman and Kopf 2018, Instant 3D Photography).
 
-Depth maps are made dense, drawn into one panorama from their middle, and stitched: each pixel takes one photograph. A
-second layer holds what lies behind the edges of the first one: seen by other photographs, or continued from beside.
+Depth maps are made dense, warped into one panorama at their centre, and stitched: each pixel takes one photograph. A
+second layer fills disocclusions: seen by other photographs, or extrapolated.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def depth_of(scene: Scene, numbers: list[int], size: int) -> list[DepthMap]:
 
 
 def panorama_camera(maps: list[DepthMap]) -> Camera:
-    """Camera in the photographs' middle that sees what they see, as sharp as they are."""
+    """Camera at the photographs' centre with their common view and resolution."""
     poses = torch.cat([seen.camera.pose for seen in maps])
     place = poses[:, :, 3].mean(0)
     forward = normalize(poses[:, :, 2].sum(0), dim=0)

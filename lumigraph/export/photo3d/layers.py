@@ -23,11 +23,10 @@ MIN_BEHIND = 1.1  # factor of distance from which on another photograph's surfac
 
 
 def background(front: PanoramaLayer, layers: list[PanoramaLayer]) -> PanoramaLayer:
-    """Surfaces behind the edges of the first layer.
+    """Background layer: surfaces behind the depth edges of the first layer.
 
-    A pixel is foreground if it lies well in front of what is around it, and hides something if it is near an edge.
-    There the nearest surface behind it that any photograph shows is taken, and for the rest a smooth continuation of
-    both and of what is no foreground.
+    A pixel is foreground if it lies well in front of its surroundings, and occludes something if it is near an edge.
+    There the nearest surface behind it in any photograph is taken, and otherwise a smooth extrapolation.
     """
     height, width = front.depth.shape
     band = max(round(BAND * width), 3)
@@ -63,8 +62,8 @@ def background(front: PanoramaLayer, layers: list[PanoramaLayer]) -> PanoramaLay
 
 
 def push_pull(values: Float[Tensor, "height width channel"], known: Bool[Tensor, "height width"]) -> Tensor:
-    """Unknown pixels from known ones around them: means over ever larger blocks, then back to finer ones
-    (Gortler 1996, section 3.4)."""
+    """Fill unknown pixels by push-pull: means over ever larger blocks, then back to finer ones (Gortler 1996,
+    section 3.4)."""
     levels = []
     weight = known.float()[None, None]
     total = values.movedim(-1, 0)[None] * weight

@@ -39,7 +39,7 @@ class PanoramaLayer:
 
 
 def dense_inverse_depth(seen: DepthMap) -> Float[Tensor, "height width"]:
-    """Inverse depth of every pixel: as it is known, and as smooth as the colours are.
+    """Dense inverse depth, an edge-aware smooth interpolation of the known one.
 
     The minimum of w sum (x - d)^2 over known pixels + sum exp(-|difference of colour| / e) (x_i - x_j)^2 over pairs
     """
@@ -68,9 +68,9 @@ def dense_inverse_depth(seen: DepthMap) -> Float[Tensor, "height width"]:
 
 
 def exposures(maps: list[DepthMap], inverse: list[Tensor]) -> list[Float[Tensor, " 3"]]:
-    """Gains of photographs that bring their colours to those of the middle one, from what both show.
+    """Exposure gains of photographs to match the central one, from their overlap.
 
-    Each is the median ratio of colours at sure places of the middle photograph.
+    Each is the median ratio of colours at reliable points of the central photograph.
     """
     middle = maps[len(maps) // 2]
     points, colours = middle.positions(), middle.rgb[middle.solid]
@@ -137,9 +137,9 @@ def grid_faces(
 def stitched(layers: list[PanoramaLayer], panorama: Camera) -> tuple[PanoramaLayer, Int[Tensor, "height width"]]:
     """One layer from those of all photographs, and the photograph of each pixel.
 
-    Costs are high where others show another surface (LONELY), the depth was guessed, the photograph was taken far from
-    the middle, or shows nothing. Seams cost less at edges. Paths of `kernels.semi_global` with one penalty for any
-    change find labels, as disparities elsewhere.
+    Costs are high for a surface that others do not show (LONELY), for guessed depth, distant photographs and empty
+    pixels. Seams cost less at edges. Labels are found by the paths of `kernels.semi_global` with one penalty for any
+    change.
     """
     depth = torch.stack([layer.depth for layer in layers])
     known, sure = (torch.stack([getattr(layer, name) for layer in layers]) for name in ("known", "sure"))
@@ -169,7 +169,7 @@ def stitched(layers: list[PanoramaLayer], panorama: Camera) -> tuple[PanoramaLay
 def filled(
     depth: Float[Tensor, "height width"], rgb: Float[Tensor, "height width 3"], known: Bool[Tensor, "height width"]
 ) -> tuple[Float[Tensor, "height width"], Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
-    """Depth and colour of the next known pixel where there is none; known is what that is not far from."""
+    """Depth and colour of the nearest known pixel for unknown ones; a mask of those close to a known one."""
     away, at = ndimage.distance_transform_edt(~known.numpy(), return_indices=True)
     row, column = torch.from_numpy(at).long()
     return depth[row, column], rgb[row, column], torch.from_numpy(away <= MAX_HOLE)

@@ -1,4 +1,4 @@
-"""Textures of meshes: a UV atlas, colours from photographs or renderings, normals from what decimation removed."""
+"""Textures of meshes: a UV atlas, colours from photographs or renderings, and normal maps of decimated detail."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def textured(
 ) -> Mesh:
     """The mesh of a surface with a texture.
 
-    sources:   of pictures, the best one first; the next ones are for texels that no earlier one shows
-    tolerance: depth behind the first surface of a picture at which a texel still counts as seen, scene units
+    sources:   of pictures, the best one first; the next ones are for texels invisible in earlier ones
+    tolerance: depth behind the first surface of a picture at which a texel still counts as visible, scene units
     size:      of the texture, texels a side
     detailed:  the surface before its decimation, for a normal map
-    Texels that no picture shows take the colours of the nearest in space. Raises LumigraphError for a surface without
-    triangles or with vertices that are not finite, and for a texture that does not fit into memory.
+    Invisible texels take the colours of the nearest in space. Raises LumigraphError for a surface without triangles or
+    with vertices that are not finite, and for a texture that exceeds memory.
     """
     vertices, faces = surface
     check_surface(vertices, faces)

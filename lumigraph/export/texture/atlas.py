@@ -1,4 +1,4 @@
-"""UV atlas of a mesh, and the points of its surface under the texels of a square texture."""
+"""UV atlas of a mesh, and surface points of a square texture's texels."""
 
 from __future__ import annotations
 

@@ -43,8 +43,8 @@ class PosedPicture:
     """A picture of the surface.
 
     camera:  a batch of one, of the picture's size
-    trusted: pixels that show the scene, rather than a mask or a background
-    seen:    the method's rendering of the same camera, in any size, which knows what is in front of the surface
+    trusted: pixels of the scene, rather than of a mask or a background
+    seen:    the method's rendering of the same camera, in any size, for occlusion by other surfaces
     """
 
     camera: Camera
@@ -115,7 +115,7 @@ def first_surface(
 def trust(
     view: PosedPicture, depth: Float[np.ndarray, "height width"], tolerance: float
 ) -> Float[np.ndarray, "height width"]:
-    """Trust in each pixel's colour, from 0 to 1: small near the edges of surface, picture and mask, 0 beyond them.
+    """Weight of each pixel's colour, from 0 to 1: small near the edges of surface, picture and mask, 0 beyond them.
 
     depth:     of the mesh
     tolerance: between neighbouring depths of one surface, scene units
@@ -166,7 +166,7 @@ def collected(
 
 
 def gains(samples: TexelColours) -> Float[np.ndarray, "view 3"]:
-    """Logarithm of a factor for each view and channel, by which overlapping views agree: robust least squares
+    """Log gain of each view and channel that equalises overlapping views by robust least squares
 
     min over g of  sum w (log c_i + g_i - log c_j - g_j)^2 + ridge |g|^2
 
@@ -224,8 +224,8 @@ def blended(samples: TexelColours, gain: Float[np.ndarray, "view 3"]) -> Float[n
 def spread_to_unseen(
     colours: Float[np.ndarray, "texel 3"], points: Float[np.ndarray, "texel 3"], known: Bool[np.ndarray, " texel"]
 ) -> Float[np.ndarray, "texel 3"]:
-    """Colours with those of unseen texels replaced by the mean of the nearest seen ones in space, weighted by
-    1 / distance."""
+    """Colours with those of invisible texels replaced by the mean of the nearest visible ones, weighted by 1 /
+    distance."""
     if known.all():
         return colours
     there = np.flatnonzero(known)

@@ -1,4 +1,4 @@
-"""Normal map: the detail that decimation removes from a mesh, as normals in the tangent frame of what is left."""
+"""Normal map: detail lost by decimation, as normals in the tangent frame of the decimated mesh."""
 
 from __future__ import annotations
 

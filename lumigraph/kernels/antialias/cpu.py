@@ -1,6 +1,5 @@
 """Numba: threads share the rows. Each pixel follows the surface to its right and lower neighbours, then blends over the
-four pairs that it belongs to. One thread sums the gradients of the few silhouette edges.
-"""
+four pairs that it belongs to. One thread sums the gradients of the few silhouette edges."""
 
 import numpy as np
 import torch
@@ -18,8 +17,7 @@ def _row(planes, k):
 
 @njit(**FAST)
 def _silhouette(f, x, y, dx, dy, corners, faces, neighbours):
-    """Silhouette edge 3 f + k at which the surface of triangle f, seen at (x, y), ends before (x + dx, y + dy); -1
-    for none."""
+    """Silhouette edge 3 f + k where the surface of f, seen at (x, y), ends before (x + dx, y + dy); -1 for none."""
     for _ in range(MAX_FACES):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         if min(corners[a, 2], corners[b, 2], corners[c, 2]) <= 0:
@@ -52,8 +50,7 @@ def _silhouette(f, x, y, dx, dy, corners, faces, neighbours):
 def _crossing(edge, row, column, axis, corners, faces):
     """Crossing of an edge with the line through the centres of a pixel and its neighbour along an axis: distance from
     the middle between them, position along the edge in [0, 1], the edge's slope, and whether it is steep enough to
-    count.
-    """
+    count."""
     f, k = edge // 3, edge % 3
     i, j = faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
     other = 1 - axis
@@ -138,9 +135,7 @@ def _to_picture(grad, picture, edges, shifts, out, to_shifts):
 
 @njit(**FAST)
 def _to_corners(to_shifts, edges, corners, faces, out):
-    """Gradient of vertices: ds = (1 - share, share) times the ends' movement along the axis, less slope times that
-    across it.
-    """
+    """Gradient of vertices: ds = (1 - share, share) times movement along the axis, less slope times that across."""
     height, width, _ = edges.shape
     out[:] = 0
     for row in range(height):

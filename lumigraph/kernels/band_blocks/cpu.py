@@ -29,8 +29,7 @@ def _place(new, count, own):
 
 @njit(cache=True, error_model="numpy")
 def _walk(depth, pose, lens, blocks, table, side, truncation, steps, begin, new, count, own):
-    """Collect blocks along rays from pixel `begin` on, until `new` is half full. Returns the next pixel and the number
-    of new blocks."""
+    """Collect blocks along rays from pixel `begin` on, until `new` is half full. Returns next pixel and count."""
     height, width = depth.shape
     mask, step = len(own) - 1, np.float32(2) * truncation / np.float32(steps)
     for pixel in range(begin, height * width):

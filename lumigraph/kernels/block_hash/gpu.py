@@ -1,6 +1,4 @@
-"""Triton: one lane inserts one block; it carries the block, or the one evicted, from slot to slot until one is
-empty.
-"""
+"""Triton: one lane carries one block, or the one it evicts, from slot to slot until one is empty."""
 
 import torch
 import triton

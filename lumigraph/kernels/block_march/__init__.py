@@ -86,9 +86,7 @@ class Blocks:
 
 
 def _with_distances(rows: Int32[Tensor, "n x y z"], farthest: int, beyond: bool) -> Int32[Tensor, "n x y z"]:
-    """Rows with Chebyshev distances to the nearest row at empty voxels. beyond: whether there may be rows outside
-    the array
-    """
+    """Rows with Chebyshev distances to the nearest row at empty voxels. beyond: rows may be outside the array"""
     near = torch.nn.functional.pad(rows >= 0, (1,) * 6, value=beyond)
     far = torch.full_like(near, farthest, dtype=torch.int8)
     for distance in range(1, farthest):

@@ -34,9 +34,7 @@ def placed(o, d, t, ball):
 
 @njit(inline="always")
 def nearest(o, d, ball):
-    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared distance to
-    the centre.
-    """
+    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared radius."""
     middle = TWO * ball - HALF
     u, v, w = o[0] - middle, o[1] - middle, o[2] - middle
     along = u * d[0] + v * d[1] + w * d[2]
@@ -95,9 +93,7 @@ def from_sides(x, b, block):
 
 @njit(inline="always")
 def past(x, y, z, d, bx, by, bz, number, block, ball):
-    """Number of steps, at least one, that skip the empty space around a block; conservative, since contracted rays
-    curve.
-    """
+    """Number of steps, at least one, over the empty space around a block; conservative, since rays may curve."""
     if ball == ZERO:
         return beyond(x, y, z, d[0], d[1], d[2], bx, by, bz, block)
     clear = min(from_sides(x, bx, block), from_sides(y, by, block), from_sides(z, bz, block))
@@ -137,13 +133,13 @@ def corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights):
 
 
 @njit(inline="always")
-def blended(values, at, weights, count, seen):
+def blended(values, at, weights, count, v):
     for c in range(C):
-        seen[c] = ZERO
+        v[c] = ZERO
     for k in range(count):
         row, weight = at[k], weights[k]
         for c in range(C):
-            seen[c] += weight * values[row, c]
+            v[c] += weight * values[row, c]
 
 
 @njit(inline="always")
@@ -176,23 +172,23 @@ def _forward(origins, directions, enter, leave, index, rows, values, ball, stop,
     n = len(origins)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights = np.empty(9, np.int64), np.empty(9, np.float32)
-        seen, total = np.empty(C, np.float32), np.empty(C, np.float32)
+        v, total = np.empty(C, np.float32), np.empty(C, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             o, d, t = origins[r], directions[r], enter[r]
             ahead, aside = nearest(o, d, ball)
-            light, along, met = ONE, ZERO, 0
+            transmittance, along, met = ONE, ZERO, 0
             for c in range(C):
                 total[c] = ZERO
-            while light >= stop:
+            while transmittance >= stop:
                 t, count = next_met(o, d, t, leave[r], ahead, aside, index, rows, ball, at, weights)
                 if count == 0:
                     break
                 met += 1
-                blended(values, at, weights, count, seen)
+                blended(values, at, weights, count, v)
                 for c in range(C):
-                    total[c] += light * seen[c]
-                along += light * seen[A] * t
-                light *= ONE - seen[A]
+                    total[c] += transmittance * v[c]
+                along += transmittance * v[A] * t
+                transmittance *= ONE - v[A]
                 t = later(t, 1, ahead, aside, ball)
             for c in range(C):
                 totals[r, c] = total[c]
@@ -200,25 +196,38 @@ def _forward(origins, directions, enter, leave, index, rows, values, ball, stop,
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, lights):
+def _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, transmittances):
     """Distances and transmittances of each ray's non-empty steps."""
     n = len(origins)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
-        at, weights, seen = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
+        at, weights, v = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            o, d, t, light = origins[r], directions[r], enter[r], ONE
+            o, d, t, transmittance = origins[r], directions[r], enter[r], ONE
             ahead, aside = nearest(o, d, ball)
             for s in range(starts[r], starts[r + 1]):
                 t, count = next_met(o, d, t, leave[r], ahead, aside, index, rows, ball, at, weights)
-                blended(values, at, weights, count, seen)
-                steps[s], lights[s] = t, light
-                light *= ONE - seen[A]
+                blended(values, at, weights, count, v)
+                steps[s], transmittances[s] = t, transmittance
+                transmittance *= ONE - v[A]
                 t = later(t, 1, ahead, aside, ball)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _owed(
-    g_totals, g_distance, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, out
+def _value_gradients(
+    g_totals,
+    g_distance,
+    origins,
+    directions,
+    index,
+    rows,
+    values,
+    ball,
+    starts,
+    steps,
+    transmittances,
+    points,
+    first,
+    out,
 ):
     """Gradient of each step's interpolated values: dL/dv = T g; alpha also gets what it occludes.
 
@@ -226,7 +235,7 @@ def _owed(
     """
     block = rows.shape[1] - 2
     for r in prange(len(origins)):
-        at, weights, seen = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
+        at, weights, v = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
         hidden = ZERO  # sum over steps j behind step i of prod_{i<k<j} (1 - alpha_k) dL/dT_j
         for s in range(starts[r + 1] - 1, starts[r] - 1, -1):
             t = steps[s]
@@ -235,18 +244,18 @@ def _owed(
             bx, by, bz, number = block_of(x, y, z, index, block)
             (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
             count = corners(rows, max(number, np.int64(0)), cx, fx, cy, fy, cz, fz, at, weights)
-            blended(values, at, weights, count, seen)
+            blended(values, at, weights, count, v)
             first[s] = block * bx + cx
-            own = g_distance[r] * seen[A] * t
+            own = g_distance[r] * v[A] * t
             for c in range(C):
-                own += g_totals[r, c] * seen[c]
-                out[s, c] = lights[s] * g_totals[r, c]
-            out[s, A] += lights[s] * (g_distance[r] * t - hidden)
-            hidden = own + (ONE - seen[A]) * hidden
+                own += g_totals[r, c] * v[c]
+                out[s, c] = transmittances[s] * g_totals[r, c]
+            out[s, A] += transmittances[s] * (g_distance[r] * t - hidden)
+            hidden = own + (ONE - v[A]) * hidden
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _spread(owed, points, index, rows, order, starts, out):
+def _spread(d_v, points, index, rows, order, starts, out):
     block = rows.shape[1] - 2
     for half in range(2):
         for pair in prange((len(starts) - 1) // 2):
@@ -260,7 +269,7 @@ def _spread(owed, points, index, rows, order, starts, out):
                 for k in range(corners(rows, max(number, np.int64(0)), cx, fx, cy, fy, cz, fz, at, weights)):
                     row, weight = at[k], weights[k]
                     for c in range(C):
-                        out[row, c] += weight * owed[s, c]
+                        out[row, c] += weight * d_v[s, c]
 
 
 def forward(ctx, origins, directions, enter, leave, blocks, values, stop):
@@ -279,9 +288,9 @@ def backward(ctx, g_totals, g_distance):
     starts = np.concatenate([np.zeros(1, np.int64), lengths.cumsum()])
     total, block = int(starts[-1]), ctx.blocks.block
     ball, first = np.float32(ctx.blocks.ball), np.empty(total, np.int32)
-    steps, lights, points, owed = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
-    _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, lights)
-    _owed(
+    steps, transmittances, points, d_v = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
+    _steps(origins, directions, enter, leave, index, rows, values, ball, starts, steps, transmittances)
+    _value_gradients(
         g_totals.numpy(),
         g_distance.numpy(),
         origins,
@@ -292,15 +301,15 @@ def backward(ctx, g_totals, g_distance):
         ball,
         starts,
         steps,
-        lights,
+        transmittances,
         points,
         first,
-        owed,
+        d_v,
     )
     # Places of one slab of cells touch its voxels and the next one's first: see `sparse_grid`.
     order, slabs = slabs_of(first, block * index.shape[0] + 1)
     to_values = torch.zeros(values.shape)
-    _spread(owed, points, index, rows, order, slabs, to_values.numpy())
+    _spread(d_v, points, index, rows, order, slabs, to_values.numpy())
     return None, None, None, None, None, to_values, None
 
 

@@ -31,9 +31,7 @@ def _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED: tl.constexpr):
 
 @triton.jit
 def _nearest(ox, oy, oz, dx, dy, dz, ball):
-    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared distance to
-    the centre.
-    """
+    """Distance from a ray's point closest to the ball's centre to its origin, and that point's squared radius."""
     middle = 2 * ball - 0.5
     u, v, w = ox - middle, oy - middle, oz - middle
     along = u * dx + v * dy + w * dz
@@ -92,9 +90,7 @@ def _cell_of(x, b, B: tl.constexpr):
 
 @triton.jit
 def _voxel_of(x, y, z, bx, by, bz, B: tl.constexpr):
-    """The lowest of the eight voxels around each position, counted within its block, and the fractional position
-    above it.
-    """
+    """The lowest of the eight voxels around each position, within its block, and the fractional position above."""
     cx, fx = _cell_of(x, bx, B)  # one pair a line: Triton 3.6 assigns to no nested tuple
     cy, fy = _cell_of(y, by, B)
     cz, fz = _cell_of(z, bz, B)
@@ -111,20 +107,20 @@ def _row_of(rows, number, voxel, there, B: tl.constexpr):
 def _blended(rows, values, number, voxel, f, there, B: tl.constexpr):
     """Trilinear values at each position, and a mask of those with a non-empty voxel."""
     c = tl.arange(0, C)
-    seen = tl.zeros([BLOCK, C], tl.float32)
+    v = tl.zeros([BLOCK, C], tl.float32)
     some = tl.zeros([BLOCK], tl.int32)
     for k in tl.static_range(8):
         weight = weight_of(k, f)
         row = _row_of(rows, number, corner_of(k, voxel), there, B).to(tl.int64)
         full = row >= 0
         some |= full.to(tl.int32)
-        seen += weight[:, None] * tl.load(values + row[:, None] * C + c[None, :], mask=full[:, None], other=0.0)
-    return seen, some > 0
+        v += weight[:, None] * tl.load(values + row[:, None] * C + c[None, :], mask=full[:, None], other=0.0)
+    return v, some > 0
 
 
 @triton.jit
-def _alpha(seen):
-    return tl.sum(tl.where(tl.arange(0, C)[None, :] == A, seen, 0.0), 1)
+def _alpha(v):
+    return tl.sum(tl.where(tl.arange(0, C)[None, :] == A, v, 0.0), 1)
 
 
 @triton.jit(do_not_specialize=["R"])
@@ -135,7 +131,7 @@ def _march(
     origins, directions, enter, leave = rays
     index, rows = grid
     totals, distance, lengths = sums
-    starts, steps, lights = noted
+    starts, steps, transmittances = noted
     r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
     ox, oy, oz = load_row(origins, r, here)
@@ -145,12 +141,12 @@ def _march(
     if NOTE:
         first = tl.load(starts + r, mask=here, other=0)
         last = tl.load(starts + r + 1, mask=here, other=0)
-    light = tl.full([BLOCK], 1.0, tl.float32)
+    transmittance = tl.full([BLOCK], 1.0, tl.float32)
     along = tl.zeros([BLOCK], tl.float32)
     total = tl.zeros([BLOCK, C], tl.float32)
     met = tl.zeros([BLOCK], tl.int32)
     ahead, aside = _nearest(ox, oy, oz, dx, dy, dz, ball)
-    alive = here & (t < end) & (light >= stop)
+    alive = here & (t < end) & (transmittance >= stop)
     while tl.max(alive.to(tl.int32), 0) > 0:
         x, y, z = _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED)
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
@@ -161,15 +157,15 @@ def _march(
         if CURVED:  # a step may be longer than a voxel
             leap = tl.maximum(leap - 1, 0)
         there &= leap == 0
-        seen, some = _blended(rows, values, number, voxel, f, there, B)
-        alpha = _alpha(seen)
+        v, some = _blended(rows, values, number, voxel, f, there, B)
+        alpha = _alpha(v)
         if NOTE:
             place = first + met
             tl.store(steps + place, t, mask=some & (place < last))
-            tl.store(lights + place, light, mask=some & (place < last))
-        total += light[:, None] * seen
-        along += light * alpha * t
-        light *= 1 - alpha
+            tl.store(transmittances + place, transmittance, mask=some & (place < last))
+        total += transmittance[:, None] * v
+        along += transmittance * alpha * t
+        transmittance *= 1 - alpha
         met += some.to(tl.int32)
         if CURVED:
             clear = tl.minimum(tl.minimum(_from_sides(x, bx, B), _from_sides(y, by, B)), _from_sides(z, bz, B))
@@ -179,7 +175,7 @@ def _march(
             out = tl.ceil(tl.minimum(away, 1e9)).to(tl.int32)
         onward = tl.where(alive, tl.maximum(tl.where(number < 0, out, leap), 1), 0)
         t = _later(t, onward, ahead, aside, ball, CURVED)
-        alive &= (t < end) & (light >= stop)
+        alive &= (t < end) & (transmittance >= stop)
     if not NOTE:
         tl.store(totals + r[:, None] * C + c[None, :], total, mask=here[:, None])
         tl.store(distance + r, along, mask=here)
@@ -192,7 +188,7 @@ def _backward(grads, rays, grid, values, noted, to_values, R, X, Y, Z, ball, CUR
     g_totals, g_distance = grads
     origins, directions = rays
     index, rows = grid
-    starts, steps, lights = noted
+    starts, steps, transmittances = noted
     r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
     ox, oy, oz = load_row(origins, r, here)
@@ -205,20 +201,20 @@ def _backward(grads, rays, grid, values, noted, to_values, R, X, Y, Z, ball, CUR
     alive = here & (s >= first)
     while tl.max(alive.to(tl.int32), 0) > 0:
         t = tl.load(steps + s, mask=alive, other=0.0)
-        light = tl.load(lights + s, mask=alive, other=0.0)
+        transmittance = tl.load(transmittances + s, mask=alive, other=0.0)
         x, y, z = _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED)
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
         there = number >= 0
         voxel, f = _voxel_of(x, y, z, bx, by, bz, B)
-        seen, _ = _blended(rows, values, number, voxel, f, there, B)
-        alpha = _alpha(seen)
-        owed = light[:, None] * (g + tl.where(c[None, :] == A, (g_along * t - hidden)[:, None], 0.0))
+        v, _ = _blended(rows, values, number, voxel, f, there, B)
+        alpha = _alpha(v)
+        d_v = transmittance[:, None] * (g + tl.where(c[None, :] == A, (g_along * t - hidden)[:, None], 0.0))
         for k in tl.static_range(8):
             weight = weight_of(k, f)
             row = _row_of(rows, number, corner_of(k, voxel), there, B).to(tl.int64)
             to = to_values + row[:, None] * C + c[None, :]
-            tl.atomic_add(to, weight[:, None] * owed, mask=(row >= 0)[:, None], sem="relaxed")
-        own = tl.sum(g * seen, 1) + g_along * alpha * t
+            tl.atomic_add(to, weight[:, None] * d_v, mask=(row >= 0)[:, None], sem="relaxed")
+        own = tl.sum(g * v, 1) + g_along * alpha * t
         hidden = tl.where(alive, own + (1 - alpha) * hidden, hidden)
         s -= 1
         alive &= s >= first
@@ -242,8 +238,8 @@ def backward(ctx, *grads):
     origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
     starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
     steps = torch.zeros(int(starts[-1]), device=values.device)
-    lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
-    out, noted = (totals, distance, lengths), (starts, steps, lights)
+    transmittances, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
+    out, noted = (totals, distance, lengths), (starts, steps, transmittances)
     given = (origins, directions, enter, leave), ctx.voxels, values, out, noted
     launch(_march, ctx.grid, *given, *ctx.sizes, ctx.stop, NOTE=True, **ctx.options)
     inputs = grads, (origins, directions), ctx.voxels, values, noted, to_values

@@ -16,12 +16,12 @@ def run(
     origins, directions, enter, leave = (x.detach() for x in (origins, directions, enter, leave))
     t = steps(origins, directions, enter, leave, blocks.ball)
     points = contracted(origins[:, None] + t[..., None] * directions[:, None], blocks.ball)
-    seen = looked_up(points.reshape(-1, 3), blocks, values).view(*t.shape, CHANNELS)
-    seen = seen * (t < leave[:, None])[..., None]
-    alpha = seen[..., ALPHA]
+    v = looked_up(points.reshape(-1, 3), blocks, values).view(*t.shape, CHANNELS)
+    v = v * (t < leave[:, None])[..., None]
+    alpha = v[..., ALPHA]
     passed = torch.cat([torch.ones_like(enter)[:, None], 1 - alpha], -1).cumprod(-1)[:, :-1]
-    light = torch.where(passed < stop, 0, passed)
-    return (light[..., None] * seen).sum(1), (light * alpha * t).sum(1)
+    transmittance = torch.where(passed < stop, 0, passed)
+    return (transmittance[..., None] * v).sum(1), (transmittance * alpha * t).sum(1)
 
 
 def steps(origins: Tensor, directions: Tensor, enter: Tensor, leave: Tensor, ball: float) -> Tensor:

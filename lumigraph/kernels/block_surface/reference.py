@@ -28,14 +28,19 @@ def run(voxels, blocks, table, min_weight):
     known = (number >= 0).view(-1, size, size, size) & (values[..., 1] > min_weight)
     negative = values[..., 0] < 0
 
-    def moved(x, step):
+    def take_neighbours(x, step):
         """Neighbour of each voxel of the blocks, a step away."""
         i, j, k = step
         return x[:, i : i + SIDE, j : j + SIDE, k : k + SIDE]
 
     here, axes = (0, 0, 0), ((1, 0, 0), (0, 1, 0), (0, 0, 1))
     crossed = torch.stack(
-        [moved(known, here) & moved(known, a) & (moved(negative, here) != moved(negative, a)) for a in axes],
+        [
+            take_neighbours(known, here)
+            & take_neighbours(known, a)
+            & (take_neighbours(negative, here) != take_neighbours(negative, a))
+            for a in axes
+        ],
         -1,
     )
     index = (crossed.flatten().cumsum(0) - 1).view(crossed.shape)
@@ -49,8 +54,8 @@ def run(voxels, blocks, table, min_weight):
         share = torch.where(one[:, 2:3] < 0, 1.0, torch.where(other[:, 2:3] < 0, 0.0, share))
     mixed = one[:, 2:] + share * (other[:, 2:] - one[:, 2:])
 
-    corners = torch.stack([moved(negative, (c >> 2, c >> 1 & 1, c & 1)) for c in range(8)], -1)
-    whole = torch.stack([moved(known, (c >> 2, c >> 1 & 1, c & 1)) for c in range(8)], -1).all(-1)
+    corners = torch.stack([take_neighbours(negative, (c >> 2, c >> 1 & 1, c & 1)) for c in range(8)], -1)
+    whole = torch.stack([take_neighbours(known, (c >> 2, c >> 1 & 1, c & 1)) for c in range(8)], -1).all(-1)
     case = (corners.long() << torch.arange(8, device=device)).sum(-1) * whole
     fans, counts = case_table(str(device))
     triangle = torch.arange(fans.shape[1], device=device) < counts[case][..., None]

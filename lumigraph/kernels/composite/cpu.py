@@ -12,20 +12,20 @@ ONE = np.float32(1)
 def _forward(tau, values, starts, stop, total, opacity, weights):
     channels = values.shape[1]
     for r in prange(len(starts) - 1):
-        through, spent = ONE, np.float32(0)
+        transmittance, sum_w = ONE, np.float32(0)
         total[r] = 0
         for i in range(starts[r], starts[r + 1]):
-            if through < stop:
+            if transmittance < stop:
                 weights[i] = 0
                 continue
-            keep = np.exp(-tau[i])
-            w = through * (ONE - keep)
+            exp_tau = np.exp(-tau[i])
+            w = transmittance * (ONE - exp_tau)
             weights[i] = w
-            spent += w
-            through *= keep
+            sum_w += w
+            transmittance *= exp_tau
             for c in range(channels):
                 total[r, c] += w * values[i, c]
-        opacity[r] = spent
+        opacity[r] = sum_w
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -33,23 +33,23 @@ def _backward(to_total, to_opacity, to_weights, tau, values, weights, starts, st
     """Gradients: dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j with g_i = dL/dw_i."""
     channels = values.shape[1]
     for r in prange(len(starts) - 1):
-        behind = np.float32(0)
+        sum_gw = np.float32(0)
         for i in range(starts[r], starts[r + 1]):
-            worth = to_opacity[r] + to_weights[i]
+            g = to_opacity[r] + to_weights[i]
             for c in range(channels):
-                worth += to_total[r, c] * values[i, c]
+                g += to_total[r, c] * values[i, c]
                 to_values[i, c] = weights[i] * to_total[r, c]
-            to_tau[i] = worth
-            behind += worth * weights[i]
-        through = ONE
+            to_tau[i] = g
+            sum_gw += g * weights[i]
+        transmittance = ONE
         for i in range(starts[r], starts[r + 1]):
-            if through < stop:
+            if transmittance < stop:
                 to_tau[i] = 0
                 continue
-            worth = to_tau[i]
-            behind -= worth * weights[i]
-            through *= np.exp(-tau[i])
-            to_tau[i] = worth * through - behind
+            g = to_tau[i]
+            sum_gw -= g * weights[i]
+            transmittance *= np.exp(-tau[i])
+            to_tau[i] = g * transmittance - sum_gw
 
 
 def forward(ctx, tau, values, starts, stop):

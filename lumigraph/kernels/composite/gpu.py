@@ -10,11 +10,11 @@ BLOCK = tl.constexpr(32)  # samples; most rays of a trained scene need one or tw
 
 
 @triton.jit
-def _thickness(tau, i, i0, b, before):
+def _thickness(tau, i, i0, b, sum_tau):
     """Each sample's tau, and the sum of tau in front of it, over tau_{i-1} because sum - tau_i would lose digits."""
     t = tl.load(tau + i, mask=i < b, other=0.0)
     previous = tl.load(tau + i - 1, mask=(i > i0) & (i < b), other=0.0)
-    return t, before + tl.cumsum(previous, 0)
+    return t, sum_tau + tl.cumsum(previous, 0)
 
 
 @triton.jit
@@ -23,18 +23,18 @@ def _forward(tau, values, ray_starts, outputs, stop, C: tl.constexpr, CHANNELS: 
     r = tl.program_id(0).to(tl.int64)
     i0, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
     c = tl.arange(0, CHANNELS)
-    before, sum_w = 0.0, 0.0
+    sum_tau, sum_w = 0.0, 0.0
     sum_wv = tl.zeros([CHANNELS], tl.float32)
-    while (i0 < b) & (tl.exp(-before) >= stop):
+    while (i0 < b) & (tl.exp(-sum_tau) >= stop):
         i = i0 + tl.arange(0, BLOCK)
-        t, in_front = _thickness(tau, i, i0, b, before)
+        t, in_front = _thickness(tau, i, i0, b, sum_tau)
         transmittance = tl.exp(-in_front)
         w = tl.where(transmittance < stop, 0.0, transmittance * (1 - tl.exp(-t)))
         tl.store(weights + i, w, mask=i < b)
         v = tl.load(values + i[:, None] * C + c[None, :], mask=(i < b)[:, None] & (c < C)[None, :], other=0.0)
         sum_wv += tl.sum(w[:, None] * v, 0)
         sum_w += tl.sum(w, 0)
-        before += tl.sum(t, 0)
+        sum_tau += tl.sum(t, 0)
         i0 += BLOCK
     while i0 < b:  # out of sight
         i = i0 + tl.arange(0, BLOCK)
@@ -56,27 +56,27 @@ def _backward(grads, tau, values, ray_starts, outputs, d_tau, d_values, stop, C:
     g_opacity = tl.load(d_opacity + r)
 
     # sum of g_j w_j over the whole ray: two of its three parts are at hand
-    behind = tl.sum(g_total * tl.load(total + r * C + c, mask=c < C, other=0.0), 0) + g_opacity * tl.load(opacity + r)
+    sum_gw = tl.sum(g_total * tl.load(total + r * C + c, mask=c < C, other=0.0), 0) + g_opacity * tl.load(opacity + r)
     for i0 in range(a, b, BLOCK):
         i = i0 + tl.arange(0, BLOCK)
         g_w = tl.load(d_weights + i, mask=i < b, other=0.0) * tl.load(weights + i, mask=i < b, other=0.0)
-        behind += tl.sum(g_w, 0)
+        sum_gw += tl.sum(g_w, 0)
 
-    before = 0.0
+    sum_tau = 0.0
     for i0 in range(a, b, BLOCK):
         i = i0 + tl.arange(0, BLOCK)
-        t, in_front = _thickness(tau, i, i0, b, before)
+        t, in_front = _thickness(tau, i, i0, b, sum_tau)
         w = tl.load(weights + i, mask=i < b, other=0.0)
         table = i[:, None] * C + c[None, :]
         there = (i < b)[:, None] & (c < C)[None, :]
         v = tl.load(values + table, mask=there, other=0.0)
         tl.store(d_values + table, w[:, None] * g_total[None, :], mask=there)
         g = tl.sum(v * g_total[None, :], 1) + g_opacity + tl.load(d_weights + i, mask=i < b, other=0.0)
-        after = behind - tl.cumsum(g * w, 0)
+        gw_behind = sum_gw - tl.cumsum(g * w, 0)
         seen = tl.exp(-in_front) >= stop
-        tl.store(d_tau + i, tl.where(seen, g * tl.exp(-in_front - t) - after, 0.0), mask=i < b)
-        before += tl.sum(t, 0)
-        behind -= tl.sum(g * w, 0)
+        tl.store(d_tau + i, tl.where(seen, g * tl.exp(-in_front - t) - gw_behind, 0.0), mask=i < b)
+        sum_tau += tl.sum(t, 0)
+        sum_gw -= tl.sum(g * w, 0)
 
 
 def forward(ctx, tau, values, ray_starts, stop):

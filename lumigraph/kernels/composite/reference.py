@@ -10,8 +10,8 @@ def run(tau: Tensor, values: Tensor, ray_starts: Tensor, stop: float) -> tuple[T
     inside = torch.arange(longest, device=tau.device) < lengths[:, None]
 
     tau = tau.new_zeros(inside.shape).masked_scatter(inside, tau)
-    before = torch.nn.functional.pad(tau, (1, 0)).cumsum(1)[:, :-1]
-    transmittance = torch.exp(-before)
+    sum_tau = torch.nn.functional.pad(tau, (1, 0)).cumsum(1)[:, :-1]
+    transmittance = torch.exp(-sum_tau)
     weights = transmittance * -torch.expm1(-tau)
     weights = torch.where(transmittance < stop, 0, weights)[inside]
 

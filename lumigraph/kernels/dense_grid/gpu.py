@@ -13,9 +13,7 @@ BLOCK = tl.constexpr(64)
 
 @triton.jit
 def _along(x, box, axis: tl.constexpr, size):
-    """Along one axis: the corner at or below each point, the fraction towards the next, and whether the point is
-    inside.
-    """
+    """Along one axis: the corner at or below each point, the fraction to the next, and whether it is inside."""
     x = (x - tl.load(box + axis)) * tl.load(box + 3 + axis)
     inside = (x > 0.0) & (x < size - 1)
     x = tl.minimum(tl.maximum(x, 0.0), (size - 1).to(tl.float32))

@@ -10,9 +10,7 @@ THIRD = np.float32(1 / 3)
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _forward(weights, middles, lengths, starts, total):
-    """Losses. A sample's pairs with earlier ones sum to 2 w_i (m_i W - M), W and M the sums of w_j and w_j m_j over
-    j < i.
-    """
+    """Losses: pairs with earlier samples sum to 2 w_i (m_i W - M), W and M sums of w_j and w_j m_j over j < i."""
     for r in prange(len(starts) - 1):
         weight, moment, found = np.float32(0), np.float32(0), np.float32(0)
         for i in range(starts[r], starts[r + 1]):

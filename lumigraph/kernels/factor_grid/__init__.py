@@ -80,9 +80,7 @@ def factor_grid(
 
 
 def cases(generator: torch.Generator) -> Iterator[tuple]:
-    """Test inputs for all engines: both kinds, widths that are multiples of the lanes and others, borders and
-    beyond.
-    """
+    """Test inputs for all engines: both kinds, widths that lanes divide and others, borders and beyond."""
     kinds: tuple[Kind, Kind] = ("vm", "cp")
     for kind in kinds:
         for samples, nodes, components, summed in [

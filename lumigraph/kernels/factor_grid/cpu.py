@@ -36,9 +36,7 @@ def _on_line(table, at, width, f):
 
 @njit(inline="always")
 def _on_plane(table, at, down, width, f, g):
-    """Bilinear interpolation in a plane. down, width: strides of its first and second axis; f, g: fractions along
-    both
-    """
+    """Bilinear interpolation in a plane. down, width: strides of its axes; f, g: fractions along both"""
     return _on_line(table, at, width, g) * (ONE - f) + _on_line(table, at + down, width, g) * f
 
 

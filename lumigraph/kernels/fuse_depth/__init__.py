@@ -79,9 +79,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(height, width, side, most, generator):
-    """A wall, the blocks around it and others, half of the voxels already observed; without inputs that depend on
-    rounding.
-    """
+    """A wall, blocks around it and others, half of the voxels observed; no input depends on rounding."""
     pose, _ = hand_held(generator)
     lens = torch.tensor([width * 1.1 + 0.1, width * 1.2 + 0.1, width / 2 + 0.03, height / 2 - 0.07])
     depth, truncation = wall(height, width, generator), side / 2

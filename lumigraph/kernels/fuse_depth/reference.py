@@ -12,7 +12,7 @@ def offsets(like):
     return torch.cartesian_prod(axis, axis, axis).to(like)
 
 
-def seen(points, depth, rgb, trust, pose, lens, edge):
+def sample_maps(points, depth, rgb, trust, pose, lens, edge):
     """Interpolated depth, colour and trust in the direction of points, and a mask of known ones; see `fuse_depth`."""
     height, width = depth.shape
     q = (points - pose[:, 3]) @ pose[:, :3]
@@ -42,7 +42,7 @@ def seen(points, depth, rgb, trust, pose, lens, edge):
 def run(voxels, blocks, depth, rgb, trust, pose, lens, voxel, truncation, edge, max_weight):
     for number, block in enumerate(blocks):
         points = voxel * (SIDE * block.to(voxels) + offsets(voxels))
-        surface, colour, w, known = seen(points, depth, rgb, trust, pose, lens, edge)
+        surface, colour, w, known = sample_maps(points, depth, rgb, trust, pose, lens, edge)
         d = (surface - (points - pose[:, 3]).norm(dim=-1)) / truncation
         changed = known & (d >= -1) & (w > 0)
         distance, weight, own = voxels[number, :, 0], voxels[number, :, 1], voxels[number, :, 2:]

@@ -102,8 +102,7 @@ def cases(generator: torch.Generator):
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
     """Samples as in a training step: runs of 32 through the unit cube, two of Instant-NGP's steps (sqrt(3) / 1024)
-    apart. Points get no gradient there.
-    """
+    apart. Points get no gradient there."""
     levels = HashLevels(levels=16, features=2, log2_entries=17)
     start = 0.2 + 0.6 * torch.rand(size // 32, 1, 3, generator=generator)
     direction = torch.nn.functional.normalize(torch.randn(size // 32, 1, 3, generator=generator), dim=-1)
@@ -113,9 +112,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 
 def _inputs(samples: int, levels: HashLevels, generator: torch.Generator):
-    """Random points and table. Points are multiples of 2^-12, so that N_l p is exact and cells do not depend on
-    rounding.
-    """
+    """Random points and table. Points are multiples of 2^-12, so that cells do not depend on rounding."""
     points = torch.randint(-(2**9), 2**12 + 2**9, (samples, 3), generator=generator) / 2**12
     table = 2 * torch.rand(levels.offsets[-1], levels.features, generator=generator) - 1
     return points, table, levels

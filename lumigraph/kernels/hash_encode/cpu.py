@@ -192,9 +192,7 @@ def _point_gradient(grad, points, table, resolutions, offsets, masks, out):
 
 @cache
 def _grid(levels):
-    """Resolution, first entry and hash mask (0: dense) of each level, and a tuple with a number for each feature of
-    an entry.
-    """
+    """Resolution, first entry and hash mask (0: dense) of each level, and a tuple as long as an entry."""
     resolutions = np.array(levels.resolutions)
     dense = (resolutions + 1) ** 3 <= 2**levels.log2_entries
     masks = np.where(dense, 0, 2**levels.log2_entries - 1).astype(np.uint32)

@@ -175,8 +175,7 @@ _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 def _clearance(occupied):
     """Clearance (cascade, x, y, z) of each block of cells: distance in blocks to the nearest occupied one; 0 in
-    occupied blocks. Rays skip that far. Computed once for each state of a grid.
-    """
+    occupied blocks. Rays skip that far. Computed once for each state of a grid."""
     version, clear = _known.get(occupied, (None, None))
     if version != occupied._version:
         cascades, n = occupied.shape[:2]

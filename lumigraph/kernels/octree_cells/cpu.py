@@ -108,9 +108,7 @@ def outside(u, v, w, side):
 
 @njit(inline="always")
 def shared(level, depth, differing):
-    """Level, at most this one, of the deepest common ancestor of two cells. differing: bits in which coordinates
-    differ
-    """
+    """Level, at most this one, of two cells' deepest common ancestor. differing: bits in which they differ"""
     while differing >> (depth - level):
         level -= 1
     return level

@@ -1,5 +1,4 @@
-"""Triton: one lane takes one ray, and descends from the root to each of its cells. The first pass counts them, the
-second writes them."""
+"""Triton: one lane takes one ray, and descends from the root to each cell; a pass counts, another writes."""
 
 import math
 
@@ -24,9 +23,7 @@ def cell_at(x, low, high, side):
 
 @triton.jit
 def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
-    """Rays (origins, directions, inverse directions), entry distances, a mask of rays that meet the cube, and entry
-    cells.
-    """
+    """Rays (origins, directions, inverse directions), entry distances, a mask of hits, and entry cells."""
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     ix = 1.0 / tl.where(tl.abs(dx) < MIN_SPEED, MIN_SPEED, dx)

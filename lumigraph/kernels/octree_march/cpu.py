@@ -34,14 +34,16 @@ def _colour(harmonics, row, y):
 
 
 @njit(inline="always")
-def _shown(met, weights, count, harmonics, y, asked):
+def _sum_colours(chunk_rows, weights, count, harmonics, y, prefetched):
     """Weighted sums of cells' colours. All rows are prefetched first, so that memory latencies overlap."""
     last = harmonics.shape[1] - 1
     for i in range(count):
-        asked[0] += harmonics[met[i], 0, 0] + harmonics[met[i], last // 2, 0] + harmonics[met[i], last, 2]
+        prefetched[0] += (
+            harmonics[chunk_rows[i], 0, 0] + harmonics[chunk_rows[i], last // 2, 0] + harmonics[chunk_rows[i], last, 2]
+        )
     red = green = blue = ZERO
     for i in range(count):
-        r_, g_, b_ = _colour(harmonics, met[i], y)
+        r_, g_, b_ = _colour(harmonics, chunk_rows[i], y)
         red += weights[i] * r_
         green += weights[i] * g_
         blue += weights[i] * b_
@@ -55,13 +57,13 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
     for i in prange(len(chunks)):
         chunk = chunks[i]
         path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
-        met, weights = np.zeros(CELLS_PER_CHUNK, np.int64), np.zeros(CELLS_PER_CHUNK, np.float32)
-        asked = np.zeros(1, np.float32)  # a sum that nobody needs, or compilers would leave it out
+        chunk_rows, weights = np.zeros(CELLS_PER_CHUNK, np.int64), np.zeros(CELLS_PER_CHUNK, np.float32)
+        prefetched = np.zeros(1, np.float32)  # a sum that nobody needs, or compilers would leave it out
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             ray = in_cells(o, d, r, across)
             t, far = through_cube(ray, across, near)
-            red = green = blue = way = spent = ZERO
-            through, count, level, waiting = ONE, np.int64(0), np.int64(0), 0
+            red = green = blue = sum_wt = sum_w = ZERO
+            transmittance, count, level, chunk_count = ONE, np.int64(0), np.int64(0), 0
             if t < far:
                 basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
                 u, v, w = place_at(ray, t, side)
@@ -69,25 +71,25 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
                     row, level, end, u2, v2, w2 = cross(cells, named, path, level, depth, u, v, w, ray, t)
                     if row >= 0:
                         count += 1
-                        keep = np.exp(-density[row] * (end - t))
-                        weight = through * (ONE - keep)
-                        through *= keep
-                        way += weight * HALF * (t + end)
-                        spent += weight
-                        met[waiting], weights[waiting] = row, weight
-                        waiting += weight > ZERO
-                        if waiting == CELLS_PER_CHUNK:
-                            r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
-                            red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
-                    if outside(u2, v2, w2, side) or through < stop:
+                        exp_tau = np.exp(-density[row] * (end - t))
+                        weight = transmittance * (ONE - exp_tau)
+                        transmittance *= exp_tau
+                        sum_wt += weight * HALF * (t + end)
+                        sum_w += weight
+                        chunk_rows[chunk_count], weights[chunk_count] = row, weight
+                        chunk_count += weight > ZERO
+                        if chunk_count == CELLS_PER_CHUNK:
+                            r_, g_, b_ = _sum_colours(chunk_rows, weights, chunk_count, harmonics, y, prefetched)
+                            red, green, blue, chunk_count = red + r_, green + g_, blue + b_, 0
+                    if outside(u2, v2, w2, side) or transmittance < stop:
                         break
                     level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
                     u, v, w, t = u2, v2, w2, end
-                if waiting:
-                    r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
+                if chunk_count:
+                    r_, g_, b_ = _sum_colours(chunk_rows, weights, chunk_count, harmonics, y, prefetched)
                     red, green, blue = red + r_, green + g_, blue + b_
             rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue
-            distance[r], opacity[r], counts[r] = way, spent, count
+            distance[r], opacity[r], counts[r] = sum_wt, sum_w, count
 
 
 @njit(parallel=True, fastmath=True, **FAST)
@@ -111,26 +113,26 @@ def _share(
             t, _ = through_cube(ray, across, near)
             y = bases[r]
             basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
-            behind = g_distance[r] * distance[r] + g_opacity[r] * opacity[r]
+            sum_gw = g_distance[r] * distance[r] + g_opacity[r] * opacity[r]
             for c in range(3):
-                behind += g_rgb[r, c] * rgb[r, c]
-            through, i, level = ONE, starts[r], np.int64(0)
+                sum_gw += g_rgb[r, c] * rgb[r, c]
+            transmittance, i, level = ONE, starts[r], np.int64(0)
             u, v, w = place_at(ray, t, side)
             while True:
                 row, level, end, u2, v2, w2 = cross(cells, named, path, level, depth, u, v, w, ray, t)
                 if row >= 0:
                     length = end - t
-                    keep = np.exp(-density[row] * length)
-                    weight = through * (ONE - keep)
-                    through *= keep
-                    worth = g_opacity[r] + g_distance[r] * HALF * (t + end)
+                    exp_tau = np.exp(-density[row] * length)
+                    weight = transmittance * (ONE - exp_tau)
+                    transmittance *= exp_tau
+                    g = g_opacity[r] + g_distance[r] * HALF * (t + end)
                     colours = _colour(harmonics, row, y)
                     for c in range(3):
                         colour = colours[c]
-                        worth += g_rgb[r, c] * colour
+                        g += g_rgb[r, c] * colour
                         shares[i, 1 + c] = weight * g_rgb[r, c] * colour * (ONE - colour)
-                    behind -= worth * weight
-                    shares[i, 0] = (worth * through - behind) * length
+                    sum_gw -= g * weight
+                    shares[i, 0] = (g * transmittance - sum_gw) * length
                     rows[i], rays[i] = row, r
                     i += 1
                     if i == starts[r + 1]:

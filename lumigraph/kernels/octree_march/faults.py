@@ -1,12 +1,12 @@
 """Faults that tests seed, by name: engine, function, code, replacement. ASTRAY: out-of-bounds accesses."""
 
 FAULTS = {
-    "attenuation forgotten": ("cpu", "_share", "worth * through - behind", "worth * through"),
+    "attenuation forgotten": ("cpu", "_share", "g * transmittance - sum_gw", "g * transmittance"),
     "slope of the sigmoid forgotten": ("cpu", "_share", "* colour * (ONE - colour)", ""),
-    "length forgotten": ("cpu", "_share", "- behind) * length", "- behind)"),
+    "length forgotten": ("cpu", "_share", "- sum_gw) * length", "- sum_gw)"),
     "another ray's direction": ("cpu", "_sum", "bases[r, k]", "bases[0, k]"),
-    "sign": ("gpu", "_backward", "through - behind", "through + behind"),
-    "opacity forgotten": ("gpu", "_backward", "worth = g_opacity +", "worth ="),
+    "sign": ("gpu", "_backward", "transmittance - sum_gw", "transmittance + sum_gw"),
+    "opacity forgotten": ("gpu", "_backward", "g = g_opacity +", "g ="),
     "coefficient of the next": ("gpu", "_backward", "row * (3 * BASIS) + 3 * k", "row * (3 * BASIS) + k"),
     "distance to the far side": ("gpu", "_forward", "0.5 * (t + end)", "end"),
 }

@@ -13,16 +13,16 @@ BLOCK = tl.constexpr(32)  # rays
 
 
 @triton.jit
-def _colour(harmonics, row, held, direction, BASIS: tl.constexpr):
+def _colour(harmonics, row, occupied, direction, BASIS: tl.constexpr):
     """Colours of cells along directions."""
     x, y, z = direction
     red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(BASIS):
         basis = harmonic(k, x, y, z)
         at = harmonics + row * (3 * BASIS) + 3 * k
-        red += basis * tl.load(at, mask=held, other=0.0)
-        green += basis * tl.load(at + 1, mask=held, other=0.0)
-        blue += basis * tl.load(at + 2, mask=held, other=0.0)
+        red += basis * tl.load(at, mask=occupied, other=0.0)
+        green += basis * tl.load(at + 1, mask=occupied, other=0.0)
+        blue += basis * tl.load(at + 2, mask=occupied, other=0.0)
     return tl.sigmoid(red), tl.sigmoid(green), tl.sigmoid(blue)
 
 
@@ -36,28 +36,28 @@ def _forward(rays, cells, named, density, harmonics, outputs, R, near, stop, DEP
     red = tl.zeros([BLOCK], tl.float32)
     green = tl.zeros([BLOCK], tl.float32)
     blue = tl.zeros([BLOCK], tl.float32)
-    way = tl.zeros([BLOCK], tl.float32)
-    spent = tl.zeros([BLOCK], tl.float32)
-    through = tl.zeros([BLOCK], tl.float32) + 1.0
+    sum_wt = tl.zeros([BLOCK], tl.float32)
+    sum_w = tl.zeros([BLOCK], tl.float32)
+    transmittance = tl.zeros([BLOCK], tl.float32) + 1.0
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
         end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going).to(tl.int64)
-        held = row >= 0
-        keep = tl.exp(-tl.load(density + row, mask=held, other=0.0) * tl.where(held, end - t, 0.0))
-        weight = through * (1 - keep)
-        through *= keep
-        r_, g_, b_ = _colour(harmonics, row, held, ray[1], BASIS)
+        occupied = row >= 0
+        exp_tau = tl.exp(-tl.load(density + row, mask=occupied, other=0.0) * tl.where(occupied, end - t, 0.0))
+        weight = transmittance * (1 - exp_tau)
+        transmittance *= exp_tau
+        r_, g_, b_ = _colour(harmonics, row, occupied, ray[1], BASIS)
         red += weight * r_
         green += weight * g_
         blue += weight * b_
-        way += weight * tl.where(held, 0.5 * (t + end), 0.0)
-        spent += weight
-        going = going & inside(u, v, w, DEPTH) & (through >= stop)
+        sum_wt += weight * tl.where(occupied, 0.5 * (t + end), 0.0)
+        sum_w += weight
+        going = going & inside(u, v, w, DEPTH) & (transmittance >= stop)
         x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
     store_row(rgb, r, (red, green, blue), here)
-    tl.store(distance + r, way, mask=here)
-    tl.store(opacity + r, spent, mask=here)
+    tl.store(distance + r, sum_wt, mask=here)
+    tl.store(opacity + r, sum_w, mask=here)
 
 
 @triton.jit(do_not_specialize=["R", "near", "stop"])
@@ -88,36 +88,36 @@ def _backward(
     g_red, g_green, g_blue = load_row(d_rgb, r, here)
     g_distance = tl.load(d_distance + r, mask=here, other=0.0)
     g_opacity = tl.load(d_opacity + r, mask=here, other=0.0)
-    behind = g_distance * tl.load(distance + r, mask=here, other=0.0)
-    behind += g_opacity * tl.load(opacity + r, mask=here, other=0.0)
-    behind += g_red * tl.load(rgb + 3 * r, mask=here, other=0.0)
-    behind += g_green * tl.load(rgb + 3 * r + 1, mask=here, other=0.0)
-    behind += g_blue * tl.load(rgb + 3 * r + 2, mask=here, other=0.0)
-    through = tl.zeros([BLOCK], tl.float32) + 1.0
+    sum_gw = g_distance * tl.load(distance + r, mask=here, other=0.0)
+    sum_gw += g_opacity * tl.load(opacity + r, mask=here, other=0.0)
+    sum_gw += g_red * tl.load(rgb + 3 * r, mask=here, other=0.0)
+    sum_gw += g_green * tl.load(rgb + 3 * r + 1, mask=here, other=0.0)
+    sum_gw += g_blue * tl.load(rgb + 3 * r + 2, mask=here, other=0.0)
+    transmittance = tl.zeros([BLOCK], tl.float32) + 1.0
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
         end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going).to(tl.int64)
-        held = row >= 0
-        length = tl.where(held, end - t, 0.0)
-        keep = tl.exp(-tl.load(density + row, mask=held, other=0.0) * length)
-        weight = through * (1 - keep)
-        through *= keep
-        red, green, blue = _colour(harmonics, row, held, ray[1], BASIS)
-        worth = g_opacity + g_distance * (0.5 * (t + end)) + g_red * red + g_green * green + g_blue * blue
-        behind -= tl.where(held, worth * weight, 0.0)
-        slope = (worth * through - behind) * length
-        tl.atomic_add(to_density + row, slope, mask=held, sem="relaxed")
+        occupied = row >= 0
+        length = tl.where(occupied, end - t, 0.0)
+        exp_tau = tl.exp(-tl.load(density + row, mask=occupied, other=0.0) * length)
+        weight = transmittance * (1 - exp_tau)
+        transmittance *= exp_tau
+        red, green, blue = _colour(harmonics, row, occupied, ray[1], BASIS)
+        g = g_opacity + g_distance * (0.5 * (t + end)) + g_red * red + g_green * green + g_blue * blue
+        sum_gw -= tl.where(occupied, g * weight, 0.0)
+        slope = (g * transmittance - sum_gw) * length
+        tl.atomic_add(to_density + row, slope, mask=occupied, sem="relaxed")
         g_r = weight * g_red * red * (1 - red)
         g_g = weight * g_green * green * (1 - green)
         g_b = weight * g_blue * blue * (1 - blue)
         for k in tl.static_range(BASIS):
             basis = harmonic(k, dx, dy, dz)
             at = to_harmonics + row * (3 * BASIS) + 3 * k
-            tl.atomic_add(at, basis * g_r, mask=held, sem="relaxed")
-            tl.atomic_add(at + 1, basis * g_g, mask=held, sem="relaxed")
-            tl.atomic_add(at + 2, basis * g_b, mask=held, sem="relaxed")
-        going = going & inside(u, v, w, DEPTH) & (through >= stop)
+            tl.atomic_add(at, basis * g_r, mask=occupied, sem="relaxed")
+            tl.atomic_add(at + 1, basis * g_g, mask=occupied, sem="relaxed")
+            tl.atomic_add(at + 2, basis * g_b, mask=occupied, sem="relaxed")
+        going = going & inside(u, v, w, DEPTH) & (transmittance >= stop)
         x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
 
 

@@ -1,5 +1,4 @@
-"""Numba. A task takes a run of pixels. A pixel's window is weighted once, then compared with each neighbour for each
-plane."""
+"""Numba. A task takes a run of pixels. A window is weighted once, then compared for each neighbour and plane."""
 
 import numpy as np
 from numba import njit, prange

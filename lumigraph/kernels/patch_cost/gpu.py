@@ -29,7 +29,7 @@ def _between(picture, row, column, down, right, rows, columns, here):
 
 
 @triton.jit
-def _seen(warp, row, x, y, h, here):
+def _warp_coordinate(warp, row, x, y, h, here):
     """One homogeneous coordinate of the warp of (x, y) at inverse depth h; each pixel has its own warp."""
     at = warp + 4 * row
     along = tl.load(at, mask=here, other=0.0) * x + tl.load(at + 1, mask=here, other=0.0) * y
@@ -71,11 +71,11 @@ def _costs(
         whole += w
         x, y = at_x.to(tl.float32) + 0.5, at_y.to(tl.float32) + 0.5
         inverse_depth = h + across * dx.to(tl.float32) + down * dy.to(tl.float32)
-        s = _seen(warp, 2, x, y, inverse_depth, here)
+        s = _warp_coordinate(warp, 2, x, y, inverse_depth, here)
         before = s > MIN_DEPTH
         inverse = 1 / tl.where(before, s, 1.0)
-        u = _seen(warp, 0, x, y, inverse_depth, here) * inverse - 0.5
-        v = _seen(warp, 1, x, y, inverse_depth, here) * inverse - 0.5
+        u = _warp_coordinate(warp, 0, x, y, inverse_depth, here) * inverse - 0.5
+        v = _warp_coordinate(warp, 1, x, y, inverse_depth, here) * inverse - 0.5
         u = tl.minimum(tl.maximum(u, -1.0), columns.to(tl.float32))
         v = tl.minimum(tl.maximum(v, -1.0), rows.to(tl.float32))
         left, top = tl.floor(u), tl.floor(v)

@@ -273,9 +273,9 @@ def _backward(
     )
     for part in prange(PARTS):
         some, given = np.zeros(TAKEN * LANES, np.float32), np.zeros(MADE * LANES, np.float32)
-        Y, worth = np.empty(16 * LANES, np.float32), np.empty(16 * LANES, np.float32)
+        Y, g_Y = np.empty(16 * LANES, np.float32), np.empty(16 * LANES, np.float32)
         rows, which, count = np.zeros(MAX_NUMBERS * LANES, np.float32), np.empty(LANES, np.int64), 0
-        scratch = some, given, Y, worth, rows
+        scratch = some, given, Y, g_Y, rows
         end = len(means) * (part + 1) // PARTS
         for i in range(len(means) * part // PARTS, end):
             if seen[i] > 0:
@@ -294,7 +294,7 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
     g_centres, g_conics, g_depths, g_colours, g_seen = grads
     means, quaternions, scales, opacities, harmonics = inputs
     to_means, to_quaternions, to_scales, to_opacities, to_harmonics = results
-    some, given, Y, worth, rows = scratch
+    some, given, Y, g_Y, rows = scratch
     numbers = 3 * bands * bands
     for lane in range(count):
         i = which[lane]
@@ -378,13 +378,13 @@ def _pull(which, count, grads, inputs, v, bands, blur, compensate, colours, resu
     _turn_all(rows, numbers)
     for n in range(bands * bands):
         h = fetch(rows, _row_of(3 * n)), fetch(rows, _row_of(3 * n + 1)), fetch(rows, _row_of(3 * n + 2))
-        put(worth, LANES * n, red * h[0] + green * h[1] + blue * h[2])
+        put(g_Y, LANES * n, red * h[0] + green * h[1] + blue * h[2])
         value = fetch(Y, LANES * n)
         put(rows, _row_of(3 * n), value * red)
         put(rows, _row_of(3 * n + 1), value * green)
         put(rows, _row_of(3 * n + 2), value * blue)
     _turn_all(rows, numbers)
-    tx, ty, tz = slope(dx, dy, dz, bands, worth)
+    tx, ty, tz = slope(dx, dy, dz, bands, g_Y)
     inward = tx * dx + ty * dy + tz * dz
     put(some, LANES * MEAN, to_mean[0] + (tx - dx * inward) / distance)
     put(some, LANES * (MEAN + 1), to_mean[1] + (ty - dy * inward) / distance)

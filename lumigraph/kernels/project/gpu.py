@@ -153,7 +153,7 @@ def _bend_backward(x, y, d_xx, d_xy, d_yy, view):
 
 
 @triton.jit
-def _held(X, low):
+def _clamp_coordinate(X, low):
     """Clamp a coordinate of the plane z = 1 to the view's limits."""
     return tl.minimum(tl.maximum(X, tl.load(low)), tl.load(low + 1))
 
@@ -162,7 +162,7 @@ def _held(X, low):
 def _lens(X, Y, z, view):
     """u, the lens Jacobian S in pixels by rows, and J = S O."""
     fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
-    x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
+    x, y = _clamp_coordinate(X, view + LIMITS), _clamp_coordinate(Y, view + LIMITS + 2)
     bent_x, bent_y, xx, xy, yy = _bend(x, y, view)
     ux = fx * (bent_x + xx * (X - x) + xy * (Y - y)) + tl.load(view + CENTRE)
     uy = fy * (bent_y + xy * (X - x) + yy * (Y - y)) + tl.load(view + CENTRE + 1)
@@ -176,7 +176,7 @@ def _lens(X, Y, z, view):
 def _lens_backward(X, Y, z, S, J, d_u, d_J, view):
     """Gradient of p = z (X, Y, 1)."""
     fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
-    x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
+    x, y = _clamp_coordinate(X, view + LIMITS), _clamp_coordinate(Y, view + LIMITS + 2)
     d_xx = fx * ((d_J[0][0] - x * d_J[0][2]) / z + d_u[0] * (X - x))
     d_xy = fx * ((d_J[0][1] - y * d_J[0][2]) / z + d_u[0] * (Y - y))
     d_xy += fy * ((d_J[1][0] - x * d_J[1][2]) / z + d_u[1] * (X - x))

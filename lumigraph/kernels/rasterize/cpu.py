@@ -107,8 +107,8 @@ def _bell(rows, i, frame, table, block):
 
 
 @njit(inline="always")
-def _alpha(exponent, light, stop):
-    return where((exponent >= MIN_EXPONENT) & (light >= stop), lowest(exp2(exponent), MAX_ALPHA), ZERO)
+def _alpha(exponent, transmittance, stop):
+    return where((exponent >= MIN_EXPONENT) & (transmittance >= stop), lowest(exp2(exponent), MAX_ALPHA), ZERO)
 
 
 @njit(inline="always")
@@ -159,14 +159,14 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
                     todo &= todo - np.uint64(1)
                     at = block * (5 * LANES)
                     _, _, exponent = _bell(rows, i, frame, table, block)
-                    light = fetch(state, at)
-                    weight = _alpha(exponent, light, stop) * light
-                    light = light - weight
-                    put(state, at, light)
+                    transmittance = fetch(state, at)
+                    weight = _alpha(exponent, transmittance, stop) * transmittance
+                    transmittance = transmittance - weight
+                    put(state, at, transmittance)
                     for c in range(4):
                         to = at + (c + 1) * LANES
                         put(state, to, fetch(state, to) + weight * rows[i + RED + c])
-                    if not some(light >= stop):
+                    if not some(transmittance >= stop):
                         alive &= ~(np.uint64(1) << np.uint64(block))
                     visited += 1
             visits[k] = visited
@@ -200,11 +200,11 @@ def _backward(
                 for x in range(min(side, width - left)):
                     at = _place(x, y, 7)
                     py, px = top + y, left + x
-                    behind = to_depth[py, px] * depth[py, px] + to_opacity[py, px] * opacity[py, px]
+                    sum_gw = to_depth[py, px] * depth[py, px] + to_opacity[py, px] * opacity[py, px]
                     for c in range(3):
-                        behind += to_rgb[py, px, c] * rgb[py, px, c]
+                        sum_gw += to_rgb[py, px, c] * rgb[py, px, c]
                         state[at + (c + 2) * LANES] = to_rgb[py, px, c]
-                    state[at], state[at + LANES] = 1, behind
+                    state[at], state[at + LANES] = 1, sum_gw
                     state[at + 5 * LANES], state[at + 6 * LANES] = to_depth[py, px], to_opacity[py, px]
             for p in range(starts[k], starts[k + 1]):
                 todo = masks[p]
@@ -219,17 +219,17 @@ def _backward(
                     todo &= todo - np.uint64(1)
                     at = block * (7 * LANES)
                     u, v, exponent = _bell(rows, i, frame, table, block)
-                    light = fetch(state, at)
-                    alpha = _alpha(exponent, light, stop)
-                    weight = alpha * light
-                    put(state, at, light - weight)
+                    transmittance = fetch(state, at)
+                    alpha = _alpha(exponent, transmittance, stop)
+                    weight = alpha * transmittance
+                    put(state, at, transmittance - weight)
                     r, g = fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES)
                     b, d = fetch(state, at + 4 * LANES), fetch(state, at + 5 * LANES)
-                    worth = fetch(state, at + 6 * LANES) + r * rows[i + RED] + g * rows[i + GREEN]
-                    worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
-                    behind = fetch(state, at + LANES) - worth
-                    put(state, at + LANES, behind)
-                    slope = worth - alpha * behind / (ONE - alpha)
+                    gw = fetch(state, at + 6 * LANES) + r * rows[i + RED] + g * rows[i + GREEN]
+                    gw = (gw + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
+                    sum_gw = fetch(state, at + LANES) - gw
+                    put(state, at + LANES, sum_gw)
+                    slope = gw - alpha * sum_gw / (ONE - alpha)
                     slope = where(alpha < MAX_ALPHA, slope, ZERO)
                     gu, gv = slope * u, slope * v
                     s, su, sv = s + slope, su + gu, sv + gv

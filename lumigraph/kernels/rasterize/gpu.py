@@ -56,15 +56,15 @@ def _steady(conic):
 
 
 @triton.jit
-def _light(dx, dy, conic, opacity, through, stop):
+def _light(dx, dy, conic, opacity, transmittance, stop):
     """Gaussian by pixel: opacity before and after thresholds, transmittance T before and behind each, and weight w."""
     a, tilt, rest = _steady(conic)
     t = tl.fma(tilt[:, None], dy, dx)
     raw = opacity[:, None] * tl.exp(-0.5 * (a[:, None] * t * t + rest[:, None] * dy * dy))
     alpha = tl.where(raw < MIN_ALPHA, 0.0, tl.minimum(raw, MAX_ALPHA))
-    behind = through[None, :] * tl.cumprod(1 - alpha, 0)
-    before = behind / (1 - alpha)
-    return raw, alpha, before, behind, tl.where(before < stop, 0.0, alpha * before)
+    T_next = transmittance[None, :] * tl.cumprod(1 - alpha, 0)
+    T = T_next / (1 - alpha)
+    return raw, alpha, T, T_next, tl.where(T < stop, 0.0, alpha * T)
 
 
 @triton.jit
@@ -80,20 +80,20 @@ def _forward(gaussians, order, starts, outputs, width, height, stop, SIDE: tl.co
     picture, depth, weight = outputs
     k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
     first, last = tl.load(starts + k), tl.load(starts + k + 1)
-    through = tl.where(inside, 1.0, 0.0)
-    red, green, blue = tl.zeros_like(through), tl.zeros_like(through), tl.zeros_like(through)
-    sum_depth, sum_w = tl.zeros_like(through), tl.zeros_like(through)
-    while (first < last) & (tl.max(through, 0) >= stop):
+    transmittance = tl.where(inside, 1.0, 0.0)
+    red, green, blue = tl.zeros_like(transmittance), tl.zeros_like(transmittance), tl.zeros_like(transmittance)
+    sum_depth, sum_w = tl.zeros_like(transmittance), tl.zeros_like(transmittance)
+    while (first < last) & (tl.max(transmittance, 0) >= stop):
         i = first + tl.arange(0, GAUSSIANS)
         _, centre, conic, opacity, v = _gaussians(i, i < last, order, gaussians)
         dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
-        _, _, _, behind, w = _light(dx, dy, conic, opacity, through, stop)
+        _, _, _, T_next, w = _light(dx, dy, conic, opacity, transmittance, stop)
         red += tl.sum(w * v[0][:, None], 0)
         green += tl.sum(w * v[1][:, None], 0)
         blue += tl.sum(w * v[2][:, None], 0)
         sum_depth += tl.sum(w * v[3][:, None], 0)
         sum_w += tl.sum(w, 0)
-        through = tl.min(behind, 0)  # it only ever grows darker
+        transmittance = tl.min(T_next, 0)  # it only ever grows darker
         first += GAUSSIANS
     store_row(picture, at, (red, green, blue), inside)
     tl.store(depth + at, sum_depth, mask=inside)
@@ -113,21 +113,21 @@ def _backward(
     d_centres, d_conics, d_opacities, d_colours, d_depths = found
     k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
     first, last = tl.load(starts + k), tl.load(starts + k + 1)
-    through = tl.where(inside, 1.0, 0.0)
+    transmittance = tl.where(inside, 1.0, 0.0)
     g = _of_pixel(grads, at, inside)
     seen = _of_pixel(outputs, at, inside)
     rest = g[0] * seen[0] + g[1] * seen[1] + g[2] * seen[2] + g[3] * seen[3] + g[4] * seen[4]  # sum of w_j g_j to come
-    while (first < last) & (tl.max(through, 0) >= stop):
+    while (first < last) & (tl.max(transmittance, 0) >= stop):
         i = first + tl.arange(0, GAUSSIANS)
         here = i < last
         n, centre, conic, opacity, v = _gaussians(i, here, order, gaussians)
         dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
-        raw, alpha, before, behind, w = _light(dx, dy, conic, opacity, through, stop)
-        worth = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
-        worth += v[3][:, None] * g[3][None, :] + g[4][None, :]
-        after = rest[None, :] - tl.cumsum(w * worth, 0)
-        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (before >= stop)
-        d_power = tl.where(moves, raw * (before * worth - after / (1 - alpha)), 0.0)
+        raw, alpha, T, T_next, w = _light(dx, dy, conic, opacity, transmittance, stop)
+        g_w = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
+        g_w += v[3][:, None] * g[3][None, :] + g[4][None, :]
+        gw_behind = rest[None, :] - tl.cumsum(w * g_w, 0)
+        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (T >= stop)
+        d_power = tl.where(moves, raw * (T * g_w - gw_behind / (1 - alpha)), 0.0)
         _add(d_colours, 3 * n, tl.sum(w * g[0][None, :], 1), here)
         _add(d_colours, 3 * n + 1, tl.sum(w * g[1][None, :], 1), here)
         _add(d_colours, 3 * n + 2, tl.sum(w * g[2][None, :], 1), here)
@@ -139,8 +139,8 @@ def _backward(
         _add(d_conics, 3 * n, -0.5 * tl.sum(d_power * dx * dx, 1), here)
         _add(d_conics, 3 * n + 1, -tl.sum(d_power * dx * dy, 1), here)
         _add(d_conics, 3 * n + 2, -0.5 * tl.sum(d_power * dy * dy, 1), here)
-        rest -= tl.sum(w * worth, 0)
-        through = tl.min(behind, 0)
+        rest -= tl.sum(w * g_w, 0)
+        transmittance = tl.min(T_next, 0)
         first += GAUSSIANS
 
 

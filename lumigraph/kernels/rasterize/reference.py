@@ -15,9 +15,9 @@ def run(
     width, height = tiles.size
     values = torch.cat([colours, depths[:, None], torch.ones_like(depths)[:, None]], -1)
     parts, places = [centres.new_zeros(0, 5)], [torch.zeros(0, dtype=torch.int64, device=centres.device)]
-    for numbers, pixels, raw, before in light(centres, conics, opacities, tiles, stop):
+    for numbers, pixels, raw, T in light(centres, conics, opacities, tiles, stop):
         alpha = torch.where(raw < MIN_ALPHA, 0, raw.clamp(max=MAX_ALPHA))
-        weights = torch.where(before < stop, 0, alpha * before)
+        weights = torch.where(T < stop, 0, alpha * T)
         parts.append(weights @ values[numbers])
         places.append(pixels[:, 1] * width + pixels[:, 0])
     seen = centres.new_zeros(height * width, 5).index_copy(0, torch.cat(places), torch.cat(parts))
@@ -39,5 +39,5 @@ def light(
         (dx, dy), (a, b, c) = d.unbind(-1), conics[numbers].unbind(-1)
         raw = opacities[numbers] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
         alpha = torch.where(raw < MIN_ALPHA, 0, raw.clamp(max=MAX_ALPHA))
-        before = torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0).cumprod(1)[:, :-1]
-        yield numbers, pixels, raw, before
+        T = torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0).cumprod(1)[:, :-1]
+        yield numbers, pixels, raw, T

@@ -1,5 +1,4 @@
-"""Numba: one thread takes a block of rays. All bins of a ray go through each stage together, so that the compiler
-vectorises it."""
+"""Numba: one thread takes a block of rays. All bins of a ray go through each stage together, vectorised."""
 
 import numpy as np
 from numba import njit, prange
@@ -78,8 +77,7 @@ def _look_up(edges, origin, direction, values, size, frustum, found, length):
 @njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
 def _sample(bins, origins, directions, near, far, values, size, frustum, limits, edges):
     """Edges of rays. frustum: scale of x, of y, near plane, and the factor of |det J|^(1/3); empty for a contraction
-    limits: numbers of the Resampling, from max_log_density on
-    """
+    limits: numbers of the Resampling, from max_log_density on"""
     one, forward, count = np.float32(1), len(frustum) > 0, edges.shape[1] - 1
     max_log_density, sharpness, uniform_share, min_weight = limits[0], limits[1], limits[2], limits[3]
     for part in prange(-(-len(origins) // BLOCK)):

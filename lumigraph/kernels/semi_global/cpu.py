@@ -14,8 +14,7 @@ DIRECTIONS = 4  # of a sweep: along the row, and from the three nearest pixels o
 
 @njit(**FAST)
 def _advance(L, before, here, least, costs, at, total, count, slope, jump):
-    """Add L at a pixel to the total and return its minimum. Indices are unsigned, which saves the test for negative
-    ones."""
+    """Add L at a pixel to the total and return its minimum. Unsigned indices save the test for negative ones."""
     lowest, limit = NO_COST, np.uint8(least + jump)
     for k in range(count):
         beside = np.uint8(min(L[before + k - ONE], L[before + k + ONE]) + slope)

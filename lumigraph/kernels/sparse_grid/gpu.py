@@ -20,9 +20,7 @@ def _along(x, cells):
 
 @triton.jit
 def cell_of(points, i, here, X, Y, Z):
-    """Cell of each point in a grid of X Y Z nodes, fractional position within it, and the axes along which it is in
-    the cube.
-    """
+    """Cell of each point in a grid of X Y Z nodes, fractional position, and the axes along which it is inside."""
     x, y, z = load_row(points, i, here)
     cx, fx = _along(x, X)  # one pair a line: Triton 3.6 assigns to no nested tuple
     cy, fy = _along(y, Y)

@@ -16,9 +16,7 @@ HALF, ONE = np.float32(0.5), np.float32(1)
 
 @njit(**FAST)
 def _near_first(depths, opacities):
-    """Indices of the visible Gaussians by depth; equal depths keep their order. Bits of floats >= 0 sort as the
-    floats do.
-    """
+    """Indices of the visible Gaussians by depth; a stable sort of the floats' bits, valid for floats >= 0."""
     bits = depths.view(np.uint32)
     order = np.flatnonzero(opacities > MIN_ALPHA).astype(np.int32)
     other = np.empty_like(order)
@@ -37,8 +35,7 @@ def _near_first(depths, opacities):
 
 @njit(parallel=True, **FAST)
 def _measure(order, centres, conics, opacities, size, side, ellipses, rows):
-    """Ellipse parameters for `_span`, first and last row of tiles, and maximum number of columns of each Gaussian,
-    by depth."""
+    """Ellipse parameters for `_span`, first and last row of tiles, and most columns of each Gaussian, by depth."""
     down, across = (size[1] + side - 1) // side, (size[0] + side - 1) // side
     for k in prange(len(order)):
         i = order[k]

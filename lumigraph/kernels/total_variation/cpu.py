@@ -1,5 +1,4 @@
-"""Numba. Value and gradient are computed in one pass. Threads share slabs of the grid as in `sparse_grid`, so that no
-two add to one node."""
+"""Numba: value and gradient in one pass. Threads share slabs as in `sparse_grid`: no two add to one node."""
 
 import numpy as np
 import torch

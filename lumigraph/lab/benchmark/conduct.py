@@ -24,7 +24,7 @@ from ...evaluation.views import file_name
 from ...figures import Row as Line
 from ...figures import contact_sheet, save_picture
 from ...figures.charts import line_chart, standalone
-from ...files.locks import check_place, held
+from ...files.locks import check_place, lock_folder
 from ...metrics import scores_of
 from ...readers.pictures import readable
 from ...run import Run
@@ -91,7 +91,7 @@ def conduct(
     for cell in cells:
         claim_log(log_of(cell, output))
     claim(output, cells, settings)
-    with held(output, "worked in"):
+    with lock_folder(output, "worked in"):
         return carry_on(cells, settings, output, tell, launch)
 
 

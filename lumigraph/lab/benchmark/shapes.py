@@ -49,9 +49,7 @@ class Held:
 def measure(
     runs: Sequence[Path], members: int, points: int, cells: int, output: Path, tell: Callable[[str], object]
 ) -> None:
-    """Measure trained runs of shapes, and write the tables. members: largest number of held-out members of a
-    collection
-    """
+    """Measure trained runs of shapes, and write the tables. members: most held-out members of a collection"""
     held, completed = list[Held](), dict[str, list[Completed]]()
     together: dict[str, list[tuple[str, Method]]] = {}
     opened: dict[str, Shapes] = {}

@@ -298,8 +298,7 @@ def row_around(event: Any) -> StepRow | None:
 
 
 class Traffic(TorchDispatchMode):
-    """Markers, among the profiler's events, of each operation's bytes. For a kernel only inputs and outputs count, not
-    its workspace."""
+    """Markers of each operation's bytes among the profiler's events; of a kernel only inputs and outputs."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -21,8 +21,7 @@ MIN_EIGENVALUE = 1e-10  # eigenvalue that is drawn, as a share of the trace
 
 
 def write_page(folder: Path, comparison: EncodingComparison) -> None:
-    """Write index.html, which is self-contained; and separately scales.svg, spectrum.svg, comparison.png and
-    figures.json."""
+    """Write index.html, self-contained; and separately scales.svg, spectrum.svg, comparison.png, figures.json."""
     scales, spectrum, sheet = scale_chart(comparison), spectrum_chart(comparison), folder / "comparison.png"
     save_picture(sheet, comparison_sheet(comparison), "figure")
     write_bytes(folder / "scales.svg", standalone(scales), "figure")
@@ -74,7 +73,7 @@ def scale_chart(comparison: EncodingComparison) -> str:
 def spectrum_chart(comparison: EncodingComparison) -> str:
     """Eigenvalues in falling order, above rounding errors."""
     series = []
-    for fit in shown(comparison):
+    for fit in select_fits(comparison):
         values = [value for value in fit.eigenvalues.tolist() if value > MIN_EIGENVALUE]
         series.append(Series(fit.name, range(1, len(values) + 1), values))
     return line_chart(
@@ -84,7 +83,7 @@ def spectrum_chart(comparison: EncodingComparison) -> str:
 
 def comparison_sheet(comparison: EncodingComparison):
     """The picture and the networks' reconstructions: whole, and a magnified centre."""
-    fits = shown(comparison)
+    fits = select_fits(comparison)
     pictures = [comparison.picture, *(fit.rgb.clamp(0, 1) for fit in fits)]
     columns = ["picture", *(f"{fit.name} · {fit.held_out:.2f} dB" for fit in fits)]
     rows = [Row("whole", pictures), Row(f"the middle, {ENLARGEMENT} times larger", [middle(p) for p in pictures])]
@@ -93,7 +92,7 @@ def comparison_sheet(comparison: EncodingComparison):
     return contact_sheet(title, columns, rows, CELL)
 
 
-def shown(comparison: EncodingComparison) -> list[EncodingFit]:
+def select_fits(comparison: EncodingComparison) -> list[EncodingFit]:
     """Best fit of each encoding, and Gaussian ones of the smallest and the largest scale."""
     smallest, *_, largest = comparison.of("gaussian")
     *others, best = comparison.leading

@@ -22,8 +22,8 @@ from torch.nn.functional import softplus
 from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rays, Samples
-from ...components.fields.development import encoded
 from ...components.sampling.sampling import stratified
+from ...components.training.development import encoded
 from ...figures import Row, contact_sheet, save_picture
 from ...figures.charts import Series, line_chart, standalone
 from ...files import write_bytes, write_json
@@ -182,10 +182,10 @@ def fitted(
 
 def quality_of(seen: Sequence[Tensor], truth: Sequence[Tensor]) -> float:
     """Mean PSNR of sRGB-encoded pictures."""
-    return sum(psnr(shown(a), shown(b)) for a, b in zip(seen, truth, strict=True)) / len(seen)
+    return sum(psnr(encode_picture(a), encode_picture(b)) for a, b in zip(seen, truth, strict=True)) / len(seen)
 
 
-def shown(light: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+def encode_picture(light: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
     return encoded(light.clamp(0, 1))
 
 
@@ -197,9 +197,7 @@ def enlarged(picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "tall wi
 
 @torch.no_grad()
 def phase_of(field: GlowingGrid) -> list[float]:
-    """Colour at PHASE_PLACE in viewing directions at angles to the light's direction, averaged around it; its mean over
-    all is 1.
-    """
+    """Colour at PHASE_PLACE by angle between viewing and light direction, averaged around it; its mean is 1."""
     place, lamp = torch.tensor(PHASE_PLACE), torch.tensor([fog.LAMP_ORBIT, 0.0, fog.LAMP_HEIGHT])
     light = torch.nn.functional.normalize(place - lamp, dim=0)
     x = torch.nn.functional.normalize(torch.linalg.cross(light, torch.tensor([0.0, 0.0, 1.0])), dim=0)
@@ -224,7 +222,7 @@ def draw(folder: Path, found: Scattering, pictures: Sequence[Sequence[Float[Tens
     """Write scattering.png, the pictures; lamps.svg, PSNR against the lamp's movement; phase.svg, colour against angle;
     and scattering.json, the figures."""
     names = ["truth", *(f"degree {fit.degree}" for fit in found.fits)]
-    rows = [Row(name, [enlarged(shown(x)) for x in row]) for name, row in zip(names, pictures, strict=True)]
+    rows = [Row(name, [enlarged(encode_picture(x)) for x in row]) for name, row in zip(names, pictures, strict=True)]
     columns = ["first lamp", "lamp moved 45°", "within the fog"]
     sheet = contact_sheet("Fog: a field of emission and absorption", columns, rows)
     save_picture(folder / "scattering.png", sheet, "figure")

@@ -67,7 +67,7 @@ class ProbeGrid:
         return float(self.axes.norm(dim=-1).min())
 
     @cached_property
-    def shown(self) -> Float[Tensor, "probe coefficient 3"]:
+    def filled_radiance(self) -> Float[Tensor, "probe coefficient 3"]:
         """Radiance, with that of the nearest free probe for probes that are not free."""
         free = self.state == FREE
         if free.all() or not free.any():
@@ -124,7 +124,7 @@ class ProbeGrid:
     ) -> Float[Tensor, "point coefficient 3"]:
         """Interpolated L_lm."""
         index, weight = self.weights(points, normals)
-        return torch.einsum("pe,pekc->pkc", weight, self.shown[index])
+        return torch.einsum("pe,pekc->pkc", weight, self.filled_radiance[index])
 
     def _interpolated(
         self, points: Tensor, normals: Tensor, directions: Tensor, kind: Callable[[Tensor], Tensor]

@@ -10,9 +10,7 @@ BORDER = 1  # texels around a map, copies of those that neighbour across its edg
 
 
 def encoded(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-    """Octahedral coordinates in [-1, 1]^2 of unit directions: (x, y) / (|x| + |y| + |z|), with the lower half folded
-    outward.
-    """
+    """Octahedral coordinates in [-1, 1]^2: (x, y) / (|x| + |y| + |z|), with the lower half folded outward."""
     x, y, z = (directions / directions.abs().sum(-1, keepdim=True)).unbind(-1)
     sign_x, sign_y = (torch.where(v >= 0, 1.0, -1.0) for v in (x, y))
     below = z < 0

@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField
+from ...components.fields.spaces import space_of
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import RISE, held_decay

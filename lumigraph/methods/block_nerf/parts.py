@@ -15,7 +15,7 @@ from ...camera.rays import Rays, Samples
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import side_by_side
 from ...components.fields.layers import MLP
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...components.training.regularizers import normalized_distance
 from ...components.training.schedules import falling
 from ...datasets.scene import Photograph, Scene

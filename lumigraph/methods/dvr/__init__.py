@@ -19,7 +19,6 @@ from ...components.fields.layers import in_chunks
 from ...components.sampling.occupancy import OccupancyGrid, visual_hull
 from ...components.sampling.sphere_trace import regula_falsi, with_gradient
 from ...components.sampling.surface_method import SHADINGS, SurfaceMethod
-from ...components.training.row_optimizers import LazyAdam
 from ...components.training.schedules import BandSchedule, exponential_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
@@ -196,11 +195,7 @@ class DVR(SurfaceMethod):
         return (ahead - behind).t()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        rate = self.config.learning_rate
-        if isinstance(self.network, OccupancyField):
-            return [torch.optim.Adam(self.network.parameters(), rate, foreach=True)]
-        common: dict[str, Any] = {"lr": rate, "betas": (0.9, 0.99), "eps": 1e-15}
-        return [LazyAdam([self.network.table], **common), torch.optim.Adam(self.network.network.parameters(), **common)]
+        return self.network.optimizers_at(self.config.learning_rate)
 
     # Surface
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from ... import kernels
 from ...components.fields.hash_field import Joining, TableNumbers, new_table
 from ...components.fields.layers import MLP, ResNetLayers
+from ...components.training.row_optimizers import LazyAdam
 
 EXTENT = 1.1  # half-size of the cube that the hash table covers: differences beyond the box of interest stay inside
 LOGIT_SCALE = 50.0  # logits per scene unit at the surface of the first sphere
@@ -29,6 +30,9 @@ class OccupancyField(nn.Module):
 
     def forward(self, points: Float[Tensor, "point 3"]) -> Outputs:
         return self.last(self.blocks(self.first(points)).relu())
+
+    def optimizers_at(self, learning_rate: float) -> list[torch.optim.Optimizer]:
+        return [torch.optim.Adam(self.parameters(), learning_rate, foreach=True)]
 
 
 class TableField(nn.Module):
@@ -60,3 +64,7 @@ class TableField(nn.Module):
         logit, raw = self.network(encoded).split([1, 3], -1)
         sphere = self.radius - (points - self.centre).norm(dim=-1, keepdim=True)
         return torch.cat([LOGIT_SCALE * sphere + logit, raw], -1)
+
+    def optimizers_at(self, learning_rate: float) -> list[torch.optim.Optimizer]:
+        table = LazyAdam([self.table], learning_rate, betas=(0.9, 0.99), eps=1e-15)
+        return [table, torch.optim.Adam(self.network.parameters(), learning_rate, (0.9, 0.99), 1e-15)]

@@ -19,8 +19,8 @@ from ...camera.lens import Pinhole
 from ...camera.rays import Rays, Rendering, Samples
 from ...components.fields.appearance import fitted
 from ...components.fields.kept_photographs import Kept, chance, photographed, square
+from ...components.fields.spaces import Box
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
-from ...components.sampling.spaces import Box
 from ...components.training.adversarial import (
     Discriminator,
     Mapping,

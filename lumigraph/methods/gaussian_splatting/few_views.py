@@ -19,7 +19,7 @@ from torch.nn.functional import max_pool2d
 from ...camera import Camera
 from ...components.clouds.addition import Addition, Step, TrainingViews
 from ...components.clouds.cloud import Cloud
-from ...components.clouds.dense_points import Points, compile_sweep
+from ...components.training.dense_points import Points, compile_sweep
 from ...components.training.regularizers import camera_between, normalized_distance, roughness
 from ...datasets.scene import Scene
 from ...exchange.packing import Stored

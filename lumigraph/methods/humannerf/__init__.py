@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.hash_field import HashNumbers
+from ...components.fields.spaces import Box
 from ...components.sampling.occupancy_sampler import StepNumbers
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import Box
 from ...components.skinning.articulated import Articulated
 from ...components.skinning.bone_motion import BoneMotion, BoneNumbers
 from ...components.skinning.weight_volume import WeightNumbers, WeightVolume
@@ -81,7 +81,7 @@ class HumanNeRF(Articulated, FieldMethod):
 
     def posed(self, times: Float[Tensor, " moment"]) -> PosedField:
         """The field in the poses of moments, under the settings."""
-        turns, places = self.bones.shown(self.settings, times)
+        turns, places = self.bones.pose_joints(self.settings, times)
         return self.network.posed(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
 
     def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Pass]:

@@ -15,11 +15,11 @@ from ...budget import BY_PHOTOGRAPH, Efforts
 from ...camera.rays import Rays
 from ...color.blending import before
 from ...components.fields.hash_field import TINY_TABLE, HashNumbers
-from ...components.sampling.spaces import Box
+from ...components.fields.spaces import Box
 from ...components.tracking.alignment import COLOUR_DEVIATION, aligned, sensor_deviation
 from ...components.tracking.frames import DepthFrame, Moment
 from ...components.tracking.tracker import ALIGNMENT_ITERATIONS, ALIGNMENT_POINTS, Iterations, Tracker, TrackingNumbers
-from ...components.tracking.trajectory import Pose, moved
+from ...components.tracking.trajectory import Pose, apply_twists
 from ...components.training.pose_refinement import PoseAdam
 from ...datasets.scene import Frame, Scene
 from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Width, between, changed
@@ -190,7 +190,7 @@ class IMap(FieldMethod):
     @torch.no_grad()
     def explained(self, field: Any, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> float:
         """Share P of pixels whose depth a map explains (eq. 9): of a table, whose surface is near what was measured."""
-        pixels = frame.drawn(EXPLAINED_PIXELS, chance, measured=True)
+        pixels = frame.sample_pixels(EXPLAINED_PIXELS, chance, measured=True)
         if not len(pixels):
             return 0.0
         rays, depth = self.world_rays(frame.rays[pixels], pose[None]), frame.depth[pixels]
@@ -217,17 +217,17 @@ class IMap(FieldMethod):
             optimizer = PoseAdam([twist], TRACKING_RATE)
             for i in range(t.tracking_iterations):
                 optimizer.param_groups[0]["lr"] = TRACKING_RATE * (1 - i / t.tracking_iterations)
-                pixels = frame.drawn(TRACKING_PIXELS, chance, measured=True)
-                rays = self.world_rays(frame.rays[pixels], moved(pose[None], twist))
+                pixels = frame.sample_pixels(TRACKING_PIXELS, chance, measured=True)
+                rays = self.world_rays(frame.rays[pixels], apply_twists(pose[None], twist))
                 terms, _ = self.errors(rays, frame.rgb[pixels], frame.depth[pixels], chance)
                 (twist.grad,) = torch.autograd.grad(torch.stack(list(terms.values())).sum(), [twist])
                 optimizer.step()
-            return moved(pose[None], twist.detach())[0]
+            return apply_twists(pose[None], twist.detach())[0]
 
     def aligned(self, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> Pose:
         field = self.network
         assert isinstance(field, DistanceTable)
-        pixels = frame.drawn(ALIGNMENT_POINTS, chance, measured=True)
+        pixels = frame.sample_pixels(ALIGNMENT_POINTS, chance, measured=True)
         points = frame.rays[pixels].at(frame.depth[pixels])
         deviation = sensor_deviation(frame.depth[pixels] / self.unit) * self.unit / field.truncation
 
@@ -252,11 +252,13 @@ class IMap(FieldMethod):
         for _ in range(iterations):
             window = self.window(joined, current, chance)
             frames = [
-                current if current and current.index == joined[i] else self.tracker.held(batch.scene, joined[i])
+                current
+                if current and current.index == joined[i]
+                else self.tracker.load_keyframe(batch.scene, joined[i])
                 for i in window
             ]
             drawn = [(f, self.pixels(f, chance)) for f in frames]
-            moving = moved(poses, twists * (numbers != joined[0])[:, None].to(twists))  # the first frame stays
+            moving = apply_twists(poses, twists * (numbers != joined[0])[:, None].to(twists))  # the first frame stays
             rays = [self.world_rays(f.rays[p], moving[i][None]) for i, (f, p) in zip(window, drawn, strict=True)]
             rgb = torch.cat(
                 [before(f.rgb[p], None if f.alpha is None else f.alpha[p], self.background) for f, p in drawn]
@@ -293,7 +295,7 @@ class IMap(FieldMethod):
         """Pixels of a frame: by the loss of their regions, which share them out (eq. 10), or evenly."""
         count, (width, height) = self.config.mapping.pixels_per_frame, frame.size
         if not self.config.mapping.active_sampling:
-            return frame.drawn(count, chance)
+            return frame.sample_pixels(count, chance)
         region = torch.multinomial(self.losses[frame.index].cpu() + MIN_LOSS, count, replacement=True, generator=chance)
         place = torch.rand(2, count, generator=chance)
         column = ((region % REGIONS + place[0]) * (width / REGIONS)).long().clamp(max=width - 1)

@@ -11,7 +11,7 @@ from torch.nn.functional import softplus
 
 from ...components.fields.hash_field import HashField, HashNumbers
 from ...components.fields.layers import Dense
-from ...components.sampling.spaces import Box
+from ...components.fields.spaces import Box
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays, Samples
+from ...components.fields.spaces import Box
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
-from ...components.sampling.spaces import Box
 from ...files.ranges import RaySamples
 from ...method import Pass, Sampler
 from ...volume import weights_of

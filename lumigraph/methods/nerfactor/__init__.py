@@ -20,14 +20,14 @@ from torch import Tensor, nn
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...color.blending import over
-from ...components.fields.development import CONTROLS, decoded, encoded, exposed, toned
 from ...components.fields.hash_field import HashField, HashNumbers
+from ...components.fields.spaces import space_of
 from ...components.fields.teacher import distil, teacher_of
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ...components.sampling.spaces import space_of
+from ...components.training.development import CONTROLS, decoded, encoded, exposed, toned
 from ...components.training.photometric import backdrop, huber, residuals
-from ...components.training.schedules import falling, held
+from ...components.training.schedules import falling, hold_and_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...files.ranges import (
@@ -376,7 +376,7 @@ class NeRFactor(FieldMethod):
         c = self.config
         spent = min(progress / max(c.geometry_share, 1e-9), 1.0)
         return {
-            "": held(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
+            "": hold_and_decay(c.geometry_rate, FINAL_GEOMETRY_RATE, step, spent, DECAY_START),
             "properties": falling(c.learning_rate, c.final_learning_rate, self._over(progress)),
             "light": falling(
                 c.light_rate, c.light_rate * c.final_learning_rate / c.learning_rate, self._over(progress)

@@ -13,7 +13,7 @@ from ... import kernels
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import OPEN_RESOLUTION, TableNumbers, new_table
 from ...components.fields.layers import MLP
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...components.training.row_optimizers import LazyAdam
 from ...exchange.packing import Stored
 from ...geometry import unit

@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.nn.functional import pad, softplus
 
 from ...camera.rays import Rays
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.appearance import AppearanceCodes
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE
+from ...components.fields.spaces import space_of
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule, held_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene

@@ -14,7 +14,7 @@ from ...components.fields.coordinate_network import CoordinateNetwork
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import HashField, side_by_side
 from ...components.fields.layers import MLP, in_chunks
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 from .warp import MotionField, SliceField

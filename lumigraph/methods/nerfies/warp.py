@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from ...components.fields.deformation import DeformationNetwork, window
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...datasets.scene import Frame, Scene
 from ...method import Part
 from ...method.controls import Control, moment

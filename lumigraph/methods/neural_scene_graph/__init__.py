@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from ...camera.rays import Look, Rays
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import CoordinateField
 from ...components.fields.hash_field import CODES_RATE, HashField
+from ...components.fields.spaces import space_of
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
 from ...components.sampling.sampling import stratified
-from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop, huber
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import held_decay

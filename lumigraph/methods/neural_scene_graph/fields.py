@@ -17,7 +17,7 @@ from ...components.fields.coordinate_field import LatentField, NetworkNumbers
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP, truncated_exp
-from ...components.sampling.spaces import Box, Space
+from ...components.fields.spaces import Box, Space
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
 CUBE = Box(((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), 0.0)  # coordinates of a box

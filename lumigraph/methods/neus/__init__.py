@@ -14,9 +14,9 @@ from torch.nn.functional import binary_cross_entropy, normalize
 from ...camera.rays import Rays, Rendering
 from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ...components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
+from ...components.fields.spaces import Box, contraction_of
 from ...components.sampling.hierarchical_sampler import RayNumbers
 from ...components.sampling.occupancy import MaskNumbers, visual_hull
-from ...components.sampling.spaces import Box, contraction_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import BandSchedule
 from ...datasets.scene import Batch, Frame, Scene

@@ -16,7 +16,7 @@ from torch.nn.utils.parametrizations import weight_norm
 from ... import kernels
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import HashField, HashNumbers, Joining
-from ...components.sampling.spaces import Box
+from ...components.fields.spaces import Box
 from ...files.ranges import Depth, Octaves
 from ...geometry import Vector
 from ...method import Field

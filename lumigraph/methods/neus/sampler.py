@@ -9,10 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera.rays import Rays, Samples
+from ...components.fields.spaces import Box, Contraction
 from ...components.sampling.hierarchical_sampler import RayNumbers
 from ...components.sampling.occupancy import MaskNumbers, OccupancyMask
 from ...components.sampling.sampling import inverse_transform, stratified
-from ...components.sampling.spaces import Box, Contraction
 from ...method import Field, Pass, Sampler
 from ...method.sampler import RayCodes
 from ...volume import weights_of

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera.rays import Rays, Rendering, Samples
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
+from ...components.fields.spaces import space_of
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Scene

@@ -15,7 +15,7 @@ from ...components.fields.coordinate_network import CoordinateNetwork, SkipNetwo
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, new_table, side_by_side
 from ...components.fields.layers import MLP, Dense, in_chunks
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...components.training.row_optimizers import LazyAdam
 from ...exchange.packing import Stored
 from ...method import Field

@@ -14,8 +14,8 @@ from torch.nn.functional import interpolate
 
 from ...camera import Camera
 from ...camera.lens import Lens
-from ...components.clouds.dense_points import compile_sweep, seen_points
 from ...components.fields.kept_photographs import WHERE, Kept, Taken
+from ...components.training.dense_points import compile_sweep, seen_points
 from ...datasets.scene import Batch, Photograph, Scene
 from ...depth_maps.optical_flow import optical_flow, round_trip_error
 from ...exchange.packing import Stored

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from ...camera.rays import Rays, Samples
+from ...components.fields.spaces import Space
 from ...components.sampling.sampling import stratified
-from ...components.sampling.spaces import Space
 from ...files.ranges import BatchSize, RaySamples
 from ...method import Field, Pass, Sampler
 from ...method.sampler import RayCodes, codes_at

@@ -17,15 +17,15 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d, softplus
 
 from ...camera.rays import Look, Rays, Rendering
+from ...components.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.appearance import CodeWidth
-from ...components.fields.backbone import CPU_BACKBONE, TINY_BACKBONE, BackboneNumbers
 from ...components.fields.coordinate_field import CoordinateField, LatentField
 from ...components.fields.hash_field import CODES_RATE, HashField
 from ...components.fields.instance_codes import InstanceCodes
+from ...components.fields.spaces import space_of
 from ...components.instances import ALONE, Edit, check_labels, edit_controls, edit_of, labels_of, layers_of
 from ...components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
 from ...components.sampling.samplers import sampling_bytes
-from ...components.sampling.spaces import space_of
 from ...components.training.photometric import huber
 from ...components.training.schedules import held_decay
 from ...composition.composed import kept, union
@@ -199,7 +199,7 @@ class ObjectNeRF(FieldMethod):
 
     def without(self, rays: Rays, number: int) -> Look:
         """The scene branch, without what goes with an instance."""
-        if isinstance(self.network, HashField):  # its samplers end rays at the first surface, which may be the instance
+        if self.config.backbone.hashed:  # its samplers end rays at the first surface, which may be the instance
             scene = SceneWithout(self.network, lambda points: self.belongs(points, number))
             return self.sampler.sample(rays, scene)[-1].look(scene)
         look = super().looks(rays)[-1]
@@ -229,7 +229,8 @@ class ObjectNeRF(FieldMethod):
 
     def _region(self, number: int, low: Tensor, high: Tensor, sides: Tensor) -> Bool[Tensor, "x y z"]:
         """Cells of an instance, remembered until it changes."""
-        state = int(self.branch.density_network.weights[0]._version) if isinstance(self.branch, ObjectTable) else 0
+        *_, last = self.branch.parameters()
+        state = last._version  # which each step changes
         if (found := self._regions.get((number, state))) is not None:
             return found
         axes = [(torch.arange(int(n), device=self.device) + 0.5) / n for n in sides]

@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from ...components.fields.coordinate_field import CoordinateField
 from ...components.fields.hash_field import DENSITY_LAYERS, HashField, HashNumbers, side_by_side
 from ...components.fields.layers import MLP
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...method import Field
 from ...method.field import Codes, Colours, Densities, Directions, Points
 
@@ -44,7 +45,7 @@ class SceneWithout(Field):
     belongs: true for points that go with the instance
     """
 
-    def __init__(self, scene: HashField, belongs: Callable[[Tensor], Tensor]):
+    def __init__(self, scene: HashField | CoordinateField, belongs: Callable[[Tensor], Tensor]):
         super().__init__()
         self._held = scene, belongs  # in a tuple: the parameters are the scene's
         self.space = scene.space

@@ -18,8 +18,8 @@ from ...camera.rays import Look, Rays, Samples
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.kept_photographs import KeptPhotographs, chance, padded, photographed, rays_through
 from ...components.fields.layers import in_chunks
+from ...components.fields.spaces import space_of
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
-from ...components.sampling.spaces import space_of
 from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene

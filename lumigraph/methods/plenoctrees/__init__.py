@@ -14,12 +14,12 @@ from torch import Tensor
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
+from ...components.fields.spaces import Box
 from ...components.fields.teacher import density_of, logit, teacher_of
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
-from ...components.sampling.spaces import Box
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.row_optimizers import LazyRMSprop
-from ...components.training.schedules import falling, held
+from ...components.training.schedules import falling, hold_and_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.baked import Octree
@@ -301,7 +301,7 @@ class PlenOctrees(FieldMethod):
         over = min(progress / max(c.teacher_share, 1e-9), 1.0)
         begun = float(self.begun)
         rates = self._rates((progress - begun) / max(1 - begun, 1e-9) if self.baked else 0.0)
-        return {"": held(c.learning_rate, c.final_learning_rate, step, over, c.decay_start), **rates}
+        return {"": hold_and_decay(c.learning_rate, c.final_learning_rate, step, over, c.decay_start), **rates}
 
     def _rates(self, progress: float) -> dict[str, float]:
         return {

@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...camera import Camera
+from ...components.fields.spaces import NDC, Space, space_of
 from ...components.fields.teacher import logit, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
 from ...components.sampling.samplers import ProposalNumbers, sampler_for
-from ...components.sampling.spaces import NDC, Space, space_of
 from ...components.training.photometric import Exposure, Setting, backdrop, residuals
 from ...components.training.regularizers import cauchy
 from ...components.training.row_optimizers import LazyRMSprop

@@ -17,12 +17,12 @@ from torch import Tensor, nn
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import HashField, HashNumbers
+from ...components.fields.spaces import NDC, space_of
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
 from ...components.sampling.occupancy import MaskNumbers
 from ...components.sampling.occupancy_sampler import MIN_RESOLUTION, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_for, sampling_bytes
-from ...components.sampling.spaces import NDC, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.regularizers import (
@@ -33,7 +33,7 @@ from ...components.training.regularizers import (
     roughness,
     unseen_cameras,
 )
-from ...components.training.schedules import BandSchedule, falling, held, joining_of
+from ...components.training.schedules import BandSchedule, falling, hold_and_decay, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between, changed
 from ...method import FieldMethod, seeded
@@ -245,7 +245,7 @@ class RegNeRF(FieldMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
-        if isinstance(self.network, HashField):
+        if self.by_table:
             own = self.network.optimizers_at(c.table_learning_rate, c.hash_weight_decay)
         else:
             own = [clipped(torch.optim.Adam(self.network.parameters(), c.learning_rate), c.gradient_clip)]
@@ -254,7 +254,7 @@ class RegNeRF(FieldMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         c = self.config
         if self.by_table:
-            return held(c.table_learning_rate, FINAL_TABLE_LEARNING_RATE, step, progress, DECAY_START)
+            return hold_and_decay(c.table_learning_rate, FINAL_TABLE_LEARNING_RATE, step, progress, DECAY_START)
         return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:

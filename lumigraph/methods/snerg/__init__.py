@@ -16,14 +16,14 @@ from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
+from ...components.fields.spaces import Box, contraction_of, space_of
 from ...components.fields.teacher import teacher_of
 from ...components.sampling.occupancy_sampler import OCCUPANCY_INTERVAL, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
-from ...components.sampling.spaces import Box, contraction_of, space_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.regularizers import cauchy
 from ...components.training.row_optimizers import LazyAdam, exchange
-from ...components.training.schedules import falling, held
+from ...components.training.schedules import falling, hold_and_decay
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError, LumigraphWarning
 from ...exchange.baked import Atlas
@@ -331,7 +331,7 @@ class SNeRG(FieldMethod):
         c, spent = self.config, self._spent(progress)
         over = min(1.0, progress / c.deferred_share)
         return {
-            "field": held(c.learning_rate, c.final_learning_rate, step, over, c.decay_start),
+            "field": hold_and_decay(c.learning_rate, c.final_learning_rate, step, over, c.decay_start),
             "view": falling(c.view_learning_rate, 0.1 * c.view_learning_rate, spent),
             "voxels": falling(c.voxel_learning_rate, 0.1 * c.voxel_learning_rate, spent / max(self._voxel_share, 1e-9)),
         }

@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool3d, max_pool3d
 
 from ... import kernels
 from ...camera.rays import Rays, Samples
-from ...components.sampling.spaces import Contraction
+from ...components.fields.spaces import Contraction
 from ...exchange.baked import Atlas
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.block_march.reference import contracted, steps

@@ -16,7 +16,7 @@ from ... import kernels
 from ...components.fields.coordinate_network import PositionNetwork
 from ...components.fields.hash_field import OPEN_RESOLUTION, TableNumbers, new_table
 from ...components.fields.layers import MLP, Dense, truncated_exp
-from ...components.sampling.spaces import Space
+from ...components.fields.spaces import Space
 from ...exchange.baked import ViewNetwork
 from ...method import Field
 from ...method.field import Colours, Densities, Directions, Points

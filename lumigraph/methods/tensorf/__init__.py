@@ -13,11 +13,11 @@ from torch import Tensor, nn
 
 from ...camera import Camera
 from ...components.fields.layers import MLP
+from ...components.fields.spaces import Space, space_of
 from ...components.fields.teacher import distil, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
 from ...components.sampling.samplers import ProposalNumbers, sampler_for
-from ...components.sampling.spaces import Space, space_of
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling

@@ -1,8 +1,7 @@
 """Raw photographs: sensor measurements under a colour filter mosaic, in linear light.
 
-photo = open_raw(path)             a camera's own file, or one of a folder of mosaics
-photo.read()                       light (height, width): 0 at black, 1 at white, with noise
-photo.developed(brightness)        as an ordinary picture
+photo = open_raw(path)             a camera's own file, or one of a folder of mosaics photo.read()
+light (height, width): 0 at black, 1 at white, with noise photo.developed(brightness)        as an ordinary picture
 """
 
 from .library import exif_of as exif_of

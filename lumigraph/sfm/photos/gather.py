@@ -201,8 +201,7 @@ class Candidate:
 
 
 def take(name: str, path: Path, copies: Path) -> Candidate | str:
-    """One photograph, copied if necessary, and judged; or the reason for none. Raises LumigraphError if the copy cannot
-    be written."""
+    """One photograph, copied if necessary, and judged; or the reason for none. Raises LumigraphError if unwritable."""
     if path.suffix.lower() not in PHOTOGRAPHS:
         return "its format is not read here; convert it to JPEG"
     heic = path.suffix.lower() in HEIC_SUFFIXES

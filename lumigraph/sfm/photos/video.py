@@ -156,7 +156,7 @@ class Odometer:
         tiles = cut(picture)
         if self._reference is None:
             self._reference = tiles
-        distance = moved(self._reference, tiles)
+        distance = measure_displacement(self._reference, tiles)
         if distance >= REFERENCE_STRIDE:
             self.travelled, self._reference, distance = self.travelled + distance, tiles, 0.0
         return self.travelled + distance
@@ -173,7 +173,7 @@ def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile r
     return (tiles - tiles.mean((1, 2), keepdims=True)) * window[:, None] * window
 
 
-def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
+def measure_displacement(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
     """Mean length of the tiles' displacements by phase correlation; 0 without texture. Tiles are tracked one by one, so
     that walking forward or rolling the camera counts as well."""
     textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > MIN_VARIANCE * WINDOW_MEAN_SQUARE

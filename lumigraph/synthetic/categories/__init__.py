@@ -1,7 +1,6 @@
 """Categories: procedural objects of one kind, any number of them, with random proportions, colours and materials. One
 file each, found by its name, with `objects(random)` and the common `BOUNDS`. The rotation of the first object is the
-deviation from the category's common orientation.
-"""
+deviation from the category's common orientation."""
 
 from __future__ import annotations
 

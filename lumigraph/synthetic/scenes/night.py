@@ -1,6 +1,5 @@
 """The study at night: two lamps and the moon through the window, photographed raw by a hand-held camera at three
-shutter times, mostly dark. The noise-free radiance is known.
-"""
+shutter times, mostly dark. The noise-free radiance is known."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ def world() -> World:
     return replace(room.world(), lights=lights, sky=sky)
 
 
-def held(count: int, random: np.random.Generator) -> np.ndarray:
+def sample_poses(count: int, random: np.random.Generator) -> np.ndarray:
     """Hand-held poses at one side of the room, looking at the other."""
     poses = []
     for _ in range(count):
@@ -41,7 +40,7 @@ def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """`views` training photographs, and a fifth as many held out."""
     random = np.random.default_rng(seed)
     held_out = max(views // 5, 1)
-    cameras = pinhole(held(views + held_out, random), size, FIELD_OF_VIEW)
+    cameras = pinhole(sample_poses(views + held_out, random), size, FIELD_OF_VIEW)
     cameras = replace(cameras, image_index=torch.arange(len(cameras)))
     return SyntheticStage(
         world(),

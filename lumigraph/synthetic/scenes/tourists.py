@@ -62,7 +62,7 @@ class Day:
     exposure: float
 
     @staticmethod
-    def drawn(random: np.random.Generator) -> Day:
+    def sample(random: np.random.Generator) -> Day:
         """Random light: morning to evening, clear or overcast, warm or cold, one stop of exposure in all."""
         warm, tint = random.normal(0, 0.13), random.normal(0, 0.03)
         return Day(
@@ -213,7 +213,7 @@ def world(day: Day, others: tuple[Object, ...] = ()) -> World:
 def photographed(seed: int, cameras: Camera, lasting: bool, index: int) -> World:
     """The world in a photograph. lasting: without transient objects"""
     random = np.random.default_rng([seed, index])
-    day = Day.drawn(random)
+    day = Day.sample(random)
     return world(day, () if lasting else tuple(passing(cameras[index], random)))
 
 

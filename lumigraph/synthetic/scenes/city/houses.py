@@ -43,7 +43,7 @@ class Style:
     shops: bool
 
     @staticmethod
-    def drawn(random: np.random.Generator) -> Style:
+    def sample(random: np.random.Generator) -> Style:
         seed = float(random.uniform(0, 90))
         return Style(
             wall(random, seed),
@@ -89,7 +89,7 @@ def house(
     place: centre of its base; half: of its sizes along x and y
     fronts: directions of those sides, degrees from -y anticlockwise: 0, 90, 180 or 270
     """
-    style = Style.drawn(random)
+    style = Style.sample(random)
     x, y, height = *half, style.height
 
     def box(

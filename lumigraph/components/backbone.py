@@ -8,14 +8,14 @@ from typing import Annotated, Any, Literal
 
 import torch
 
-from ...datasets.scene import Frame
-from ...files.ranges import LearningRate, Width, between
-from ...method import Sampler
-from ..sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ..sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
-from ..sampling.spaces import Space
-from .coordinate_field import CoordinateField, NetworkNumbers
-from .hash_field import HashField, HashNumbers
+from ..datasets.scene import Frame
+from ..files.ranges import LearningRate, Width, between
+from ..method import Sampler
+from .fields.coordinate_field import CoordinateField, NetworkNumbers
+from .fields.hash_field import HashField, HashNumbers
+from .fields.spaces import Space
+from .sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from .sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 
 # Numbers of a Config by name, for `changed`: a hash table for a plain CPU, and one for tests.
 CPU_BACKBONE: dict[str, Any] = {**CPU_HASH, "field": "hash", "hidden_width": 32}
