@@ -12,6 +12,7 @@ from budgets import budget
 
 from lumigraph.components.instances import edit_of
 from lumigraph.datasets.scene import Photograph
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians import joined
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.methods.gaussian_splatting import GaussianSplatting
@@ -26,7 +27,7 @@ EYES = (-3.0, 0.3, 0.8), (0.2, -3.0, 0.5), (3.0, 0.2, 0.3), (-0.3, 3.0, 0.9)
 
 
 def method_of(cloud, numbers=NUMBERS):
-    config = replace(GaussianSplatting.smallest(), groups=numbers, sh_degree=0)
+    config = changed(replace(GaussianSplatting.smallest(), groups=numbers), sh_degree=0)
     method = build(GaussianSplatting, WHITE, config, torch.device("cpu"), 0)
     method.begin_with(cloud, eye(EYES[0]))
     return method

@@ -33,6 +33,7 @@ from lumigraph.export.panorama import (
     surrounding_distances,
     top_bottom,
 )
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import look_at
 from lumigraph.method import RayMethod
@@ -120,7 +121,7 @@ def cloud() -> Gaussians:
 
 def splatted():
     kind = find("gaussian-splatting")
-    method = kind(Frame(near=0.05), kind.Config(sh_degree=0))
+    method = kind(Frame(near=0.05), changed(kind.Config(), sh_degree=0))
     method.cloud.replace(cloud())
     return method.eval()
 

@@ -27,9 +27,9 @@ RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", 
 # Of the package: who lowers a number lowers its ceiling.
 MAX_LINES = 112_800  # of Python
 MAX_LONG_FUNCTIONS = 20  # of more than 60 lines
-MAX_ANY_METHODS = 65  # parameters `method: Any`
+MAX_ANY_METHODS = 63  # parameters `method: Any`
 MAX_ROOMS = 38  # names at the top level
-MAX_OPTIONS = 1_152  # of all methods, those of parts counted for each method that holds them
+MAX_OPTIONS = 1_151  # of all methods, those of parts counted for each method that holds them
 TO_BE_WRITTEN = {"lumigraph/methods/soft_colours.py"}  # by the reader of CONTRIBUTING.md
 
 

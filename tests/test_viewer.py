@@ -31,6 +31,7 @@ from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.figures import EMPTY_COLOUR, RAMP, hex_colour
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.gaussians.cloud import cleaned
 from lumigraph.method import Method, RayMethod
@@ -159,7 +160,7 @@ def test_limits_of_an_opening(learnt, tmp_path):
 def test_a_slow_browser_has_a_picture_from_the_beginning(tmp_path):
     """Behind splats there is our own rendering until the client moves, and a colour from then on."""
     kind = lumigraph.methods.find("gaussian-splatting")
-    method = kind(tiny.scene().frame, kind.Config(sh_degree=0))
+    method = kind(tiny.scene().frame, changed(kind.Config(), sh_degree=0))
     method.cloud.replace(some_cloud(200, degree=0))
     about = subject(tiny.scene(), tmp_path)
     with Viewer(method.eval(), about, choose_address(port=0)) as viewer:

@@ -18,6 +18,7 @@ import lumigraph.methods
 from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.composition.floaters import CANDIDATE_COLOUR, evidence
 from lumigraph.errors import LumigraphError
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians.cloud import cleaned, gone
 from lumigraph.paths import Surroundings
 from lumigraph.paths.opening import subject_of
@@ -36,7 +37,7 @@ def cloud_viewer(tmp_path):
     cloud.means[0] = 0.6 * tiny.scene().cameras.position[0]
     cloud.log_scales[0] = -4.0
     kind = lumigraph.methods.find("gaussian-splatting")
-    method = kind(tiny.scene().frame, kind.Config(sh_degree=0))
+    method = kind(tiny.scene().frame, changed(kind.Config(), sh_degree=0))
     method.cloud.replace(cloud)
     saved = []
 

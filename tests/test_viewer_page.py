@@ -20,6 +20,7 @@ from waiting import until
 
 import lumigraph.methods
 from lumigraph.datasets.scene import Frame
+from lumigraph.files.ranges import changed
 from lumigraph.paths.keyframes import CameraPath
 from lumigraph.run import build
 from lumigraph.training import fit
@@ -264,7 +265,7 @@ def test_gaussians_are_drawn_by_the_browser(page, faults, tmp_path):
     cloud = replace(some_cloud(300), harmonics=0.4 * some_cloud(300).harmonics)
     frame = Frame(near=0.05, background=(0.1, 0.2, 0.3))
     kind = lumigraph.methods.find("gaussian-splatting")
-    method = kind(frame, kind.Config(sh_degree=3))
+    method = kind(frame, changed(kind.Config(), sh_degree=3))
     method.cloud.replace(cloud)
     with Viewer(method.eval(), subject(replace(tiny.scene(), frame=frame), tmp_path), choose_address(port=0)) as viewer:
         visitor = visit(viewer, page)
