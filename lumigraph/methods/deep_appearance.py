@@ -64,8 +64,8 @@ class Unwrapped:
     """Photographs as textures.
 
     rgb:    bytes; 0 where `shown` is False
-    shown:  texels that the photograph shows
-    view:   unit direction from the mesh's middle to the camera
+    shown:  mask of texels visible in the photograph
+    view:   unit direction from the mesh's centre to the camera
     moment: number of the expression
     """
 

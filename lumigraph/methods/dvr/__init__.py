@@ -83,8 +83,8 @@ SPHERE_RADIUS = 0.6  # of the first sphere, of that around the hull
 
 
 class DVR(SurfaceMethod):
-    """Learns occupancy and colour of points from photographs with masks; a ray sees the first point where occupancy
-    rises above a threshold."""
+    """Learns occupancy and colour of points from photographs with masks; a ray's surface is its first crossing of the
+    occupancy threshold."""
 
     Config, learns_from = Config, Scene
     learning_rate = exponential_decay
@@ -183,8 +183,8 @@ class DVR(SurfaceMethod):
         samples: Samples,
         generator: torch.Generator,
     ) -> dict[str, Tensor]:
-        """L_freespace and L_occupancy: cross-entropy where rays beside the object meet a surface, or at a random place
-        of the box, and at a random place of rays that should meet one and do not."""
+        """L_freespace and L_occupancy: cross-entropy at surface intersections of background rays, or at a random point
+        of the box, and at a random point of foreground rays without an intersection."""
         c, hit = self.config, t.isfinite()
         enter, leave = rays.through_box(torch.tensor(self.frame.bounds, device=self.device))
         share = torch.rand(len(rays), generator=generator).to(t)
@@ -225,8 +225,8 @@ class DVR(SurfaceMethod):
         return in_chunks(lambda x: (self.network(x)[:, 1:].sigmoid(),), points)[0]
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Logit of the threshold less that of points, by LOGIT_SCALE: it has the sign and the zero level of a distance,
-        and not its length."""
+        """Logit of the threshold minus that of points, over LOGIT_SCALE: sign and zero level of a distance, but not
+        its length."""
         level = math.log(self.config.threshold / (1 - self.config.threshold))
         return (level - self.logits(points)) / LOGIT_SCALE
 
@@ -236,8 +236,8 @@ class DVR(SurfaceMethod):
         return self.with_normals(rays, t)
 
     def _met(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Samples]:
-        """Distance at which each ray first enters what is occupied, infinity where it does not, and the places that
-        were looked at. Even steps in the hull find the crossing, the secant method narrows it down (section 3.2).
+        """Distance of each ray's first intersection with the surface, infinity without one, and the evaluated samples.
+        Equal steps in the hull bracket the crossing, the secant method refines it (section 3.2).
 
         Differentiable in the field where gradients are enabled (eq. 10).
         """

@@ -48,7 +48,7 @@ class RobustMask(Addition):
         self.register_buffer("histogram", torch.zeros(BINS))
 
     def is_active(self, method: Any) -> bool:
-        """True if pixels are left out: always, or with the setting auto where photographs differ."""
+        """True if pixels are masked: always, or with the setting auto if photographs differ."""
         return self.numbers.robust == "yes" or (method.appearance is not None and method.appearance.is_active)
 
     def mask(self, method: Any, step: Step) -> None:
@@ -70,7 +70,7 @@ class RobustMask(Addition):
 
     @torch.no_grad()
     def record(self, residual: Float[Tensor, "height width"]) -> None:
-        """Add a photograph's residuals to the histogram, but for zeros, of pixels without content in either."""
+        """Add a photograph's residuals to the histogram, except zeros, which are pixels without content in either."""
         some = residual[residual > 0]
         self.histogram.mul_(HISTOGRAM_DECAY).add_(torch.histc(some, BINS, 0, 1) / max(len(some), 1))
 

@@ -51,7 +51,7 @@ class Config:
 
 
 class HumanNeRF(Articulated, FieldMethod):
-    """A canonical field, and the way to it from a body in any pose."""
+    """A canonical field, and the deformation from a posed body to it."""
 
     Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: PosedField
@@ -96,7 +96,7 @@ class HumanNeRF(Articulated, FieldMethod):
     # Moments
 
     def posed(self, times: Float[Tensor, " moment"]) -> PosedField:
-        """The field in the poses of moments, under the settings."""
+        """The field in the poses at given times, under the settings."""
         turns, places = self.bones.pose_joints(self, times)
         return self.network.posed(self.bones.transforms(turns, places), self.bones.angles_of(turns.detach()))
 
@@ -105,7 +105,7 @@ class HumanNeRF(Articulated, FieldMethod):
         return self.sampler.sample(rays, self.posed(times), rows[:, None].float(), generator)
 
     def shown_field(self) -> PosedField:
-        """The field in the pose of pictures, by the settings."""
+        """The field in the pose of renderings, by the settings."""
         return self.posed(torch.tensor([self.moment_of()], device=self.device))
 
     def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:

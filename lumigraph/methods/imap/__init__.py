@@ -94,11 +94,11 @@ class Config:
 
 
 class IMap(FieldMethod):
-    """One step is one frame: find its pose in the map, decide whether it is a keyframe, then descend on the map and the
-    poses of keyframes together. Steps after the last frame map on.
+    """One step is one frame: estimate its pose in the map, decide whether it is a keyframe, then optimise the map and
+    the keyframes' poses jointly. Steps after the last frame continue mapping.
 
-    losses:   of each image and region of active sampling, as they were last measured; those of keyframes count
-    snapshot: the map when the latest keyframe was added, by which frames are judged (section 3.4)
+    losses:   last measured loss of each image and region of active sampling; those of keyframes are used
+    snapshot: the map at the latest keyframe, for keyframe selection (section 3.4)
     """
 
     Config = Config
@@ -193,7 +193,8 @@ class IMap(FieldMethod):
 
     @torch.no_grad()
     def explained(self, field: Any, frame: DepthFrame, pose: Pose, chance: torch.Generator) -> float:
-        """Share P of pixels whose depth a map explains (eq. 9): of a table, whose surface is near what was measured."""
+        """Share P of pixels with depth explained by the map (eq. 9); of a table, with its surface close to the
+        measured depth."""
         pixels = frame.sample_pixels(EXPLAINED_PIXELS, chance, measured=True)
         if not len(pixels):
             return 0.0
@@ -308,7 +309,7 @@ class IMap(FieldMethod):
 
     @torch.no_grad()
     def remember(self, drawn: Sequence[tuple[DepthFrame, Tensor]], error: Float[Tensor, " ray"]) -> None:
-        """Keep the mean error of the regions that were drawn from."""
+        """Store the mean error of the sampled regions."""
         if not self.config.mapping.active_sampling:
             return
         for (frame, pixels), own in zip(drawn, error.split([len(p) for _, p in drawn]), strict=True):

@@ -252,7 +252,7 @@ def hull(scene: Scene, cells: int) -> Mesh:
 
 
 def surface_of(teacher: Any, cameras: Camera, cells: int) -> Mesh:
-    """The surface of a method's fused depth maps, closed around what no camera sees, with its colours."""
+    """Surface of a method's fused depth maps with its colours, closed in regions that no camera sees."""
     frame = teacher.frame
     maps = render_depth_maps(teacher.render, cameras, frame.background, TEACHER_VIEWS, TEACHER_SIZE)
     low, high = (np.array(corner) for corner in frame.bounds)

@@ -86,7 +86,7 @@ class MeshSurface(Part):
         return self.corners.faces
 
     def replace(self, mesh: Mesh, optimizers: tuple[torch.optim.Optimizer | None, ...] = (None, None)) -> None:
-        """Another mesh; what optimizers remembered of the old one is forgotten."""
+        """Replace the mesh, with fresh optimizer moments."""
         self.corners.faces = torch.from_numpy(np.ascontiguousarray(mesh.faces)).long().to(self.corners.faces.device)
         places = self.solver.apply(torch.from_numpy(mesh.vertices).float())
         exchange(self, "places", places.contiguous(), optimizers[0])

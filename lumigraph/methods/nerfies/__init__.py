@@ -190,7 +190,7 @@ class Nerfies(FieldMethod):
         super().begin(data, seconds)
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        """Rays of the moments that have joined: at first those of a tenth of the capture."""
+        """Rays of the times that have joined: at first those of a tenth of the capture."""
         d, time = self.config.deformation, data.cameras.time
         if self.progress < d.growth and time is not None and self.frame.times is not None:
             first, last = self.frame.times
@@ -240,7 +240,7 @@ class Nerfies(FieldMethod):
         return total / len(rays) * elastic_loss(jacobian, d.elastic_scale).mean()
 
     def restlessness(self, motion: MotionField, generator: torch.Generator) -> Float[Tensor, ""]:
-        """Distance that points of the background move at random moments, by a robust loss (eq. 12)."""
+        """Displacement of static background points at random times, by a robust loss (eq. 12)."""
         count, known = self.config.deformation.background_points, self.background_points
         points = known[torch.randint(len(known), (count,), generator=generator).to(self.device)]
         first, last = self.frame.times or (0.0, 0.0)
@@ -267,7 +267,7 @@ class Nerfies(FieldMethod):
 
     @torch.no_grad()
     def follow(self, points: Points, start: float, end: float) -> Points:
-        """Positions at one moment of surface points of another: those with the same canonical position."""
+        """Positions at one time of surface points of another: those with the same canonical position."""
         motion = self.network.motion
         if motion is None:
             return points
