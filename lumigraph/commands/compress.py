@@ -98,7 +98,7 @@ def verdict(made: Any, run: Path) -> str:
 
 
 def bytes_in(text: str) -> int:
-    """A size as people write it, 5MB or 800 kB. Raises LumigraphError for what is none."""
+    """Bytes of a size such as 5MB or 800 kB. Raises LumigraphError for invalid text."""
     found = SIZE.fullmatch(text)
     size = float(found[1][:20]) * UNITS[found[2].lower()] if found and found[2].lower() in UNITS else 0.0
     if not 1 <= size <= 1e15:
@@ -107,7 +107,7 @@ def bytes_in(text: str) -> int:
 
 
 def table(made: Any) -> Any:
-    """Before and after."""
+    """Table of figures before and after."""
     from rich.table import Table
 
     rows = Table("", "before", "after", "")

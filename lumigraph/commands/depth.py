@@ -98,7 +98,7 @@ class Depth:
 
 
 def number_of(scene: Scene, name: str) -> int:
-    """Number of a photograph that is given by name, with or without its ending, or by number."""
+    """Number of a photograph from its name, with or without its ending, or its number."""
     names = list(scene.names)
     stems = [Path(one).stem for one in names]
     if name in names or name in stems:

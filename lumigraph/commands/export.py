@@ -112,8 +112,8 @@ class ExportMesh(Reports, MeshOptions, Files):
         return opened, mesh.in_source(opened.frame), why
 
     def photographs(self, opened: Any) -> Any:
-        """The photographs of a run, if their colours or masks are used; None, with a warning, where they are gone.
-        Raises LumigraphError if they are not where --scene says."""
+        """The photographs of a run, if their colours or masks are used; None, with a warning, if unavailable. Raises
+        LumigraphError if they are not at --scene."""
         if opened.open_scene is None or not (self.texture or opened.masked):
             return None
         try:
@@ -239,7 +239,7 @@ class ExportSplats(Reports):
         return Exported(self.output, {"still": still, "moving": moving.moving}, rows=rows)
 
     def _one_moment(self) -> Exported:
-        """Write a cloud as it is at one moment."""
+        """Write a cloud at one time."""
         from ..exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ..exchange.streamed_sog import Detail
         from ..large import open_any
@@ -418,7 +418,7 @@ class ExportLightField(Reports):
         return Exported(self.output, {"views": self.grid**2}, rows=rows)
 
     def _number(self, opened: Any) -> int:
-        """Row of the photograph of --view among those to learn from."""
+        """Row of the photograph of --view among the training photographs."""
         from .explain import find_view
 
         names = opened.view_names()["train"]
@@ -433,7 +433,7 @@ Place = Annotated[
 
 @dataclass(frozen=True)
 class SphereExport(Reports):
-    """Base of exports of the whole sphere around a place."""
+    """Base of exports of the whole sphere around a point."""
 
     source: SourceOption
     output: Annotated[Positional[Path], needed("FILE")]

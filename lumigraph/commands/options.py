@@ -71,19 +71,19 @@ def photographers(opened: Any, method: Any) -> Any:
 
 
 def controlled(opened: Any, method: Any, settings: Iterable[str]) -> Any:
-    """The method with the controls of --set. Raises LumigraphError for controls that it does not have."""
+    """The method with the controls of --set. Raises LumigraphError for unknown controls."""
     values = dict(parted("--set", "NAME=VALUE", text) for text in settings)
     return method.given(**{name: by_number(opened, method, name, value) for name, value in values.items()})
 
 
 def at_one_moment(method: Any) -> Any:
-    """A method that moves, at the moment of --set or at its first one, for all cameras; any other as it is."""
+    """A dynamic method fixed at the time of --set or at its first one, for all cameras; any other unchanged."""
     control = next((one for one in method.controls if one.name == "time"), None)
     return method if control is None else method.given(time=method.control("time"))
 
 
 def animate(opened: Any, method: Any, settings: Iterable[str], frames: int) -> Any:
-    """The method of each frame of a film by --animate; the method itself without --animate."""
+    """The method for each frame of a film by --animate; the method itself without --animate."""
     from ..export.film import animated
 
     stations = {}
@@ -97,7 +97,7 @@ def animate(opened: Any, method: Any, settings: Iterable[str], frames: int) -> A
 
 
 def parted(option: str, form: str, text: str) -> tuple[str, str]:
-    """The two sides of NAME=VALUE."""
+    """Name and value of NAME=VALUE."""
     name, equals, value = text.partition("=")
     if not (name.strip() and equals and value.strip()):
         raise LumigraphError(f"{option} {text} gives no value for a control; write {option} {form}")
@@ -105,8 +105,8 @@ def parted(option: str, form: str, text: str) -> tuple[str, str]:
 
 
 def by_number(opened: Any, method: Any, name: str, value: str) -> str:
-    """The value, or the number of the photograph that it names if the control takes one; in a blend, A:B:0.5, the
-    numbers of both."""
+    """The value, with a photograph's name replaced by its number if the control takes one; in a blend, A:B:0.5, both
+    names."""
     control = next((control for control in method.controls if control.name == name), None)
     if control is None or not control.of_photographs:
         return value
@@ -144,7 +144,8 @@ class Scaling:
             raise LumigraphError("--scale-by names one point twice; give two points, and the distance between them")
 
     def remember(self, opened: Any) -> None:
-        """Set the scale of an opened run, once and for all exports. Raises LumigraphError for what remembers none."""
+        """Set the scale of an opened run, once and for all exports. Raises LumigraphError for files that cannot
+        store it."""
         if self.scale_by is not None:
             opened.set_scale(self.scale_by[6] / math.dist(self.scale_by[:3], self.scale_by[3:6]))
 
@@ -199,15 +200,15 @@ class Keeping(Cropping):
 
     @property
     def removes(self) -> bool:
-        """True if Gaussians go for another reason than a crop."""
+        """True if Gaussians are removed for reasons other than a crop."""
         return self.clean or bool(self.strength) or self.max_scale is not None
 
     def of_gaussians(self, gaussians: Any, crop: Any, frame: Any, cameras: Any) -> Any:
-        """Gaussians to keep. Raises LumigraphError if that is none."""
+        """Gaussians to keep. Raises LumigraphError if there is none."""
         return gaussians[self.kept(gaussians, crop, frame, cameras)]
 
     def kept(self, gaussians: Any, crop: Any, frame: Any, cameras: Any) -> Any:
-        """Mask of the Gaussians to keep. Raises LumigraphError if that is none.
+        """Mask of the Gaussians to keep. Raises LumigraphError if there is none.
 
         cameras: of the photographs, in the cloud's frame; None without photographs
         """
@@ -224,9 +225,10 @@ class Keeping(Cropping):
         return ~lost
 
     def of_method(self, method: Any, opened: Any) -> Any:
-        """The cropped method without floaters, ready to render. Raises LumigraphError where it can have no floaters.
+        """The method, cropped and without floaters, ready to render. Raises LumigraphError for a method without
+        Gaussians.
 
-        opened: the run or file that the method is of
+        opened: the method's run or file
         """
         from ..composition import FilteredCloud, PickedCloud, cropped
         from ..method.capabilities import HasGaussians, can, needs
@@ -244,12 +246,12 @@ class Keeping(Cropping):
         return method if crop is None else cropped(method, crop)
 
     def without_floaters(self, method: Any, opened: Any) -> Any:
-        """All of a method but its floaters, for what crops by itself."""
+        """A method without its floaters but not cropped, for exports with their own crop."""
         return replace(self, box=None, sphere=None).of_method(method, opened)
 
 
 def told_origin(frame: Any, wanted: bool) -> tuple[Any, dict[str, str]]:
-    """Origin on Earth to write into a file, and the row that says so; neither where it is unknown or unwanted."""
+    """Origin on Earth for a file, and its row to print; neither if unknown or unwanted."""
     if not wanted or frame.origin is None:
         return None, {}
     place = f"latitude {frame.origin.latitude:.6f}, longitude {frame.origin.longitude:.6f}"

@@ -106,7 +106,7 @@ class Segment:
         return self.output.with_name(f"{self.output.name}.png")
 
     def _check(self, opened: Any, is_cloud: bool) -> None:
-        """Raises LumigraphError unless the result may go to the output."""
+        """Raises LumigraphError unless the result can be written to the output."""
         from ..exchange import SUFFIXES, names_splats
         from ..files import claim_folder
         from ..run.derived import check_output
@@ -130,7 +130,7 @@ class Segment:
         claim(self._picture, "comparison", self.overwrite, reads)
 
     def _drawn(self, scene: Any, path: Path, name: str) -> Any:
-        """Strokes of a file on the photograph of a name, over whole segments if there are any."""
+        """Strokes from a file on the photograph of a name, over whole segments if there are any."""
         from ..selection import read_segments, read_strokes
 
         number = numbered(scene, name)
@@ -203,7 +203,7 @@ def some_views(scene: Any, count: int) -> Sequence[int]:
 
 
 def numbered(scene: Any, name: str) -> int:
-    """Number of the photograph of a name, with or without its folder and ending."""
+    """Number of a photograph from its name, with or without its folder and ending."""
     stems = [Path(x).stem for x in scene.names]
     for names in (scene.names, [Path(x).name for x in scene.names], stems):
         if names.count(name) == 1:
@@ -213,7 +213,7 @@ def numbered(scene: Any, name: str) -> int:
 
 
 def write_masks(folder: Path, scene: Any, selection: Any, chosen: Any) -> None:
-    """A label picture for each photograph: 1 where it shows the part, 0 elsewhere."""
+    """Write a label picture for each photograph: 1 where the part is visible, 0 elsewhere."""
     import numpy as np
     from PIL import Image
 
@@ -231,8 +231,8 @@ def write_masks(folder: Path, scene: Any, selection: Any, chosen: Any) -> None:
 def before_and_after(
     opened: Any, method: Any, selection: Any, chosen: Any, cameras: Sequence[Any], result: Path | None, alone: bool
 ) -> Any:
-    """A sheet of some views: before, the selection tinted, and the result, hatched where nothing is known of what was
-    behind the part. alone: whether the part is all that is left"""
+    """A sheet of some views: before, the selection tinted, and the result, with unseen regions behind the part hatched.
+    alone: whether only the part remains"""
     import torch
 
     from ..camera.rays import Rendering
