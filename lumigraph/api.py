@@ -122,13 +122,13 @@ class Model:
         return {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
     def _made(self, name: str, *arguments: object, **options: Any) -> Any:
-        """Result of a command on what is opened."""
+        """Result of a command applied to the opened model."""
         made: Reports = command(name, self.opened.path, *arguments, **options)
         with held_open(self.opened):
             return quietly(made.made)[0]
 
     def _derived(self, name: str, output: Path | str, *arguments: object, **options: Any) -> Model:
-        """Run or file that a command makes of what is opened."""
+        """Run or file derived from the opened model by a command."""
         made = command(name, self.opened.path, *arguments, output=output, **options)
         with held_open(self.opened):
             finished(quietly(made.run)[0])

@@ -225,8 +225,7 @@ class Keeping(Cropping):
         return ~lost
 
     def of_method(self, method: Any, opened: Any) -> Any:
-        """The method, cropped and without floaters, ready to render. Raises LumigraphError for a method without
-        Gaussians.
+        """The method, cropped and without floaters. Raises LumigraphError for floaters of a method without Gaussians.
 
         opened: the method's run or file
         """

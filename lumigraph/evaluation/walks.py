@@ -101,10 +101,10 @@ def evaluate_walk(
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
     most: int | None = None,
 ) -> WalkEvaluation:
-    """Render the cameras of a split, which lie along a walk, and compare each frame with the one before.
+    """Render the cameras of a split, which lie along a walk, and compare each frame with the previous one.
 
     keep: receives each frame's name and rendering
-    most: so many frames at most, the first ones; None means all
+    most: largest number of frames, the first ones; None means all
     Raises LumigraphError for a split without cameras.
     """
     chosen = world.splits.get(split, torch.empty(0, dtype=torch.int64)).tolist()[:most]

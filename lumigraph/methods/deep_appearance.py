@@ -192,7 +192,7 @@ class DeepAppearance(Method):
     # Learning
 
     def compile_begin(self) -> None:
-        """On the copy that rehearses a step: one empty photograph in place of what `begin` unwraps."""
+        """For kernel compilation on a copy: one empty photograph instead of the textures of `begin`."""
         super().compile_begin()
         self.meshes.rows = self.mean_mesh[None]
         self.textures.rows = self.mean_texture.byte()[None]

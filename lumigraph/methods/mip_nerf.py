@@ -65,7 +65,7 @@ class MipNeRF(FieldMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        """The paper's network, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
+        """The paper's network, tiny, with an occupancy grid: every part, within some twenty quick steps."""
         return Config(**TINY_NETWORK, network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6))
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:

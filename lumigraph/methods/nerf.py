@@ -80,7 +80,7 @@ class NeRF(FieldMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        """The paper's two networks, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
+        """The paper's two networks, tiny, with an occupancy grid: every part, within some twenty quick steps."""
         network = NetworkNumbers(depth=3, skip_layer=2, position_frequencies=5)
         return Config(**TINY_NETWORK, network=network, transmittance_threshold=1e-3)
 

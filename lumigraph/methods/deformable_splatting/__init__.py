@@ -83,7 +83,8 @@ class DeformableSplatting(CloudMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        """Some hundred Gaussians that move, are refined and told apart within some twenty quick steps."""
+        """Some hundred Gaussians with motion, refinement and separation of static ones, within some twenty quick
+        steps."""
         refine = RefineNumbers(300, cap_ramp=True, refine_every=4, refine_from=4, refine_until=0.8)
         return changed(
             Config(refine=refine, tidying=ALL_RULES), sh_degree=1, sh_degree_interval=4, initial_gaussians=200,
@@ -93,7 +94,7 @@ class DeformableSplatting(CloudMethod):
         )  # fmt: skip
 
     def joined_photographs(self, data: Scene) -> Int[Tensor, " photograph"]:
-        """Photographs around the middle moment at first, and more and more of the others (`all_moments_from`)."""
+        """Photographs around the middle time at first, and gradually all others (`all_moments_from`)."""
         train, until = super().joined_photographs(data), self.config.motion.all_moments_from
         times, share = data.cameras.time, self.progress / until if until else 1.0
         if times is None or self.frame.times is None or share >= 1:

@@ -271,7 +271,8 @@ class PlaneMotion(Addition):
         step.cloud = self.at(step.cloud, method.moment_of(step.camera))
 
     def regularize(self, method: Any, step: Step) -> None:
-        """Smooth planes, and neighbours at fixed places in each other's frame (Luiten 2024, eq. 9)."""
+        """Smoothness of planes, and rigidity: neighbours' offsets are constant in each other's frame (Luiten 2024,
+        eq. 9)."""
         if not self.active:
             return
         n = self.numbers
@@ -281,8 +282,8 @@ class PlaneMotion(Addition):
             step.terms["rigidity"] = n.rigidity * self.bending(step.whole, method.moment_of(step.camera), step.chance)
 
     def bending(self, cloud: Gaussians, time: float, chance: torch.Generator) -> Float[Tensor, ""]:
-        """Mean squared change of the places of neighbours in the frames of Gaussians that move, relative to their
-        distance; of some, at random, or of all nodes."""
+        """Mean squared change of neighbours' offsets in the frames of moving Gaussians, relative to their distance; of
+        a random subset, or of all nodes."""
         if self.node_count:
             places, links = (x[: int(self.node_count)] for x in (self.nodes, self.links))
             drawn = torch.arange(len(places), device=places.device)

@@ -107,7 +107,7 @@ class DVR(SurfaceMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A hash table whose levels join one by one; rays look within the visual hull alone."""
+        """A hash table with levels activated one by one; samples only within the visual hull."""
         c = Config(table=CPU_LEVELS, field="hash", hidden_width=32, hull_cells=64, march_steps=192)
         c = replace(c, first_march_steps=96, march_settling=0.3, rays_per_step=2048, coarse_to_fine=0.5)
         c = replace(c, neighbour_distance=1e-2, difference_step=1e-2)
@@ -146,7 +146,7 @@ class DVR(SurfaceMethod):
         self._march_steps = round(c.march_steps / 2 ** math.ceil((1 - share) * doublings))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        """Raises LumigraphError for photographs without masks, and for places without bounds."""
+        """Raises LumigraphError for photographs without masks, and for scenes without bounds."""
         confirm(data)
         layers = ("depth",) if self.config.depth_weight else ()
         return data.sample_rays(self.config.rays_per_step, generator, layers=layers).to(self.device)
@@ -279,7 +279,7 @@ def sum_of_lengths(a: Float[Tensor, "point 3"], b: Float[Tensor, "point 3"]) -> 
 
 
 def confirm(data: Scene) -> None:
-    """Raises LumigraphError for photographs without masks, and for places without bounds."""
+    """Raises LumigraphError for photographs without masks, and for scenes without bounds."""
     if not data.images.has_alpha or data.frame.is_open:
         lacking = "have no masks" if not data.images.has_alpha else "show a place without bounds"
         raise LumigraphError(

@@ -142,7 +142,7 @@ class PosedField(Field):
         return torch.zeros_like(body).index_copy(0, inside, self.canonical.density(placed) * body[inside])
 
     def _moved(self, rest: Points, rows: Int[Tensor, " point"]) -> Points:
-        """Canonical places of places at rest: with the non-rigid offset."""
+        """Canonical positions of points at rest, with the non-rigid offset."""
         assert self.poses is not None
         return self.offset(rest, self.poses.angles[rows])
 

@@ -280,8 +280,8 @@ class IMap(FieldMethod):
         return terms
 
     def window(self, joined: list[int], current: DepthFrame | None, chance: torch.Generator) -> list[int]:
-        """Places in `joined` of the frames of one descent: the current and the latest keyframe, others by their mean
-        loss or evenly."""
+        """Indices in `joined` of the frames of one iteration: the current and the latest keyframe, others sampled by
+        their mean loss or uniformly."""
         latest = [i for i, index in enumerate(joined) if current is not None and index == current.index]
         latest = list(dict.fromkeys([*latest, len(joined) - 1]))
         others = [i for i in range(len(joined)) if i not in latest]

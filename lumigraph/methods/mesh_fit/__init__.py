@@ -177,7 +177,7 @@ class MeshFit(Method):
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """The paper's Adam for places, whose steps are as long as gradients are large beside each other."""
+        """The paper's Adam for vertices, with one step length for all of them; Adam for colours."""
         places = UniformAdam([{"params": [self.surface.places], "name": "places"}])
         colours = torch.optim.Adam([{"params": [self.surface.colours], "name": "colours"}])
         self._optimizers = places, colours

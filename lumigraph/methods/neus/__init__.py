@@ -110,7 +110,7 @@ class NeuS(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A hash table whose levels join one by one, a grid of what is empty, sections that matter alone."""
+        """A hash table with levels activated one by one, a grid of empty space, and no sections of low weight."""
         c = Config(table=CPU_TABLE, rays=RayNumbers(48, 16, rays_per_step=768), mask=MaskNumbers(64), field="hash")
         c = replace(c, hidden_width=32, upsampling_rounds=2, outside_samples=24, weight_threshold=1e-3)
         c = replace(c, samples_per_step=12_288, cosine_annealing=0.2, coarse_to_fine=0.5)
@@ -118,7 +118,7 @@ class NeuS(FieldMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        """A tiny table whose levels join, with a grid of what is empty, within some twenty quick steps."""
+        """A tiny table with levels activated one by one, and a grid of empty space, within some twenty quick steps."""
         c = Config(table=TINY_TABLE, rays=RayNumbers(16, 8, rays_per_step=192), mask=MaskNumbers(16), field="hash")
         c = replace(c, hidden_width=16, upsampling_rounds=2, samples_per_step=2048, outside_samples=8)
         c = replace(c, weight_threshold=1e-3, coarse_to_fine=0.5, curvature_weight=1e-4, warmup=0.1)

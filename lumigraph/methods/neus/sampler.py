@@ -174,5 +174,5 @@ def in_order(first: Samples, second: Samples) -> tuple[Samples, Tensor]:
 
 
 def padded(values: Tensor, count: int) -> Tensor:
-    """Rows followed by so many zeros."""
+    """Rows padded with zeros."""
     return torch.cat([values, values.new_zeros(count, *values.shape[1:])])

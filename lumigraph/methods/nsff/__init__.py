@@ -195,8 +195,8 @@ class NSFF(FieldMethod):
         return data.sample_rays(self.sampler.batch_size, generator, places=True).to(self.device)
 
     def before_step(self, step: int, progress: float) -> None:
-        """The weights of flow and depth fall to a tenth each time; from the first fall on, warps go on to the second
-        neighbour."""
+        """Weights of flow and depth decay by a factor of ten each time; from the first decay on, warps reach the
+        second neighbour."""
         falls = int(progress / self.config.flow.prior_interval)
         self.prior_scale, self.chains = PRIOR_FALL**-falls, falls > 0 and self.config.flow.neighbours > 1
         super().before_step(step, progress)

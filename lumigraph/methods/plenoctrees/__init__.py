@@ -129,7 +129,7 @@ class PlenOctrees(FieldMethod):
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
-        """The paper's depth, where photographs have so many pixels: coarser leaves lose detail for good."""
+        """The paper's depth for photographs of a sufficient resolution: coarser leaves lose detail permanently."""
         return replace(cls.preset(device), octree_depth=cls.Config.octree_depth)
 
     @classmethod

@@ -45,8 +45,8 @@ class FactorGrid(nn.Module):
 
     @torch.no_grad()
     def resampled(self, nodes: Nodes, part: Ends) -> Float[Tensor, "row component"]:
-        """A table with other nodes over a part of the cube, from corner to corner, by linear interpolation
-        (section 4.4: upsampling, and shrinking to what holds something)."""
+        """A table resampled to other nodes over a part of the cube, corner-aligned, by linear interpolation (section
+        4.4: upsampling, and shrinking to the occupied region)."""
         places = [torch.linspace(float(a), float(b), n) for a, b, n in zip(*part, nodes, strict=True)]
         factors = self.factors
         axes = [mode[:2] for mode in MODES] if self.kind == "vm" else []
