@@ -163,7 +163,7 @@ class SNeRG(FieldMethod):
 
     @classmethod
     def taught_preset(cls, device: torch.device) -> Any:
-        """Voxels begin close to their values, and rays in minutes are few for each: steps of 0.01 add noise."""
+        """A lower learning rate: voxels start close to their values, and with few rays for each, 0.01 adds noise."""
         return replace(cls.preset(device), voxel_learning_rate=0.003)
 
     @classmethod
